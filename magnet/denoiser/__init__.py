@@ -1,0 +1,1 @@
+"""The diffusion forcing transformer: training, and generation of scenes with it."""

@@ -1,0 +1,74 @@
+"""Which noise level each token gets during training (paper 3.2, A.6.2)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from magnet.sampling.noise import LEVELS
+
+NoiseLevels = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
+
+PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
+MIXTURE = (0.35, 0.15, 0.05, 0.45)
+"""Shares of the four kinds in `mixture`."""
+
+
+def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Generator) -> Tensor:
+    """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
+
+    `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
+    `per_sequence`: one a scene. `mixture` (ours) draws one of these or a *roll-out* for each scene: a
+    clean past, a block being denoised, an unknown future, which is what the sampler will ask about but
+    what independent levels almost never show.
+    """
+    device = generator.device
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.randint(LEVELS + 1, shape, generator=generator, device=device).expand(B, N, P)
+
+    if kind == "per_token":
+        return uniform(B, N, P)
+    if kind == "per_timestep":
+        return uniform(B, N, 1)
+    if kind == "per_sequence":
+        return uniform(B, 1, 1)
+    if kind != "mixture":
+        raise ValueError(f"noise_levels: got {kind!r}, expected per_token, per_timestep, per_sequence or mixture")
+    share = torch.tensor(MIXTURE, device=device)
+    which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
+    levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
+    levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
+    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator), levels)
+
+
+def rollout_levels(B: int, N: int, P: int, generator: torch.Generator) -> Tensor:
+    """Clean past, one block at a shared level, unknown future; agents may be given or hidden. -> (B, N, P) int
+
+    In half of the scenes every agent is generated. In the others each agent is, by chance, generated,
+    given as far as the block reaches, given to the end, or hidden from the block on: partner
+    prediction, motion control and inpainting.
+    """
+    device = generator.device
+
+    def integers(low: Tensor, high: Tensor) -> Tensor:
+        """Uniform in [low, high], elementwise."""
+        draw = torch.rand(low.shape, generator=generator, device=device)
+        return (low + draw * (high - low + 1)).long().clamp_max(high)
+
+    zero = torch.zeros(B, 1, 1, dtype=torch.long, device=device)
+    past = integers(zero, zero + N - 1)
+    stop = integers(past + 1, zero + N)
+    level = integers(zero + 1, zero + LEVELS)
+    time = torch.arange(N, device=device)[None, :, None]
+    generated = torch.where(time < past, 0, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
+    given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
+    hidden = torch.where(time < past, 0, LEVELS).expand(B, N, P)
+    role = torch.randint(4, (B, 1, P), generator=generator, device=device)
+    mixed = torch.rand(B, 1, 1, generator=generator, device=device) < 0.5
+    role = torch.where(mixed, role, 0)
+    levels = torch.where(role == 1, given, generated)
+    levels = torch.where(role == 2, torch.zeros_like(levels), levels)
+    return torch.where(role == 3, hidden, levels)

@@ -1,0 +1,88 @@
+"""What the denoiser is trained on (paper Eq. 9-11)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.motion.frames import partners
+from magnet.motion.tokens import TokenLayout, by_frame
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean over the elements that count; 0 where none does. mask broadcasts to values."""
+    mask = mask.to(values.dtype).expand_as(values)
+    return (values * mask).sum() / mask.sum().clamp_min(1.0)
+
+
+def token_losses(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor) -> dict[str, Tensor]:
+    """Huber loss of each part of a token, each part averaged by itself (Eq. 9, 10).
+
+    clean, truth (B, N, P, D) normalised; there (B, N, P, 1 + slots) bool, which groups speak of people
+    who are there in valid frames. 512 latent numbers against 36 P transforms: one common mean would
+    drown the transforms.
+    """
+    error = F.smooth_l1_loss(clean, truth, reduction="none")
+    latent, steps, relations = layout.unpack(error)
+    losses = {
+        "latent": masked_mean(latent, there[..., :1]),
+        "step": masked_mean(steps.flatten(-2), there[..., :1]),
+    }
+    if layout.slots:
+        losses["relation"] = masked_mean(relations.flatten(-2), there[..., 1:, None])
+    return losses
+
+
+def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tuple[Tensor, Tensor]:
+    """How far predicted pairwise transforms are from what the predicted steps make of them (Eq. 11).
+
+    Per frame, across token borders, where it holds exactly on real motion. tokens (B, N, P, D) in real
+    units; there as in `token_losses`. -> rotation (1 - cos of the angle), translation (Huber, metres).
+    Transforms are turns about the vertical and ground shifts, so they are handled as unit complex
+    numbers and ground vectors.
+    """
+    P = layout.agents
+    _, steps, relations = layout.unpack(tokens)
+    turn, shift = _planar(by_frame(steps))  # (B, T, P, 2) each
+    pair_turn, pair_shift = _planar(_slots_by_frame(relations))  # (B, T, P, P - 1, 2)
+    partner = partners(P, tokens.device)
+    own_turn, own_shift = turn[:, 1:, :, None], shift[:, 1:, :, None]
+    other_turn, other_shift = turn[:, 1:, partner], shift[:, 1:, partner]
+    before_turn, before_shift = pair_turn[:, :-1], pair_shift[:, :-1]
+    # T' = inverse(dT_self) @ T @ dT_partner
+    expected_turn = _multiply(_conjugate(own_turn), _multiply(before_turn, other_turn))
+    moved = before_shift + _apply(before_turn, other_shift) - own_shift
+    expected_shift = _apply(_conjugate(own_turn), moved)
+    rotation = 1 - (expected_turn * pair_turn[:, 1:]).sum(-1)
+    translation = F.smooth_l1_loss(expected_shift, pair_shift[:, 1:], reduction="none").sum(-1)
+    frames = there[..., 1:].repeat_interleave(steps.shape[-2], dim=1)
+    both = frames[:, 1:] & frames[:, :-1]
+    return masked_mean(rotation, both), masked_mean(translation, both)
+
+
+def _slots_by_frame(relations: Tensor) -> Tensor:
+    """(B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 9)"""
+    return relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)
+
+
+def _planar(nine: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit (cos, sin) of the yaw and ground shift (x, z) of nine numbers. (..., 9) -> (..., 2) x 2"""
+    turn = torch.stack([nine[..., 0], -nine[..., 2]], dim=-1)
+    return F.normalize(turn, dim=-1, eps=1e-6), nine[..., [6, 8]]
+
+
+def _multiply(a: Tensor, b: Tensor) -> Tensor:
+    real = a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1]
+    return torch.stack([real, a[..., 0] * b[..., 1] + a[..., 1] * b[..., 0]], dim=-1)
+
+
+def _conjugate(a: Tensor) -> Tensor:
+    return torch.stack([a[..., 0], -a[..., 1]], dim=-1)
+
+
+def _apply(turn: Tensor, shift: Tensor) -> Tensor:
+    """Turn a ground vector (x, z) about the vertical."""
+    cos, sin = turn.unbind(-1)
+    x, z = shift.unbind(-1)
+    return torch.stack([cos * x + sin * z, cos * z - sin * x], dim=-1)

@@ -1,0 +1,286 @@
+"""`Denoiser`: training the diffusion forcing transformer, and sampling every task with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from magnet.denoiser.generation import SamplerOptions, generate
+from magnet.denoiser.levels import NoiseLevels, draw_levels
+from magnet.denoiser.losses import consistency_losses, token_losses
+from magnet.denoiser.statistics import Statistics
+from magnet.denoiser.transformer import Rope, Transformer
+from magnet.evaluation import Evaluation
+from magnet.motion.frames import pose_features
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE, TokenLayout, scene_steps, scene_transforms
+from magnet.sampling.noise import add_noise
+from magnet.seeding import derive, step_generator
+from magnet.tasks.base import Task
+from magnet.tokenizer.module import RawPose, Tokenizer
+
+
+class Denoiser(L.LightningModule):
+    """Diffusion forcing transformer over the motion tokens of all agents (paper 3.2).
+
+    Holds the frozen tokenizer it was trained with, so one checkpoint is all that a user needs.
+
+    Args:
+        tokenizer: checkpoint of a trained tokenizer. `raw` uses plain poses instead (ablation, paper Table 5).
+            A checkpoint of this module brings its own, and this is then not read.
+        max_agents: agent slots P; smaller scenes leave slots empty. Linked to the data's.
+        window: token steps that the model sees at once; 16 tokens are 64 frames. Linked to the data's.
+        width: hidden size d, paper Table A.2.
+        layers: transformer blocks, paper Table A.2.
+        heads: attention heads, paper Table A.2.
+        mlp_ratio: MLP size over d, paper Table A.2.
+        dropout: in attention and MLPs; the paper does not say.
+        rope: where time enters: `hidden` as in paper Table A.2, `heads` as usual elsewhere, `none` (ablation,
+            Table A.5).
+        agent_embedding: False takes the agents' identities away (ablation, paper Table A.5).
+        relations: False takes pairwise transforms out of the tokens (ablation, paper Table 5).
+        relation_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
+            `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
+        noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
+            `mixture` (ours: these and the patterns that sampling asks about).
+        latent_weight: lambda_0 of paper Eq. 10.
+        step_weight: lambda_1 of paper Eq. 10.
+        relation_weight: lambda_2 of paper Eq. 10.
+        consistency_weight: lambda_3 of paper Eq. 10, for rotation and translation alike.
+        consistency_warmup: steps over which lambda_3 grows from 0.
+        std_floor: smallest standard deviation used for z-scores.
+        learning_rate: paper A.3.
+        weight_decay: paper A.3.
+        warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
+        compile: compile the transformer for training; worth it on a GPU, not on a CPU.
+        seed: all training noise follows from it.
+    """
+
+    def __init__(
+        self,
+        tokenizer: str | None = None,
+        max_agents: int = 2,
+        window: int = 16,
+        width: int = 512,
+        layers: int = 6,
+        heads: int = 8,
+        mlp_ratio: int = 4,
+        dropout: float = 0.05,
+        rope: Rope = "hidden",
+        agent_embedding: bool = True,
+        relations: bool = True,
+        relation_noise: Literal["noisier_end", "token"] = "noisier_end",
+        noise_levels: NoiseLevels = "per_token",
+        latent_weight: float = 1.0,
+        step_weight: float = 1.0,
+        relation_weight: float = 1.0,
+        consistency_weight: float = 0.1,
+        consistency_warmup: int = 1000,
+        std_floor: float = 1e-2,
+        learning_rate: float = 2e-4,
+        weight_decay: float = 1e-4,
+        warmup_steps: int = 1000,
+        compile: bool = False,
+        seed: int = 1111,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.window = window
+        self.tokenizer: Tokenizer | RawPose
+        self.evaluation: Evaluation | None = None
+        if tokenizer == "raw":
+            self.build(RawPose())
+        elif tokenizer is not None and Path(tokenizer).exists():
+            self.build(Tokenizer.load(tokenizer))
+
+    # -- parts ---------------------------------------------------------------------------------
+
+    def build(self, tokenizer: Tokenizer | RawPose) -> None:
+        """Make the parts whose sizes depend on the tokenizer."""
+        h = self.hparams
+        self.tokenizer = tokenizer.requires_grad_(False).eval()
+        self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.relations, h.relation_noise)
+        self.statistics = Statistics(self.layout, h.std_floor)
+        self.transformer = Transformer(
+            self.layout,
+            width=h.width,
+            layers=h.layers,
+            heads=h.heads,
+            mlp_ratio=h.mlp_ratio,
+            dropout=h.dropout,
+            rope=h.rope,
+            agent_embedding=h.agent_embedding,
+        )
+        self._forward: Callable[[Tensor, Tensor, Tensor], Tensor] = self.transformer
+
+    @property
+    def built(self) -> bool:
+        return hasattr(self, "transformer")
+
+    def _require_tokenizer(self) -> None:
+        if not self.built:
+            raise ValueError(
+                f"the denoiser has no tokenizer: --model.tokenizer is {self.hparams.tokenizer!r}, which is not a file. "
+                "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint"
+            )
+
+    def train(self, mode: bool = True) -> Denoiser:
+        super().train(mode)
+        if self.built:
+            self.tokenizer.eval()  # frozen: its codebook must never move
+        return self
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        raw = isinstance(self.tokenizer, RawPose)
+        checkpoint["tokenizer_hyper_parameters"] = None if raw else dict(self.tokenizer.hparams)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if "tokenizer_hyper_parameters" not in checkpoint:
+            raise ValueError("this is not a denoiser's checkpoint: it carries no tokenizer")
+        if not self.built:
+            stored = checkpoint["tokenizer_hyper_parameters"]
+            self.build(RawPose() if stored is None else Tokenizer(**stored))
+            self.to(self.device)
+
+    # -- what the model does -------------------------------------------------------------------
+
+    def encode(self, scene: Scene) -> Tensor:
+        """Quantised latents of a scene. -> (B, N, P, C)"""
+        return self.tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene))
+
+    def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """Predict clean tokens. noisy (B, N, P, D) normalised, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
+
+        A window does not know what came before it: its first step is always shown as standing still, in
+        training as in sampling.
+        """
+        return self._forward(self._without_lead(noisy), levels, present)
+
+    def _without_lead(self, tokens: Tensor) -> Tensor:
+        lead = slice(self.layout.latent, self.layout.latent + 9)
+        identity = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], device=tokens.device)
+        still = (identity - self.statistics.mean[lead]) / self.statistics.std[lead]
+        tokens = tokens.clone()
+        tokens[:, 0, :, lead] = still.to(tokens.dtype)
+        return tokens
+
+    def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
+        """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
+        scene = scene.pad_agents(self.layout.agents)
+        tokens = self.layout.pack(self.encode(scene), *scene_transforms(scene))
+        there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
+        if scene.valid is not None:
+            whole = scene.valid.unflatten(1, (-1, STRIDE)).all(dim=-1)
+            there = there & whole[:, :, None, None]
+        return tokens, there
+
+    def generate(
+        self,
+        scene: Scene,
+        task: Task,
+        context: int,
+        frames: int,
+        samples: int = 1,
+        options: SamplerOptions | None = None,
+        generator: torch.Generator | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Scene:
+        """Sample a task: see `magnet.denoiser.generation.generate`."""
+        self._require_tokenizer()
+        with torch.no_grad():
+            return generate(self, scene, task, context, frames, samples, options, generator, progress)
+
+    # -- training ------------------------------------------------------------------------------
+
+    def on_fit_start(self) -> None:
+        self._require_tokenizer()
+        if not self.statistics.ready:
+            self._fit_statistics()
+        if self.hparams.compile:
+            self._forward = torch.compile(self.transformer)
+
+    @torch.no_grad()
+    def _fit_statistics(self) -> None:
+        """z-scores from the first training batches; the same on every rank, because ranks draw alike here."""
+        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
+        scenes = [scene.to(self.device) for scene in datamodule.statistics_batches()]
+        if isinstance(self.tokenizer, RawPose):
+            self.tokenizer.set_statistics(scenes)
+        parts = [self.tokenize(scene) for scene in scenes]
+        self.statistics.fit(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
+
+    def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
+        generator = step_generator(self.device, self.hparams.seed, "train", self.global_step, self.global_rank)
+        losses = self._losses(batch, generator)
+        self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
+        self.log("loss", losses["loss"], prog_bar=True)
+        return losses["loss"]
+
+    def validation_step(self, batch: Scene, batch_idx: int) -> None:
+        # The same noise at every validation, so that epochs can be compared.
+        seed = derive(self.hparams.seed, "validation", batch_idx, self.global_rank)
+        generator = torch.Generator(device=self.device).manual_seed(seed)
+        losses = self._losses(batch, generator)
+        logged = {f"val/{name}": value for name, value in losses.items()}
+        self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
+
+    def _losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
+        h = self.hparams
+        with torch.no_grad():
+            tokens, there = self.tokenize(scene)
+            truth = self.statistics.normalise(tokens)
+            B, N, P, _ = truth.shape
+            levels = draw_levels(h.noise_levels, B, N, P, generator)
+            noise = torch.randn(truth.shape, generator=generator, device=truth.device)
+            noisy = add_noise(truth, noise, self.layout.spread(self.layout.group_levels(levels)))
+        clean = self.denoise(noisy, levels, scene.pad_agents(P).present).float()
+        losses = token_losses(clean, truth, self.layout, there)
+        total = h.latent_weight * losses["latent"] + h.step_weight * losses["step"]
+        if self.layout.slots:
+            rotation, translation = consistency_losses(self.statistics.restore(clean), self.layout, there)
+            losses["consistency"] = rotation + translation
+            ramp = min(1.0, (self.global_step + 1) / max(h.consistency_warmup, 1)) if self.training else 1.0
+            total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
+        return {"loss": total, **losses}
+
+    def configure_optimizers(self) -> Any:
+        h = self.hparams
+        fused = self.device.type == "cuda"
+        optimizer = torch.optim.AdamW(
+            self.transformer.parameters(), lr=h.learning_rate, weight_decay=h.weight_decay, fused=fused
+        )
+        total = max(int(self.trainer.estimated_stepping_batches), 1)
+        warmup = min(h.warmup_steps, total // 2)
+        ramp = torch.optim.lr_scheduler.LinearLR(optimizer, 1e-3, 1.0, max(warmup, 1))
+        fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(total - warmup, 1))
+        schedule = torch.optim.lr_scheduler.SequentialLR(optimizer, [ramp, fall], [max(warmup, 1)])
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    # -- testing and predicting ----------------------------------------------------------------
+
+    def configure_test(self, evaluation: Evaluation) -> None:
+        """What `test` and `predict` do; the command line calls this."""
+        self.evaluation = evaluation
+
+    def _evaluation(self) -> Evaluation:
+        self._require_tokenizer()
+        if self.evaluation is None:
+            self.evaluation = Evaluation()
+        return self.evaluation
+
+    def on_test_start(self) -> None:
+        self._evaluation().start(self, self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def test_step(self, batch: Scene, batch_idx: int) -> None:
+        self._evaluation().step(self, batch, batch_idx)
+
+    def on_test_epoch_end(self) -> None:
+        self.log_dict(self._evaluation().finish(self))
+
+    def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
+        return self._evaluation().predict(self, batch, batch_idx, self.trainer.datamodule)  # type: ignore[attr-defined]

@@ -1,0 +1,214 @@
+"""What `magnet test` and `magnet predict` do with a task: sample, compare with baselines, measure, write down."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torchmetrics import MetricCollection
+
+from magnet.baselines import HoldPose, NearestNeighbour, RandomSample
+from magnet.body import Body
+from magnet.denoiser.generation import SamplerOptions
+from magnet.metrics import FrechetDistance, all_metrics, frechet_distance, ground_truth_metrics
+from magnet.metrics.frechet import moments
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE
+from magnet.report import Results
+from magnet.sampling.schedule import Grid
+from magnet.seeding import derive
+from magnet.tasks.base import Task
+from magnet.tasks.joint import JointFuture
+
+if TYPE_CHECKING:
+    from magnet.datamodules.base import MotionDataModule
+    from magnet.denoiser.module import Denoiser
+
+MODEL, TRUTH = "magnet", "ground truth"
+CONFIDENCE = 0.95
+
+Predictor = Callable[[Scene, int, torch.Generator], Scene]
+"""A method under test: whole test scenes, samples, randomness -> (B * samples, horizon, P). It must read of the
+scenes no more than its task gives."""
+
+
+@dataclass
+class Evaluation:
+    """A test run.
+
+    Args:
+        task: what is sampled.
+        samples: scenes drawn for each test scene (paper 4; metrics.md B.0).
+        options: how they are sampled.
+        baselines: also measure nearest neighbour, random sample and held pose, aligned with the context and as found.
+        seed: test scene b of a batch draws the same noise whenever the seed is the same.
+        baseline_stride: frames between the starts of training stretches that baselines choose from.
+    """
+
+    task: Task = field(default_factory=JointFuture)
+    samples: int = 10
+    options: SamplerOptions = field(default_factory=SamplerOptions)
+    baselines: bool = True
+    seed: int = 1111
+    baseline_stride: int = 15
+    results: Results | None = field(default=None, init=False)
+    predicted: list[Scene] = field(default_factory=list, init=False)
+
+    def start(self, model: Denoiser, datamodule: MotionDataModule) -> None:
+        """Set up methods and metrics.
+
+        Raises:
+            ValueError: the context is not a whole number of tokens.
+        """
+        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        if self.context % STRIDE:
+            raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")
+        self.body: Body = datamodule.body.to(model.device)
+        self.methods: dict[str, Predictor] = {MODEL: self._model(model)}
+        train = None
+        if self.baselines:
+            train = datamodule.train_scenes(self.context + self.horizon, self.baseline_stride).to(model.device)
+            self.methods |= {
+                "NN": self._baseline(NearestNeighbour(train)),
+                "RS": self._baseline(RandomSample(train)),
+                "held pose": self._baseline(HoldPose()),
+                "NN, not aligned": self._baseline(NearestNeighbour(train, aligned=False)),
+                "RS, not aligned": self._baseline(RandomSample(train, aligned=False)),
+            }
+        scored = self.scored_agents(model, self.horizon)
+        self.metrics = {
+            name: all_metrics(datamodule.fps, scored, CONFIDENCE).to(model.device) for name in self.methods
+        }
+        self.metrics[TRUTH] = ground_truth_metrics(datamodule.fps, scored, CONFIDENCE).to(model.device)
+        self.train_features = self._train_features(train, scored)
+        self.halves = FrechetDistance(fps=datamodule.fps, agents=scored).to(model.device)
+        self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
+        self.scenes = 0
+
+    def scored_agents(self, model: Denoiser, horizon: int) -> Tensor | None:
+        """Who is measured: agents of whom something is generated; None where that is everybody. -> (P,) bool"""
+        tokens = (self.context + horizon) // STRIDE
+        P = model.layout.agents
+        schedule = self.task.schedule(Grid(tokens, P, self.context // STRIDE, 1, model.window, self.options.stride))
+        generated = (schedule.finished & ~schedule.known).any(dim=0)
+        return None if bool(generated.all()) else generated
+
+    # -- methods -------------------------------------------------------------------------------
+
+    def _model(self, model: Denoiser) -> Predictor:
+        def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
+            whole = model.generate(
+                scene, self.task, self.context, self.horizon, samples, self.options, generator=generator
+            )
+            return whole.cut(self.context)
+
+        return predict
+
+    def _baseline(self, method: Callable[..., Scene]) -> Predictor:
+        def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
+            return method(scene.cut(0, self.context), self.horizon, samples, generator)
+
+        return predict
+
+    def _train_features(self, train: Scene | None, scored: Tensor | None) -> FrechetDistance | None:
+        """Pooled poses of real training stretches, placed as the test scenes are."""
+        if train is None:
+            return None
+        pooled = FrechetDistance(agents=scored).to(train.device)
+        for start in range(0, train.scenes, 256):
+            part = aligned(train.pick(slice(start, start + 256)), self.context - 1)
+            future = self.body.joints(part.cut(self.context))
+            pooled.update(future[None], future, part.present)
+        return pooled
+
+    # -- the run -------------------------------------------------------------------------------
+
+    def step(self, model: Denoiser, batch: Scene, batch_idx: int) -> None:
+        """Measure every method on one batch of test scenes."""
+        batch = aligned(batch, self.context - 1)
+        future = self.body.joints(batch.cut(self.context))
+        for name, method in self.methods.items():
+            generator = self._generator(model, batch_idx)
+            began = time.perf_counter()
+            predicted = method(batch, self.samples, generator)
+            self.seconds[name] += time.perf_counter() - began
+            joints = self.body.joints(predicted).unflatten(0, (batch.scenes, self.samples)).transpose(0, 1)
+            self.metrics[name].update(joints, future, batch.present)
+        self.metrics[TRUTH].update(future[None], future, batch.present)
+        even, odd = future[0::2], future[1::2]
+        n = min(len(even), len(odd))
+        if n:
+            self.halves.update(even[None, :n], odd[:n], batch.present[0::2][:n] & batch.present[1::2][:n])
+        self.scenes += batch.scenes
+
+    def finish(self, model: Denoiser) -> dict[str, Tensor]:
+        """Close the run; the table is in `results`. Returns what to log, the model's metrics first."""
+        rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
+        truth_moments = None
+        pooled = self.metrics[MODEL]["FD"]
+        if bool((pooled.count >= 2).all()):
+            truth_moments = moments(pooled.count[1], pooled.sum[1], pooled.outer[1])
+        if self.train_features is not None and truth_moments is not None:
+            real = self.train_features
+            real_moments = moments(real.count[1], real.sum[1], real.outer[1])
+            rows["training windows"] = {"fd": float(frechet_distance(*real_moments, *truth_moments))}
+        rows[TRUTH]["fd halves"] = float(self.halves.compute().get("fd", torch.tensor(torch.nan)))
+        meta = {
+            "task": type(self.task).__name__,
+            "task options": repr(self.task),
+            "samples": self.samples,
+            "sampler": repr(self.options),
+            "test scenes": self.scenes,
+            "context frames": self.context,
+            "horizon frames": self.horizon,
+            "seconds": {name: round(value, 2) for name, value in self.seconds.items()},
+            "device": str(model.device),
+        }
+        self.results = Results(rows=rows, meta=meta)
+        return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}
+
+    def predict(self, model: Denoiser, batch: Scene, batch_idx: int, datamodule: MotionDataModule) -> Scene:
+        """Context and samples of one batch of scenes, for writing."""
+        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        return model.generate(
+            aligned(batch, self.context - 1),
+            self.task,
+            self.context,
+            self.horizon,
+            self.samples,
+            self.options,
+            generator=self._generator(model, batch_idx),
+        )
+
+    def _generator(self, model: Denoiser, batch_idx: int) -> torch.Generator:
+        seed = derive(self.seed, "test", batch_idx, model.global_rank)
+        return torch.Generator(device=model.device).manual_seed(seed)
+
+
+def aligned(scene: Scene, frame: int) -> Scene:
+    """The same motion in a world that all test scenes share: origin between the people, facing with agent 0.
+
+    Both are taken at one frame, the last known one, so that positions of different scenes can be compared.
+    """
+    yaw, ground = to_planar(canonical_frame(scene.T_world_root)[:, frame])  # (B, P), (B, P, 2)
+    there = scene.present[..., None].to(ground)
+    middle = (ground * there).sum(dim=1) / there.sum(dim=1).clamp_min(1)
+    first = scene.present.int().argmax(dim=1)
+    facing = yaw.gather(1, first[:, None])[:, 0]
+    return scene.moved(inverse(from_planar(facing, middle))[:, None, None])
+
+
+def _plain(metrics: MetricCollection) -> dict[str, Any]:
+    return {name: float(value) for name, value in metrics.compute().items()}
+
+
+def save(results: Results, folder: Path) -> None:
+    """Table as JSON and CSV."""
+    results.save_json(folder / "results.json")
+    results.save_csv(folder / "results.csv")

@@ -1,0 +1,237 @@
+"""Frames of reference: root, canonical and partner frames, and the way back into the world (paper 3.1).
+
+A transform carries the names of its two frames and the names cancel:
+`T_self_partner = inverse(T_world_self) @ T_world_partner`. Transforms are (..., 4, 4), metres, y up.
+A canonical frame stands on the ground under the pelvis and is turned about the vertical only, so it
+is fully described by a yaw and a ground position: its *planar* form.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.motion.rotations import about_y, from_6d, to_6d, yaw_of
+from magnet.motion.scene import Scene
+
+Placement = Literal["integrate", "anchor", "fuse"]
+
+UPRIGHT = 1e-3
+"""Below this horizontal length of the left axis the person lies on the side and has no yaw."""
+
+
+# -- transforms --------------------------------------------------------------------------------
+
+
+def inverse(T_a_b: Tensor) -> Tensor:
+    """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)"""
+    R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
+    return rigid(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
+
+
+def rigid(R_a_b: Tensor, t_a_b: Tensor) -> Tensor:
+    """T_a_b from a rotation and the origin of b in a. (..., 3, 3), (..., 3) -> (..., 4, 4)"""
+    top = torch.cat([R_a_b, t_a_b[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return torch.cat([top, bottom], dim=-2)
+
+
+def to_9d(T_a_b: Tensor) -> Tensor:
+    """Rotation in 6-D, then translation in metres. (..., 4, 4) -> (..., 9)"""
+    return torch.cat([to_6d(T_a_b[..., :3, :3]), T_a_b[..., :3, 3]], dim=-1)
+
+
+def from_9d(nine: Tensor) -> Tensor:
+    """The rigid transform nearest to nine numbers. (..., 9) -> (..., 4, 4)"""
+    return rigid(from_6d(nine[..., :6]), nine[..., 6:])
+
+
+def to_planar(T_a_b: Tensor) -> tuple[Tensor, Tensor]:
+    """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped."""
+    return yaw_of(T_a_b[..., :3, :3]), T_a_b[..., [0, 2], 3]
+
+
+def from_planar(yaw: Tensor, ground: Tensor) -> Tensor:
+    """Inverse of `to_planar`. (...), (..., 2) -> (..., 4, 4)"""
+    x, z = ground.unbind(-1)
+    return rigid(about_y(yaw), torch.stack([x, torch.zeros_like(x), z], dim=-1))
+
+
+def turn(yaw: Tensor, ground: Tensor) -> Tensor:
+    """Turn ground vectors (x, z) about the vertical. (...), (..., 2) -> (..., 2)"""
+    cos, sin = yaw.cos(), yaw.sin()
+    x, z = ground.unbind(-1)
+    return torch.stack([cos * x + sin * z, cos * z - sin * x], dim=-1)
+
+
+# -- from a scene to what tokens hold ----------------------------------------------------------
+
+
+def canonical_frame(T_world_root: Tensor) -> Tensor:
+    """Frame on the ground under the pelvis, facing where the pelvis faces. (..., T, P, 4, 4) -> same
+
+    The yaw comes from the pelvis's left axis, which stays horizontal in bows and dips where a forward
+    axis would flip. A person lying exactly on the side keeps the yaw of the last frame that had one;
+    before any such frame, the forward axis decides.
+    """
+    left = T_world_root[..., :3, 0]
+    yaw = torch.atan2(-left[..., 2], left[..., 0])
+    upright = left[..., [0, 2]].norm(dim=-1) >= UPRIGHT
+    if not bool(upright.all()):
+        forward = T_world_root[..., :1, :, :3, 2]
+        yaw = torch.cat([torch.atan2(forward[..., 0], forward[..., 2]), yaw], dim=-2)
+        frame = torch.arange(1, yaw.shape[-2], device=yaw.device)[:, None]
+        last_upright = torch.where(upright, frame, 0).cummax(dim=-2).values
+        yaw = yaw.gather(-2, last_upright)
+    return from_planar(yaw, T_world_root[..., [0, 2], 3])
+
+
+def canonical_steps(T_world_can: Tensor) -> Tensor:
+    """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same"""
+    before = torch.cat([T_world_can[..., :1, :, :, :], T_world_can[..., :-1, :, :, :]], dim=-4)
+    steps = inverse(before) @ T_world_can
+    steps[..., 0, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
+    return steps
+
+
+def partners(agents: int, device: torch.device | None = None) -> Tensor:
+    """Which agent each partner slot of an agent points at: everybody else, in order. (P, P - 1) int"""
+    everyone = torch.arange(agents, device=device).expand(agents, agents)
+    return everyone[~torch.eye(agents, dtype=torch.bool, device=device)].view(agents, agents - 1)
+
+
+def pairwise(T_world_can: Tensor) -> Tensor:
+    """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)"""
+    T_world_partner = T_world_can[..., partners(T_world_can.shape[-3], T_world_can.device), :, :]
+    return inverse(T_world_can)[..., None, :, :] @ T_world_partner
+
+
+def propagated(T_self_partner: Tensor, steps: Tensor) -> Tensor:
+    """Right side of paper Eq. 11: each frame's pairwise transform as the frame before and the steps imply it.
+
+    T_self_partner (..., T, P, P - 1, 4, 4), steps (..., T, P, 4, 4) -> (..., T - 1, P, P - 1, 4, 4),
+    to be compared with frames 1 to T - 1. On real motion the two are equal.
+    """
+    now = steps[..., 1:, :, :, :]
+    step_partner = now[..., partners(now.shape[-3], now.device), :, :]
+    return inverse(now)[..., None, :, :] @ T_self_partner[..., :-1, :, :, :, :] @ step_partner
+
+
+def pose_features(scene: Scene) -> Tensor:
+    """What the tokenizer sees of a body: 21 joint rotations in 6-D and T_can_root in 9-D. -> (B, T, P, 135)"""
+    T_can_root = inverse(canonical_frame(scene.T_world_root)) @ scene.T_world_root
+    return torch.cat([to_6d(scene.body_rot).flatten(-2), to_9d(T_can_root)], dim=-1)
+
+
+POSE_FEATURES = 21 * 6 + 9
+
+
+def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
+    """Inverse of `pose_features`: bodies put at canonical frames. (B, T, P, 135), (B, T, P, 4, 4)
+
+    Shapes, presence, names and body come from `like`, of which nothing else is read.
+    """
+    body_rot = from_6d(features[..., : 21 * 6].unflatten(-1, (21, 6)))
+    T_world_root = T_world_can @ from_9d(features[..., 21 * 6 :])
+    there = like.present[:, None, :, None, None]
+    eye = torch.eye(4, dtype=features.dtype, device=features.device)
+    return like.replace(
+        body_rot=torch.where(there[..., None], body_rot, eye[:3, :3]),
+        T_world_root=torch.where(there, T_world_root, eye),
+        valid=None,
+    )
+
+
+# -- from predicted tokens back into the world -------------------------------------------------
+
+
+def project_se2(T: Tensor) -> Tensor:
+    """Nearest transform that only turns about the vertical and moves on the ground. (..., 4, 4) -> same"""
+    return from_planar(*to_planar(T))
+
+
+def place(
+    steps: Tensor,
+    T_self_partner: Tensor | None,
+    T_world_start: Tensor,
+    placement: Placement = "integrate",
+    trust: float = 0.1,
+    present: Tensor | None = None,
+) -> Tensor:
+    """World canonical frames of a predicted stretch of motion.
+
+    Args:
+        steps: (B, T, P, 4, 4), step from the frame before; the first leads away from `T_world_start`.
+        T_self_partner: (B, T, P, P - 1, 4, 4); `integrate` does not read it and takes None.
+        T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
+        placement: `integrate`: every agent integrates its own steps (the reference's way; agents may
+            drift apart slowly). `anchor`: agent 0 integrates, the others hang off it by its pairwise
+            transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
+            the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
+        trust: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
+        present: (B, P) bool; relations to absent agents are not read. None: all are there.
+
+    Returns:
+        T_world_can (B, T, P, 4, 4), in the dtype of `steps`; computed in float64 so that thousands of
+        frames add up exactly.
+    """
+    step_yaw, step_ground = to_planar(steps.double())
+    start_yaw, start_ground = to_planar(T_world_start.double())
+    if placement == "fuse" and T_self_partner is not None and steps.shape[2] > 1:
+        if present is None:
+            present = torch.ones(steps.shape[0], steps.shape[2], dtype=torch.bool, device=steps.device)
+        pairs = to_planar(T_self_partner.double())
+        return from_planar(*_fuse(step_yaw, step_ground, *pairs, start_yaw, start_ground, trust, present)).to(steps)
+    yaw = start_yaw[:, None] + step_yaw.cumsum(dim=1)
+    before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
+    ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
+    T_world_can = from_planar(yaw, ground)
+    if placement == "anchor" and T_self_partner is not None:
+        T_world_others = T_world_can[:, :, :1] @ project_se2(T_self_partner[:, :, 0].double())
+        T_world_can = torch.cat([T_world_can[:, :, :1], T_world_others], dim=2)
+    return T_world_can.to(steps)
+
+
+def _fuse(
+    step_yaw: Tensor,
+    step_ground: Tensor,
+    pair_yaw: Tensor,
+    pair_ground: Tensor,
+    yaw: Tensor,
+    ground: Tensor,
+    trust: float,
+    present: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Frame by frame: minimise |pose - stepped pose|^2 + trust * sum |pair - predicted pair|^2.
+
+    Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
+    I + 2 trust (graph Laplacian of the people present).
+    """
+    partner = partners(present.shape[1], present.device)
+    together = trust * (present[:, :, None] & present[:, None]).to(step_yaw)
+    together.diagonal(dim1=1, dim2=2).zero_()
+    system = torch.eye(present.shape[1]).to(step_yaw) + 2 * (torch.diag_embed(together.sum(-1)) - together)
+    solve = torch.linalg.inv(system)
+    weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
+
+    def pull(residual: Tensor) -> Tensor:
+        """Pair residuals (B, P, P - 1, C) as a pull on each agent: those that point at it, less its own."""
+        weighted = weight[..., None] * residual
+        return (-weighted.sum(dim=2)).index_add(1, partner.flatten(), weighted.flatten(1, 2))
+
+    yaws, grounds = [], []
+    for t in range(step_yaw.shape[1]):
+        ground = ground + turn(yaw, step_ground[:, t])
+        yaw = yaw + step_yaw[:, t]
+        off = pair_yaw[:, t] - (yaw[:, partner] - yaw[:, :, None])
+        off = torch.atan2(off.sin(), off.cos())
+        yaw = yaw + (solve @ pull(off[..., None]))[..., 0]
+        away = turn(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
+        ground = ground + solve @ pull(away)
+        yaws.append(yaw)
+        grounds.append(ground)
+    return torch.stack(yaws, dim=1), torch.stack(grounds, dim=1)

@@ -1,0 +1,207 @@
+"""`Scene`: the one record of motion, whatever its source."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+BODY_JOINTS = 22
+"""The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
+
+SCENE_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Several people moving together: B scenes of T frames with P agents, metres, y up.
+
+    An absent agent (a free slot) has identity rotations, its pelvis at the origin and zero shape.
+
+    Raises:
+        ValueError: a tensor's shape does not fit the others.
+    """
+
+    body_rot: Tensor  # (B, T, P, 21, 3, 3) rotation of each body joint relative to its parent
+    T_world_root: Tensor  # (B, T, P, 4, 4) pose of the pelvis *joint* (not SMPL-X's transl) in the world
+    betas: Tensor  # (B, P, 10) shape numbers of `body`
+    present: Tensor  # (B, P) bool
+    fps: float = 30.0
+    body: str = "open-1"  # id of the body model that `betas` belong to
+    valid: Tensor | None = None  # (B, T) bool, False where a frame is padding or was masked; None: all good
+    names: tuple[str, ...] = ()  # one label a scene, for reports
+
+    def __post_init__(self) -> None:
+        shape = self.T_world_root.shape
+        if len(shape) != 5 or shape[-2:] != (4, 4):
+            raise ValueError(f"T_world_root: got {tuple(shape)}, expected (B, T, P, 4, 4)")
+        B, T, P = shape[:3]
+        expected = {"body_rot": (B, T, P, BODY_JOINTS - 1, 3, 3), "betas": (B, P, 10), "present": (B, P)}
+        if self.valid is not None:
+            expected["valid"] = (B, T)
+        for field, want in expected.items():
+            got = tuple(getattr(self, field).shape)
+            if got != want:
+                raise ValueError(f"{field}: got {got}, expected {want} for {B} scenes, {T} frames, {P} agents")
+        if self.names and len(self.names) != B:
+            raise ValueError(f"names: got {len(self.names)} for {B} scenes")
+
+    @property
+    def scenes(self) -> int:
+        return self.T_world_root.shape[0]
+
+    @property
+    def frames(self) -> int:
+        return self.T_world_root.shape[1]
+
+    @property
+    def agents(self) -> int:
+        """Number of slots, absent agents included."""
+        return self.T_world_root.shape[2]
+
+    @property
+    def device(self) -> torch.device:
+        return self.T_world_root.device
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensor fields that are set, by name."""
+        fields = ("body_rot", "T_world_root", "betas", "present", "valid")
+        return {f: value for f in fields if (value := getattr(self, f)) is not None}
+
+    def replace(self, **changes: object) -> Scene:
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+    def to(self, device: torch.device | str | int) -> Scene:
+        """The same scene on another device."""
+        return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
+
+    def cut(self, start: int, stop: int | None = None) -> Scene:
+        """Frames `start:stop` of every scene."""
+        valid = None if self.valid is None else self.valid[:, start:stop]
+        return self.replace(
+            body_rot=self.body_rot[:, start:stop], T_world_root=self.T_world_root[:, start:stop], valid=valid
+        )
+
+    def pick(self, scenes: Tensor | Sequence[int] | slice) -> Scene:
+        """Some of the B scenes, in the order given."""
+        if not isinstance(scenes, slice):
+            scenes = torch.as_tensor(scenes, device=self.device)
+            if scenes.dtype == torch.bool:
+                scenes = scenes.nonzero()[:, 0]
+        chosen = torch.arange(self.scenes, device=self.device)[scenes].tolist()
+        changes: dict[str, object] = {name: value[scenes] for name, value in self.tensors().items()}
+        return self.replace(**changes, names=tuple(self.names[i] for i in chosen) if self.names else ())
+
+    def repeat(self, samples: int) -> Scene:
+        """Each scene `samples` times in a row: scene b becomes b * samples ... b * samples + samples - 1."""
+        index = torch.arange(self.scenes, device=self.device).repeat_interleave(samples)
+        return self.pick(index)
+
+    def order(self, agents: Tensor) -> Scene:
+        """Agents in another order, one for all scenes. agents: (P,) int"""
+        return self.replace(
+            body_rot=self.body_rot[:, :, agents],
+            T_world_root=self.T_world_root[:, :, agents],
+            betas=self.betas[:, agents],
+            present=self.present[:, agents],
+        )
+
+    def pad_agents(self, agents: int) -> Scene:
+        """The same people in `agents` slots; the new slots are absent.
+
+        Raises:
+            ValueError: the scene has more slots than that.
+        """
+        extra = agents - self.agents
+        if extra < 0:
+            raise ValueError(f"the scene has {self.agents} agents, but room was asked for {agents}")
+        if extra == 0:
+            return self
+        empty = absent(self.scenes, self.frames, extra, self.T_world_root)
+        return self.replace(
+            body_rot=torch.cat([self.body_rot, empty.body_rot], dim=2),
+            T_world_root=torch.cat([self.T_world_root, empty.T_world_root], dim=2),
+            betas=torch.cat([self.betas, empty.betas], dim=1),
+            present=torch.cat([self.present, empty.present], dim=1),
+        )
+
+    def moved(self, T_new_world: Tensor) -> Scene:
+        """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
+        moved = T_new_world @ self.T_world_root
+        keep = self.present[:, None, :, None, None]
+        return self.replace(T_world_root=torch.where(keep, moved, self.T_world_root))
+
+    def save(self, path: str | Path) -> Path:
+        """Write all B scenes to one npz that needs no unpickling. Returns the path written."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        meta = {"format": SCENE_FORMAT, "fps": self.fps, "body": self.body, "names": list(self.names)}
+        arrays = {name: value.detach().cpu().numpy() for name, value in self.tensors().items()}
+        np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
+        return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+
+    @staticmethod
+    def load(path: str | Path) -> Scene:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: the file is not such a file, or of a later format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                meta = json.loads(str(file["meta"]))
+                arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
+        except (OSError, KeyError, ValueError, EOFError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error
+        if meta["format"] > SCENE_FORMAT:
+            raise ValueError(f"{path}: scene format {meta['format']}, this version reads up to {SCENE_FORMAT}")
+        return Scene(**arrays, fps=meta["fps"], body=meta["body"], names=tuple(meta["names"]))
+
+
+def absent(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:
+    """Slots with nobody in them, with the dtype and device of `like`."""
+    eye3 = torch.eye(3, dtype=like.dtype, device=like.device)
+    eye4 = torch.eye(4, dtype=like.dtype, device=like.device)
+    return Scene(
+        body_rot=eye3.expand(scenes, frames, agents, BODY_JOINTS - 1, 3, 3),
+        T_world_root=eye4.expand(scenes, frames, agents, 4, 4),
+        betas=torch.zeros(scenes, agents, 10, dtype=like.dtype, device=like.device),
+        present=torch.zeros(scenes, agents, dtype=torch.bool, device=like.device),
+    )
+
+
+def concatenate(scenes: Sequence[Scene]) -> Scene:
+    """Several batches of scenes as one batch; slots are padded to the largest group.
+
+    Raises:
+        ValueError: frames, fps or body differ.
+    """
+    first = scenes[0]
+    for scene in scenes[1:]:
+        for field in ("frames", "fps", "body"):
+            if getattr(scene, field) != getattr(first, field):
+                raise ValueError(f"{field} differ: {getattr(first, field)} and {getattr(scene, field)}")
+    agents = max(scene.agents for scene in scenes)
+    padded = [scene.pad_agents(agents) for scene in scenes]
+    valid = None
+    if any(scene.valid is not None for scene in scenes):
+        valid = torch.cat([torch.ones(s.scenes, s.frames, dtype=torch.bool, device=s.device) if s.valid is None else s.valid for s in padded])
+    named = all(scene.names for scene in scenes)
+    return Scene(
+        body_rot=torch.cat([s.body_rot for s in padded]),
+        T_world_root=torch.cat([s.T_world_root for s in padded]),
+        betas=torch.cat([s.betas for s in padded]),
+        present=torch.cat([s.present for s in padded]),
+        fps=first.fps,
+        body=first.body,
+        valid=valid,
+        names=tuple(name for s in scenes for name in s.names) if named else (),
+    )

@@ -1,0 +1,112 @@
+"""Tokens: what the denoiser sees. One token is one agent during `STRIDE` frames (paper Eq. 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import canonical_frame, canonical_steps, pairwise, partners, to_9d
+from magnet.motion.scene import Scene
+
+STRIDE = 4
+"""Frames in a token: the temporal stride omega of the paper."""
+
+
+@dataclass(frozen=True)
+class TokenLayout:
+    """Where things lie in a packed token: latent, 4 x 9 steps, then 4 x 9 for each partner slot.
+
+    The numbers fall into *groups* that share one noise level: group 0 is the agent's own (latent and
+    steps), group 1 + s is partner slot s.
+    """
+
+    latent: int = 512
+    agents: int = 2
+    relations: bool = True  # False: tokens carry no pairwise transforms (paper Table 5)
+    relation_noise: Literal["noisier_end", "token"] = "noisier_end"  # "token" is the paper read literally; it leaks
+
+    @property
+    def slots(self) -> int:
+        return self.agents - 1 if self.relations else 0
+
+    @property
+    def width(self) -> int:
+        """Numbers in a token: 512 + 36 P at the paper's sizes."""
+        return self.latent + 9 * STRIDE * (1 + self.slots)
+
+    def groups(self, device: torch.device | None = None) -> Tensor:
+        """Group of each number of a token. (D,) int"""
+        sizes = [self.latent + 9 * STRIDE] + [9 * STRIDE] * self.slots
+        return torch.arange(len(sizes), device=device).repeat_interleave(torch.tensor(sizes, device=device))
+
+    def group_levels(self, levels: Tensor) -> Tensor:
+        """Noise level of each group: a relation is as noisy as its noisier end. (..., P) -> (..., P, 1 + slots)
+
+        Otherwise a clean token would give away where its unknown partner is: `relation_noise="token"`
+        does that, for comparison.
+        """
+        own = levels[..., None]
+        if not self.slots:
+            return own
+        if self.relation_noise == "token":
+            return own.expand(*levels.shape, 1 + self.slots)
+        return torch.cat([own, torch.maximum(own, levels[..., partners(self.agents, levels.device)])], dim=-1)
+
+    def group_present(self, present: Tensor) -> Tensor:
+        """Whether each group speaks of people who are there. (B, P) -> (B, P, 1 + slots) bool"""
+        own = present[..., None]
+        if not self.slots:
+            return own
+        return torch.cat([own, own & present[..., partners(self.agents, present.device)]], dim=-1)
+
+    def spread(self, grouped: Tensor) -> Tensor:
+        """One value a group to one value a number. (..., 1 + slots) -> (..., D)"""
+        return grouped[..., self.groups(grouped.device)]
+
+    def pack(self, latent: Tensor, steps: Tensor, relations: Tensor) -> Tensor:
+        """(B, N, P, C), (B, N, P, 4, 9), (B, N, P, P - 1, 4, 9) -> (B, N, P, D)"""
+        parts = [latent, steps.flatten(-2)]
+        if self.slots:
+            parts.append(relations.flatten(-3))
+        return torch.cat(parts, dim=-1)
+
+    def unpack(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Inverse of `pack`; without relations the last one has no slots."""
+        sizes = [self.latent, 9 * STRIDE, 9 * STRIDE * self.slots]
+        latent, steps, relations = tokens.split(sizes, dim=-1)
+        return latent, steps.unflatten(-1, (STRIDE, 9)), relations.unflatten(-1, (self.slots, STRIDE, 9))
+
+
+def by_token(frames: Tensor) -> Tensor:
+    """Group the time axis into tokens, the frames inside a token last but one. (B, T, P, D) -> (B, N, P, 4, D)"""
+    B, T, P, D = frames.shape
+    if T % STRIDE:
+        raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the scene first")
+    return frames.view(B, T // STRIDE, STRIDE, P, D).transpose(2, 3)
+
+
+def by_frame(tokens: Tensor) -> Tensor:
+    """Inverse of `by_token`. (B, N, P, 4, D) -> (B, T, P, D)"""
+    return tokens.transpose(2, 3).flatten(1, 2)
+
+
+def scene_steps(scene: Scene) -> Tensor:
+    """Canonical steps in 9-D, a frame each. -> (B, T, P, 9)"""
+    return to_9d(canonical_steps(canonical_frame(scene.T_world_root)))
+
+
+def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Steps (B, N, P, 4, 9) and pairwise transforms (B, N, P, P - 1, 4, 9) of a scene, by token."""
+    return transforms(canonical_frame(scene.T_world_root))
+
+
+def transforms(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
+    P = T_world_can.shape[2]
+    steps = by_token(to_9d(canonical_steps(T_world_can)))
+    pairs = to_9d(pairwise(T_world_can))  # (B, T, P, P - 1, 9)
+    relations = by_token(pairs.flatten(-2)).unflatten(-1, (P - 1, 9)).transpose(-3, -2)
+    return steps, relations

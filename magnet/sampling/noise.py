@@ -1,0 +1,51 @@
+"""How noise is added and taken away, with a level of its own on every token (paper 3.2, A.3)."""
+
+import math
+
+import torch
+from torch import Tensor
+
+LEVELS = 1000
+"""K: level 0 is clean, level K is pure noise."""
+
+OFFSET = 0.008
+
+
+def alpha_bar(levels: Tensor, K: int = LEVELS) -> Tensor:
+    """Share of the signal's variance left at a noise level: cosine schedule. (...) int in 0..K -> (...) float32
+
+    The paper's formula is 0.99984 at level 0; divided by that, level 0 is clean bit for bit. Level K is
+    exactly 0, so nothing of the truth survives in a token at level K.
+    """
+    angle = (levels.double() / K + OFFSET) / (1 + OFFSET) * (math.pi / 2)
+    share = (angle.cos() / math.cos(OFFSET / (1 + OFFSET) * math.pi / 2)) ** 2
+    return torch.where(levels <= 0, 1.0, torch.where(levels >= K, 0.0, share)).float()
+
+
+def add_noise(clean: Tensor, noise: Tensor, levels: Tensor, K: int = LEVELS) -> Tensor:
+    """Forward process, paper Eq. 7. clean, noise (..., D); levels (..., D) or broadcastable -> (..., D)"""
+    alpha = alpha_bar(levels, K)
+    return alpha.sqrt() * clean + (1 - alpha).sqrt() * noise
+
+
+def ddim_step(noisy: Tensor, clean: Tensor, now: Tensor, after: Tensor, K: int = LEVELS) -> Tensor:
+    """One deterministic DDIM step (eta 0) from levels `now` down to `after`, given the predicted clean value.
+
+    Elements whose level stays come back bit-identical; those that reach level 0 become `clean` exactly.
+    """
+    a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
+    # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
+    noise = (noisy - a_now.sqrt() * clean) / (1 - a_now).clamp_min(1e-12).sqrt()
+    moved = a_after.sqrt() * clean + (1 - a_after).sqrt() * noise
+    return torch.where(now == after, noisy, torch.where(after == 0, clean, moved))
+
+
+def ddim_levels(steps: int, K: int = LEVELS) -> Tensor:
+    """The levels a token passes in `steps` denoising steps, from K down to 0. -> (S + 1,) int
+
+    Raises:
+        ValueError: fewer than one step, or more steps than levels.
+    """
+    if not 1 <= steps <= K:
+        raise ValueError(f"denoising steps: got {steps}, expected 1 to {K}")
+    return torch.tensor([K * (steps - s) // steps for s in range(steps + 1)])

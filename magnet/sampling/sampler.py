@@ -1,0 +1,130 @@
+"""The one sampling loop. It never asks which task it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling.noise import LEVELS, ddim_step
+from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
+
+
+class DenoiseFn(Protocol):
+    """Predicts clean tokens. noisy (B, N, P, D), levels (B, N, P) int, present (B, P) bool -> (B, N, P, D)"""
+
+    def __call__(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor: ...
+
+
+Settle = Callable[[Tensor, Tensor], Tensor]
+"""Called after each stage with the canvas (B, N, P, D) and which tokens it finished (N, P) bool; returns the
+canvas with those tokens made self-consistent (codes snapped, transforms recomputed from world poses)."""
+
+
+@torch.no_grad()
+def sample(
+    denoise: DenoiseFn,
+    schedule: MaskSchedule,
+    tokens: Tensor,
+    present: Tensor,
+    layout: TokenLayout,
+    generator: torch.Generator | None = None,
+    settle: Settle | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Tensor:
+    """Fill in what a schedule leaves open.
+
+    Args:
+        denoise: the model.
+        schedule: the plan.
+        tokens: (B, N, P, D) normalised tokens. Only those the schedule knows are read, and of those only
+            relations whose both ends are known; the rest may hold anything.
+        present: (B, P) bool.
+        layout: which numbers of a token share a level.
+        generator: source of all noise, on the tokens' device.
+        settle: see `Settle`.
+        progress: told 1 after each denoising step.
+
+    Returns:
+        (B, N, P, D). Known tokens come back bit-identical.
+    """
+    B, N, P, D = tokens.shape
+    if (N, P) != (schedule.tokens, schedule.agents):
+        raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
+    clean = layout.spread(layout.group_levels(initial_levels(schedule.known)) == 0).to(tokens.device)
+    noise = torch.randn(tokens.shape, generator=generator, device=tokens.device, dtype=tokens.dtype)
+    canvas = torch.where(clean, tokens, noise)
+    # What a view hides is shown as noise of its own, not as the noise that is about to become the token.
+    veil = torch.randn(tokens.shape, generator=generator, device=tokens.device, dtype=tokens.dtype)
+    for stage in schedule.stages:
+        window = slice(stage.start, stage.stop)
+        canvas[:, window] = run_stage(
+            denoise, stage, canvas[:, window], veil[:, window], present, layout, progress=progress
+        )
+        if settle is not None:
+            finished = torch.zeros(N, P, dtype=torch.bool)
+            finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
+            canvas = settle(canvas, finished)
+    return canvas
+
+
+def run_stage(
+    denoise: DenoiseFn,
+    stage: Stage,
+    tokens: Tensor,
+    veil: Tensor,
+    present: Tensor,
+    layout: TokenLayout,
+    progress: Callable[[int], None] | None = None,
+) -> Tensor:
+    """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)"""
+    device = tokens.device
+    levels = stage.levels.to(device)
+    hidden = None if stage.hidden is None else stage.hidden.to(device)
+    for now, after in zip(levels[:-1], levels[1:], strict=True):
+        if hidden is None:
+            clean = denoise(tokens, now.expand(len(tokens), -1, -1), present)
+            tokens = _step(tokens, clean, now, after, layout)
+        else:
+            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout)
+        if progress is not None:
+            progress(1)
+    return tokens
+
+
+def _step(tokens: Tensor, clean: Tensor, now: Tensor, after: Tensor, layout: TokenLayout) -> Tensor:
+    group_now, group_after = layout.group_levels(now), layout.group_levels(after)
+    return ddim_step(tokens, clean, layout.spread(group_now), layout.spread(group_after))
+
+
+def _step_in_views(
+    denoise: DenoiseFn,
+    tokens: Tensor,
+    veil: Tensor,
+    now: Tensor,
+    after: Tensor,
+    hidden: Tensor,
+    present: Tensor,
+    layout: TokenLayout,
+) -> Tensor:
+    """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)"""
+    B, W, P, D = tokens.shape
+    seen_now = torch.where(hidden, LEVELS, now)  # (P views, W, P)
+    seen_after = torch.where(hidden, LEVELS, after)
+    group = layout.spread(layout.group_levels(seen_now))  # (P views, W, P, D)
+    # A relation to somebody hidden is unknown too, although the token that carries it is not.
+    unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
+    views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, P views, W, P, D)
+    clean = denoise(
+        views.flatten(0, 1),
+        seen_now.expand(B, P, W, P).flatten(0, 1),
+        present[:, None].expand(B, P, P).flatten(0, 1),
+    ).unflatten(0, (B, P))
+    stepped = ddim_step(tokens[:, None], clean, group, layout.spread(layout.group_levels(seen_after)))
+    own = torch.arange(P, device=tokens.device)
+    return stepped[:, own, :, own].permute(1, 2, 0, 3)
+
+

@@ -1,0 +1,185 @@
+"""Mask schedules: a task as a plan of noise levels over (denoising step, token time, agent)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.sampling.noise import LEVELS, ddim_levels
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What a task plans on: N token steps of P agents, of which the first `context` steps are recorded."""
+
+    tokens: int  # N
+    agents: int  # P
+    context: int  # recorded token steps at the start, 0 for generation from nothing
+    steps: int = 30  # denoising steps S, paper A.3
+    window: int = 16  # token steps W that the model sees at once
+    stride: int = 4  # token steps finished before the window moves on
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.context <= self.tokens or self.agents < 1 or self.tokens < 1:
+            raise ValueError(f"no such grid: {self}")
+        if not 1 <= self.stride <= self.window:
+            raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
+
+    def mask(self) -> Tensor:
+        """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""
+        return torch.zeros(self.tokens, self.agents, dtype=torch.bool)
+
+    def past(self) -> Tensor:
+        """What has been recorded: the first `context` steps of everybody. (N, P) bool"""
+        mask = self.mask()
+        mask[: self.context] = True
+        return mask
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Some denoising steps on one position of the window.
+
+    Attributes:
+        start: token step at which the window begins.
+        levels: (S + 1, W, P) int in 0..K. Row s holds the levels before denoising step s, the last row
+            those after the last step. 0 is clean.
+        hidden: (P, W, P) bool or None. hidden[p, i, q]: while agent p's tokens are updated, the model must
+            not see agent q's token i. None: everybody sees everything. Where agents see different
+            things each is updated from a view of its own; views run as one batch.
+    """
+
+    start: int
+    levels: Tensor
+    hidden: Tensor | None = None
+
+    @property
+    def stop(self) -> int:
+        return self.start + self.levels.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class MaskSchedule:
+    """All stages of a task, in order, on a grid of N token steps and P agents.
+
+    Laws, checked when built: levels lie in 0..K; a column never rises, inside a stage or from one stage
+    to the next; a column starts either clean (known) or at K (unknown); each denoising step changes
+    something.
+
+    Raises:
+        ValueError: a law is broken; names the stage, step, token and agent.
+    """
+
+    tokens: int
+    agents: int
+    stages: tuple[Stage, ...]
+    known: Tensor  # (N, P) bool: given by the task; everything else starts as pure noise
+
+    def __post_init__(self) -> None:
+        if tuple(self.known.shape) != (self.tokens, self.agents):
+            raise ValueError(f"known: got {tuple(self.known.shape)}, expected {(self.tokens, self.agents)}")
+        level = initial_levels(self.known)
+        for number, stage in enumerate(self.stages):
+            rows = stage.levels
+            if rows.dim() != 3 or rows.shape[2] != self.agents or not 0 <= stage.start <= stage.stop <= self.tokens:
+                raise ValueError(
+                    f"stage {number}: levels {tuple(rows.shape)} at token {stage.start} do not fit "
+                    f"{self.tokens} token steps of {self.agents} agents"
+                )
+            if int(rows.min()) < 0 or int(rows.max()) > LEVELS:
+                raise ValueError(f"stage {number}: levels {int(rows.min())}..{int(rows.max())} outside 0..{LEVELS}")
+            history = torch.cat([level[stage.start : stage.stop][None], rows])
+            rises = history.diff(dim=0) > 0
+            if rises.any():
+                step, token, agent = rises.nonzero()[0].tolist()
+                raise ValueError(
+                    f"stage {number}: the level of token {stage.start + token} of agent {agent} rises "
+                    f"from {int(history[step, token, agent])} to {int(history[step + 1, token, agent])} "
+                    f"at step {step}; a column must never rise"
+                )
+            if not torch.equal(history[0], history[1]):
+                step, token, agent = (0, *(history[0] != history[1]).nonzero()[0].tolist())
+                raise ValueError(
+                    f"stage {number}: token {stage.start + token} of agent {agent} begins at level "
+                    f"{int(history[1, token, agent])} but was left at {int(history[0, token, agent])}"
+                )
+            idle = (rows.diff(dim=0) == 0).flatten(1).all(dim=1)
+            if idle.any():
+                raise ValueError(f"stage {number}: denoising step {int(idle.nonzero()[0])} changes nothing")
+            level[stage.start : stage.stop] = rows[-1]
+
+    @property
+    def evaluations(self) -> int:
+        """Denoising steps in all: how often the denoiser runs, guidance aside."""
+        return sum(stage.levels.shape[0] - 1 for stage in self.stages)
+
+    @property
+    def finished(self) -> Tensor:
+        """Which tokens end clean. (N, P) bool"""
+        return self.final_levels() == 0
+
+    def final_levels(self) -> Tensor:
+        """Levels after the last stage. (N, P) int"""
+        level = initial_levels(self.known)
+        for stage in self.stages:
+            level[stage.start : stage.stop] = stage.levels[-1]
+        return level
+
+    def rows(self) -> Iterator[Tensor]:
+        """The whole grid before each denoising step and after the last, for pictures. (N, P) int each"""
+        level = initial_levels(self.known)
+        yield level.clone()
+        for stage in self.stages:
+            for row in stage.levels[1:]:
+                level[stage.start : stage.stop] = row
+                yield level.clone()
+
+    @staticmethod
+    def together(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
+        """Denoise all targets at one level, window by window (paper 3.3, causal autoregression).
+
+        Args:
+            known: (N, P) bool, given clean.
+            target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
+            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`.
+        """
+        stages = []
+        level = initial_levels(known)
+        plan = ddim_levels(grid.steps)
+        for start, first, last in window_positions(target, grid):
+            stop = min(start + grid.window, grid.tokens)
+            active = target[start:stop].clone()
+            active[: first - start] = False
+            active[last - start :] = False
+            rows = torch.where(active, plan[:, None, None], level[start:stop])
+            stages.append(Stage(start, rows))
+            level[start:stop] = rows[-1]
+        return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+
+
+def initial_levels(known: Tensor) -> Tensor:
+    """Known tokens are clean, all others pure noise. (N, P) bool -> (N, P) int"""
+    return torch.where(known, 0, LEVELS)
+
+
+def window_positions(target: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
+    """Where the window stands: (start, first token step to denoise, one past the last), until all is done.
+
+    The first window is filled to its end; each later one keeps window - stride finished steps in view.
+    """
+    wanted = target.any(dim=1).nonzero()[:, 0].tolist()
+    if not wanted:
+        return
+    first, end = wanted[0], wanted[-1] + 1
+    # Leave room for at least one stride of new tokens behind the recorded ones.
+    start = max(0, min(first - (grid.window - grid.stride), grid.tokens - grid.window))
+    last = min(start + grid.window, end)
+    while True:
+        yield start, first, last
+        if last >= end:
+            return
+        first, last = last, min(last + grid.stride, end)
+        start = max(0, min(last - grid.window, grid.tokens - grid.window))

@@ -1,0 +1,126 @@
+"""Which tasks exist: ours, and those of installed packages (entry-point group `magnet.tasks`)."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
+from importlib.metadata import entry_points
+from typing import TypeVar
+
+GROUP = "magnet.tasks"
+VARIABLE = "MAGNET_TASKS"
+BUILT_IN = ("magnet.tasks.joint",)
+
+T = TypeVar("T", bound=type)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A task and where it came from."""
+
+    name: str
+    task: type
+    origin: str
+
+
+_tasks: dict[str, Registered] = {}
+_failures: dict[str, Exception] = {}
+_discovered = False
+
+
+def register_task(name: str, origin: str = "magnet") -> Callable[[T], T]:
+    """Class decorator that makes a task known under a name.
+
+    Raises:
+        TypeError: not a dataclass with a `schedule` method and a `formula`.
+        ValueError: the name is taken by another class.
+    """
+
+    def register(task: T) -> T:
+        _add(name, task, origin)
+        return task
+
+    return register
+
+
+def _add(name: str, task: type, origin: str) -> None:
+    missing = [part for part in ("schedule", "formula") if not hasattr(task, part)]
+    if not is_dataclass(task) or missing:
+        what = f"has no {' and no '.join(missing)}" if missing else "is not a dataclass"
+        raise TypeError(f"task {name}: {task!r} {what}; see docs/tasks.md")
+    known = _tasks.get(name)
+    if known is not None and known.task is not task:
+        raise ValueError(f"task name {name} is taken by {known.task.__module__}.{known.task.__qualname__}")
+    _tasks[name] = Registered(name, task, origin)
+
+
+def discover(again: bool = False) -> None:
+    """Load all tasks once. A plug-in that fails is kept in `failures` and hides no other."""
+    global _discovered
+    if _discovered and not again:
+        return
+    _discovered = True
+    for module in BUILT_IN:
+        importlib.import_module(module)
+    for point in entry_points(group=GROUP):
+        origin = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
+        _load(point.name, point.load, origin)
+    for value in filter(None, os.environ.get(VARIABLE, "").split(",")):
+        _load_variable(value.strip())
+
+
+def _load_variable(value: str) -> None:
+    def load() -> type:
+        module, _, name = value.partition(":")
+        return getattr(importlib.import_module(module), name or "Task")
+
+    name = value.partition(":")[2] or value
+    snake = "".join("_" + c.lower() if c.isupper() and i else c.lower() for i, c in enumerate(name))
+    _load(snake, load, f"{VARIABLE}={value}")
+
+
+def _load(name: str, load: Callable[[], type], origin: str) -> None:
+    try:
+        task = load()
+        if any(entry.task is task for entry in _tasks.values()):
+            return  # it has registered itself with the decorator
+        _add(name, task, origin)
+    except Exception as error:  # a stranger's import may raise anything
+        _failures[name] = error
+
+
+def names() -> list[str]:
+    """Names of all tasks."""
+    discover()
+    return sorted(_tasks)
+
+
+def entries() -> list[Registered]:
+    """All tasks with their origins, by name."""
+    discover()
+    return [_tasks[name] for name in sorted(_tasks)]
+
+
+def get(name: str) -> type:
+    """The class of a task.
+
+    Raises:
+        ValueError: no such task; suggests the closest name, or says why a plug-in of that name failed.
+    """
+    discover()
+    if name in _tasks:
+        return _tasks[name].task
+    if name in _failures:
+        raise ValueError(f"task {name} failed to load: {_failures[name]!r}") from _failures[name]
+    close = difflib.get_close_matches(name, _tasks, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise ValueError(f"no task named {name}{hint} There are: {', '.join(sorted(_tasks))}")
+
+
+def failures() -> dict[str, Exception]:
+    """Plug-ins that could not be loaded, with the error of each."""
+    discover()
+    return dict(_failures)

@@ -1,0 +1,31 @@
+"""Fixtures that several rooms share."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(7)
+
+
+@pytest.fixture
+def scene(generator: torch.Generator) -> Scene:
+    """Two scenes of three people, 64 frames of smooth random motion."""
+    return random_scene(2, 64, 3, generator)
+
+
+@pytest.fixture(scope="session")
+def cmu_root() -> Path:
+    """The folder of real recordings: MAGNET_CMU, or shared/data/cmu beside the repository."""
+    beside = Path(__file__).parents[2] / "shared" / "data" / "cmu"
+    root = Path(os.environ.get("MAGNET_CMU", beside))
+    if not root.is_dir():
+        pytest.skip(f"no CMU recordings at {root}; set MAGNET_CMU")
+    return root

@@ -1,0 +1,37 @@
+import pytest
+import torch
+
+from magnet.denoiser.levels import draw_levels, rollout_levels
+from magnet.sampling.noise import LEVELS
+
+KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_levels_span_clean_to_pure_noise_and_follow_the_seed(kind, generator):
+    levels = draw_levels(kind, 4000, 4, 2, generator)
+    assert levels.shape == (4000, 4, 2)
+    assert (int(levels.min()), int(levels.max())) == (0, LEVELS)
+    again = [draw_levels(kind, 8, 4, 2, torch.Generator().manual_seed(1)) for _ in range(2)]
+    assert torch.equal(*again)
+
+
+def test_tokens_are_independent_time_steps_shared_sequences_equal(generator):
+    per_token = draw_levels("per_token", 2000, 3, 2, generator).double().flatten(1)
+    correlation = torch.corrcoef(per_token.T) - torch.eye(6)
+    assert correlation.abs().max() < 0.1
+    per_timestep = draw_levels("per_timestep", 50, 3, 2, generator)
+    assert torch.equal(per_timestep[..., 0], per_timestep[..., 1])
+    per_sequence = draw_levels("per_sequence", 50, 3, 2, generator)
+    assert (per_sequence == per_sequence[:, :1, :1]).all()
+
+
+def test_a_roll_out_is_a_clean_past_a_block_and_an_unknown_future(generator):
+    levels = rollout_levels(3000, 16, 2, generator)
+    assert (levels.diff(dim=1) >= 0).all()
+    assert (levels[:, -1] == LEVELS).any() and (levels[:, 0] == 0).any()
+
+
+def test_an_unknown_kind_is_named(generator):
+    with pytest.raises(ValueError, match="got 'per_moon'"):
+        draw_levels("per_moon", 1, 1, 1, generator)

@@ -1,0 +1,75 @@
+import torch
+
+from magnet.denoiser.losses import consistency_losses, token_losses
+from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, pairwise, propagated
+from magnet.motion.rotations import geodesic
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TokenLayout, scene_transforms
+
+LAYOUT = TokenLayout(latent=8, agents=3)
+
+
+def packed(scene: Scene) -> torch.Tensor:
+    steps, relations = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, relations)
+
+
+def everybody(scene: Scene) -> torch.Tensor:
+    return torch.ones(scene.scenes, scene.frames // 4, 3, 3, dtype=torch.bool)
+
+
+def test_real_motion_is_consistent(scene: Scene):
+    for loss in consistency_losses(packed(scene), LAYOUT, everybody(scene)):
+        assert loss < 1e-6
+
+
+def test_consistency_equals_eq_11_computed_with_whole_matrices(scene: Scene, generator):
+    tokens = packed(scene)
+    yaw_noise = 0.1 * torch.randn(tokens.shape, generator=generator)
+    latent, steps, relations = LAYOUT.unpack(tokens)
+    shift = LAYOUT.unpack(yaw_noise)[1].clone()
+    shift[..., :6], shift[..., 7] = 0, 0  # ground shifts only, so that the transforms stay turns and shifts
+    noisy = LAYOUT.pack(latent, steps + shift, relations)
+
+    T_prev_can = from_9d((steps + shift).transpose(2, 3).flatten(1, 2))
+    T_self_partner = pairwise(canonical_frame(scene.T_world_root))
+    expected = propagated(T_self_partner, T_prev_can)
+    rotation = (1 - geodesic(expected[..., :3, :3], T_self_partner[:, 1:, ..., :3, :3]).cos()).mean()
+    error = (expected - T_self_partner[:, 1:])[..., :3, 3]
+    translation = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none").sum(-1).mean()
+    got_rotation, got_translation = consistency_losses(noisy, LAYOUT, everybody(scene))
+    assert torch.allclose(got_rotation, rotation, atol=1e-5)
+    assert torch.allclose(got_translation, translation, rtol=1e-4)
+
+
+def test_absent_agents_and_bad_frames_cost_nothing(scene: Scene, generator):
+    truth = packed(scene)
+    there = everybody(scene)
+    there[:, :, 2] = False
+    there[:, :, :, 2] = False
+    there[:, 5] = False
+    clean = truth.clone()
+    clean[:, :, 2] += 5
+    clean[:, 5] += 5
+    assert all(loss == 0 for loss in token_losses(clean, truth, LAYOUT, there).values())
+
+
+def test_each_part_is_averaged_by_itself(scene: Scene):
+    truth = packed(scene)
+    clean = truth.clone()
+    clean[..., :8] += 2.0  # Huber of 2 is 1.5
+    losses = token_losses(clean, truth, LAYOUT, everybody(scene))
+    assert losses["latent"].item() == 1.5
+    assert losses["step"] == losses["relation"] == 0
+
+
+def test_steps_and_relations_have_finite_gradients_at_zero():
+    tokens = torch.zeros(1, 2, 3, LAYOUT.width, requires_grad=True)
+    there = torch.ones(1, 2, 3, 3, dtype=torch.bool)
+    (gradient,) = torch.autograd.grad(sum(consistency_losses(tokens, LAYOUT, there)), tokens)
+    assert gradient.isfinite().all()
+
+
+def test_canonical_steps_are_what_the_first_frame_starts_from(scene: Scene):
+    steps = canonical_steps(canonical_frame(scene.T_world_root))
+    assert torch.equal(steps[:, 0], torch.eye(4).expand_as(steps[:, 0]))

@@ -1,0 +1,199 @@
+import pytest
+import roma
+import torch
+
+from magnet.motion.frames import (
+    canonical_frame,
+    canonical_steps,
+    from_9d,
+    from_planar,
+    inverse,
+    pairwise,
+    partners,
+    place,
+    pose_features,
+    posed,
+    propagated,
+    rigid,
+    to_9d,
+    to_planar,
+)
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import by_frame, scene_transforms
+from magnet.testing import random_scene
+
+PLACEMENTS = ["integrate", "anchor", "fuse"]
+
+
+def world_move(yaw: float, x: float, z: float) -> torch.Tensor:
+    return from_planar(torch.tensor(yaw), torch.tensor([x, z]))
+
+
+def pairs_by_frame(relations: torch.Tensor) -> torch.Tensor:
+    """(B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 4, 4)"""
+    return from_9d(relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2))
+
+
+def test_inverse_is_the_matrix_inverse(scene: Scene):
+    T = scene.T_world_root.double()
+    assert torch.allclose(inverse(T), torch.linalg.inv(T), atol=1e-6)
+
+
+def test_canonical_frame_stands_on_the_ground_and_turns_about_the_vertical(scene: Scene):
+    T_world_can = canonical_frame(scene.T_world_root)
+    assert torch.equal(T_world_can[..., 1, 3], torch.zeros_like(T_world_can[..., 1, 3]))
+    assert torch.allclose(T_world_can[..., :3, 1], torch.tensor([0.0, 1, 0]).expand_as(T_world_can[..., :3, 1]))
+    assert torch.equal(T_world_can[..., [0, 2], 3], scene.T_world_root[..., [0, 2], 3])
+
+
+def test_an_unturned_pelvis_faces_z():
+    T_world_root = torch.eye(4).expand(1, 3, 1, 4, 4)
+    assert torch.allclose(canonical_frame(T_world_root), torch.eye(4).expand(1, 3, 1, 4, 4))
+
+
+@pytest.mark.parametrize("yaw", [0.4, 3.0, -2.2])
+def test_what_tokens_hold_does_not_change_when_the_world_turns_and_shifts(scene: Scene, yaw: float):
+    moved = scene.moved(world_move(yaw, 3.0, -7.0))
+    for before, after in zip(scene_transforms(scene), scene_transforms(moved), strict=True):
+        assert torch.allclose(before, after, atol=1e-5)
+    assert torch.allclose(pose_features(scene), pose_features(moved), atol=1e-5)
+
+
+def test_eq_11_holds_exactly_on_motion(scene: Scene):
+    T_world_can = canonical_frame(scene.T_world_root.double())
+    T_self_partner = pairwise(T_world_can)
+    expected = propagated(T_self_partner, canonical_steps(T_world_can))
+    assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-12)
+
+
+def test_eq_11_holds_on_a_recorded_duet(cmu_root):
+    from magnet.datamodules.asf_amc import read_pair_roots
+
+    T_world_root = read_pair_roots(cmu_root / "salsa", 60, 61, 10)
+    T_world_can = canonical_frame(T_world_root.double())
+    T_self_partner = pairwise(T_world_can)
+    expected = propagated(T_self_partner, canonical_steps(T_world_can))
+    assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_thousand_frames_come_back_within_a_tenth_of_a_millimetre(placement, generator):
+    scene = random_scene(2, 1000, 3, generator)
+    T_world_can = canonical_frame(scene.T_world_root)
+    steps, relations = scene_transforms(scene)
+    T_prev_can, T_self_partner = from_9d(by_frame(steps)), pairs_by_frame(relations)
+    placed = place(T_prev_can[:, 1:], T_self_partner[:, 1:], T_world_can[:, 0], placement)
+    assert (placed - T_world_can[:, 1:])[..., :3, 3].norm(dim=-1).max() < 1e-4
+
+
+def test_pose_features_and_canonical_frames_give_the_scene_back(scene: Scene):
+    back = posed(pose_features(scene), canonical_frame(scene.T_world_root), scene)
+    assert torch.allclose(back.body_rot, scene.body_rot, atol=1e-5)
+    assert torch.allclose(back.T_world_root, scene.T_world_root, atol=1e-5)
+
+
+def test_permuting_agents_permutes_everything(scene: Scene):
+    order = torch.tensor([2, 0, 1])
+    steps, relations = scene_transforms(scene)
+    steps_ordered, relations_ordered = scene_transforms(scene.order(order))
+    assert torch.equal(steps[:, :, order], steps_ordered)
+    table = partners(3)
+    for agent in range(3):
+        for slot, partner in enumerate(table[agent].tolist()):
+            old, old_partner = order[agent], order[partner]
+            old_slot = table[old].tolist().index(int(old_partner))
+            assert torch.equal(relations_ordered[:, :, agent, slot], relations[:, :, old, old_slot])
+
+
+@pytest.mark.parametrize("placement", ["integrate", "fuse"])
+def test_placement_is_the_same_for_all_agents(scene: Scene, placement, generator):
+    """Noisy predictions, agents permuted: the placed agents are permuted, nothing else."""
+    order = torch.tensor([2, 0, 1])
+    T_world_can = canonical_frame(scene.T_world_root)
+    noise = 0.02 * torch.randn(scene.scenes, scene.frames, 3, generator=generator)
+
+    def placed(agents: torch.Tensor) -> torch.Tensor:
+        T = T_world_can[:, :, agents]
+        steps = canonical_steps(T)
+        steps = from_planar(to_planar(steps)[0] + noise[:, :, agents], to_planar(steps)[1])
+        return place(steps[:, 1:], pairwise(T)[:, 1:], T[:, 0], placement, trust=0.3)
+
+    assert torch.allclose(placed(torch.arange(3))[:, :, order], placed(order), atol=1e-5)
+
+
+def test_fuse_equals_a_general_least_squares_solver(generator):
+    """One frame, noisy steps and pairs, yaws known: the ground positions minimise the stated sum of squares."""
+    P, trust = 3, 0.4
+    start = random_scene(1, 1, P, generator).T_world_root
+    T_start = canonical_frame(start)[:, 0].double()
+    step = from_planar(torch.zeros(1, 1, P), 0.1 * torch.randn(1, 1, P, 2, generator=generator)).double()
+    stepped = T_start[:, None] @ step
+    exact = pairwise(stepped)
+    yaw, ground = to_planar(exact)
+    pairs = from_planar(yaw, ground + 0.1 * torch.randn(ground.shape, generator=generator).double())
+    placed = to_planar(place(step, pairs, T_start, "fuse", trust))[1][0, 0]  # (P, 2)
+
+    rows, right = [], []
+    for p in range(P):
+        row = torch.zeros(P).double()
+        row[p] = 1
+        rows.append(row)
+        right.append(to_planar(stepped)[1][0, 0, p])
+        for slot, q in enumerate(partners(P)[p].tolist()):
+            row = torch.zeros(P).double()
+            row[q], row[p] = trust**0.5, -(trust**0.5)
+            rows.append(row)
+            R_world_self = stepped[0, 0, p, :3, :3]
+            right.append(trust**0.5 * (R_world_self @ pairs[0, 0, p, slot, :3, 3])[[0, 2]])
+    solution = torch.linalg.lstsq(torch.stack(rows), torch.stack(right)).solution
+    assert torch.allclose(placed, solution, atol=1e-9)
+
+
+def test_fuse_does_not_listen_to_absent_agents(scene: Scene):
+    T_world_can = canonical_frame(scene.T_world_root)
+    steps, pairs = canonical_steps(T_world_can), pairwise(T_world_can)
+    present = torch.tensor([[True, True, False]]).expand(scene.scenes, 3)
+    noise = pairs.clone()
+    table = partners(3)
+    noise[:, :, table == 2] = torch.eye(4)
+    noise[:, :, 2] = torch.eye(4)
+    start = T_world_can[:, 0]
+    placed = place(steps[:, 1:], noise[:, 1:], start, "fuse", present=present)
+    assert torch.allclose(placed[:, :, :2], T_world_can[:, 1:, :2], atol=1e-5)
+
+
+def test_fuse_bounds_the_drift_between_agents(generator):
+    """With noisy steps, integrating drifts apart without bound; fused agents stay together."""
+    scene = random_scene(1, 600, 2, generator)
+    T_world_can = canonical_frame(scene.T_world_root)
+    yaw, ground = to_planar(canonical_steps(T_world_can))
+    noisy = from_planar(yaw, ground + 0.01 * torch.randn(ground.shape, generator=generator))
+    apart = {}
+    for placement in PLACEMENTS:
+        placed = place(noisy[:, 1:], pairwise(T_world_can)[:, 1:], T_world_can[:, 0], placement)
+        off = pairwise(placed)[..., :3, 3] - pairwise(T_world_can[:, 1:])[..., :3, 3]
+        apart[placement] = off.norm(dim=-1).mean().item()
+    assert apart["anchor"] < 1e-4
+    assert apart["fuse"] < 0.3 * apart["integrate"]
+
+
+def test_a_person_lying_on_the_side_keeps_the_last_yaw():
+    lying = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, torch.pi / 2]))
+    upright = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.7, 0.0]))
+    rotations = torch.stack([upright, lying, lying, upright])[None, :, None]
+    T = rigid(rotations, torch.zeros(1, 4, 1, 3))
+    yaw, _ = to_planar(canonical_frame(T))
+    assert torch.allclose(yaw[0, :, 0], torch.tensor(0.7).expand(4), atol=1e-5)
+    first_lying = rigid(lying.expand(1, 2, 1, 3, 3), torch.zeros(1, 2, 1, 3))
+    assert canonical_frame(first_lying).isfinite().all()
+
+
+def test_bowing_past_the_horizontal_does_not_turn_a_person_round():
+    for angle in (0.5, 1.5, 2.0):
+        R = roma.rotvec_to_rotmat(torch.tensor([angle, 0.0, 0.0]))
+        yaw, _ = to_planar(canonical_frame(rigid(R.expand(1, 1, 1, 3, 3), torch.zeros(1, 1, 1, 3))))
+        assert yaw.abs().max() < 1e-6
+
+
+def test_9d_round_trip(scene: Scene):
+    assert torch.allclose(from_9d(to_9d(scene.T_world_root)), scene.T_world_root, atol=1e-6)

@@ -1,0 +1,60 @@
+import pytest
+import torch
+
+from magnet.motion.scene import Scene, concatenate
+from magnet.testing import random_scene
+
+
+def test_saved_and_loaded_scenes_are_equal(scene: Scene, tmp_path):
+    scene = scene.replace(names=("a", "b"), valid=torch.ones(2, 64, dtype=torch.bool))
+    loaded = Scene.load(scene.save(tmp_path / "two"))
+    for name, value in scene.tensors().items():
+        assert torch.equal(value, getattr(loaded, name))
+    assert (loaded.fps, loaded.body, loaded.names) == (scene.fps, scene.body, scene.names)
+
+
+def test_a_file_that_is_no_scene_is_named(tmp_path):
+    path = tmp_path / "no.npz"
+    path.write_bytes(b"PK nothing")
+    with pytest.raises(ValueError, match=r"no\.npz: not a scene file"):
+        Scene.load(path)
+
+
+def test_a_missing_file_is_not_called_broken(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Scene.load(tmp_path / "absent.npz")
+
+
+def test_wrong_shapes_are_named(scene: Scene):
+    with pytest.raises(ValueError, match=r"betas: got \(2, 2, 10\), expected \(2, 3, 10\)"):
+        scene.replace(betas=scene.betas[:, :2])
+
+
+def test_padding_adds_nobody(scene: Scene):
+    padded = scene.pad_agents(5)
+    assert padded.present.sum() == scene.present.sum()
+    assert torch.equal(padded.T_world_root[:, :, :3], scene.T_world_root)
+    with pytest.raises(ValueError, match="room was asked for 2"):
+        scene.pad_agents(2)
+
+
+def test_concatenated_scenes_come_back_by_picking(scene: Scene, generator):
+    other = random_scene(1, 64, 4, generator)
+    both = concatenate([scene, other])
+    assert (both.scenes, both.agents) == (3, 4)
+    assert torch.equal(both.pick([2]).T_world_root, other.T_world_root)
+    assert torch.equal(both.pick(slice(0, 2)).pad_agents(4).betas[:, :3], scene.betas)
+
+
+def test_repeat_keeps_samples_of_a_scene_together(scene: Scene):
+    repeated = scene.replace(names=("a", "b")).repeat(3)
+    assert repeated.names == ("a", "a", "a", "b", "b", "b")
+    assert torch.equal(repeated.T_world_root[4], scene.T_world_root[1])
+
+
+def test_absent_agents_are_not_moved(generator):
+    present = torch.tensor([[True, True, False]])
+    scene = random_scene(1, 8, 3, generator, present=present)
+    T = torch.eye(4)
+    T[0, 3] = 5.0
+    assert torch.equal(scene.moved(T).T_world_root[:, :, 2], scene.T_world_root[:, :, 2])

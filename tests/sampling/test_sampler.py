@@ -1,0 +1,160 @@
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.sampler import sample
+from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+
+LAYOUT = TokenLayout(latent=6, agents=3)
+PRESENT = torch.ones(2, 3, dtype=torch.bool)
+
+
+def joint(grid: Grid) -> MaskSchedule:
+    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+
+
+def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+    """A toy denoiser in which everything depends on everything, and no agent has a name."""
+    pooled = (noisy * (1 + levels[..., None] / LEVELS)).mean(dim=(1, 2), keepdim=True)
+    return torch.tanh(noisy.roll(1, dims=1) + pooled)
+
+
+def make_tokens(grid: Grid, generator: torch.Generator) -> Tensor:
+    return torch.randn(2, grid.tokens, grid.agents, LAYOUT.width, generator=generator)
+
+
+def run(grid: Grid, tokens: Tensor, seed: int = 0, denoise=mixing, **options) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return sample(denoise, joint(grid), tokens, PRESENT, LAYOUT, generator, **options)
+
+
+GRID = Grid(tokens=30, agents=3, context=5, steps=4)
+
+
+def test_context_tokens_return_bit_identical(generator):
+    tokens = make_tokens(GRID, generator)
+    assert torch.equal(run(GRID, tokens)[:, :5], tokens[:, :5])
+
+
+def test_an_oracle_gives_the_truth_back(generator):
+    tokens = make_tokens(GRID, generator)
+    position = iter([stage for stage in joint(GRID).stages for _ in range(GRID.steps)])
+
+    def oracle(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        stage = next(position)
+        return tokens[:, stage.start : stage.stop]
+
+    assert torch.equal(run(GRID, tokens, denoise=oracle), tokens)
+
+
+def test_what_is_not_known_cannot_influence_the_sample(generator):
+    tokens = make_tokens(GRID, generator)
+    other = tokens.clone()
+    other[:, 5:] = torch.randn(other[:, 5:].shape, generator=generator) * 100
+    assert torch.equal(run(GRID, tokens), run(GRID, other))
+
+
+def test_the_future_may_even_be_missing(generator):
+    tokens = make_tokens(GRID, generator)
+    other = tokens.clone()
+    other[:, 5:] = torch.nan
+    assert torch.equal(run(GRID, tokens), run(GRID, other))
+
+
+def test_same_seed_same_sample_other_seed_other_sample(generator):
+    tokens = make_tokens(GRID, generator)
+    assert torch.equal(run(GRID, tokens, 1), run(GRID, tokens, 1))
+    assert not torch.equal(run(GRID, tokens, 1), run(GRID, tokens, 2))
+
+
+def test_the_denoiser_runs_as_often_as_the_schedule_says(generator):
+    calls = []
+
+    def counting(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        calls.append(levels)
+        return mixing(noisy, levels, present)
+
+    steps = []
+    run(GRID, make_tokens(GRID, generator), denoise=counting, progress=steps.append)
+    assert len(calls) == joint(GRID).evaluations == sum(steps)
+
+
+def test_agents_have_no_names_in_the_loop(generator):
+    """A denoiser blind to the agents' order gives permuted samples for permuted agents and noise."""
+    order = torch.tensor([2, 0, 1])
+    layout = TokenLayout(latent=6, agents=3, relations=False)
+    tokens = torch.randn(2, 30, 3, layout.width, generator=generator)
+
+    def noise_of(permuted: bool):
+        noise = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(3))
+        return noise[:, :, order] if permuted else noise
+
+    def run_with(given: Tensor, noise: Tensor) -> Tensor:
+        def first_call_noise(*shape, **kwargs):
+            return noise.clone()
+
+        original, torch.randn = torch.randn, first_call_noise
+        try:
+            return sample(mixing, joint(GRID), given, PRESENT, layout)
+        finally:
+            torch.randn = original
+
+    plain = run_with(tokens, noise_of(False))
+    permuted = run_with(tokens[:, :, order], noise_of(True))
+    assert torch.allclose(plain[:, :, order], permuted, atol=1e-6)
+
+
+def test_relations_to_unknown_agents_are_never_shown(generator):
+    """Agent 1 known throughout, agent 0 not: agent 1's slot toward agent 0 must not hold the truth."""
+    grid = Grid(tokens=6, agents=3, context=0, steps=3)
+    known = grid.mask()
+    known[:, 1] = True
+    schedule = MaskSchedule.together(known, ~known, grid)
+    tokens = make_tokens(grid, generator)
+    seen = []
+
+    def watching(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        seen.append(noisy.clone())
+        return mixing(noisy, levels, present)
+
+    sample(watching, schedule, tokens, PRESENT, LAYOUT, generator)
+    own = LAYOUT.groups() == 0
+    toward_unknown = ~own
+    assert torch.equal(seen[0][:, :, 1][..., own], tokens[:, :, 1][..., own])
+    assert (seen[0][:, :, 1][..., toward_unknown] != tokens[:, :, 1][..., toward_unknown]).all()
+
+
+def hiding_stage(grid: Grid) -> Stage:
+    """Everybody denoises the last step at once, without seeing the others'."""
+    levels = torch.zeros(3, grid.tokens, grid.agents, dtype=torch.long)
+    levels[:, -1] = torch.tensor([1000, 500, 0])[:, None]
+    hidden = torch.zeros(grid.agents, grid.tokens, grid.agents, dtype=torch.bool)
+    hidden[:, -1] = ~torch.eye(grid.agents, dtype=torch.bool)
+    return Stage(0, levels, hidden)
+
+
+def test_what_a_view_hides_cannot_influence_it(generator):
+    """With the others' current tokens hidden, perturbing what the model says of them changes nothing."""
+    grid = Grid(tokens=4, agents=3, context=3)
+    schedule = MaskSchedule(4, 3, (hiding_stage(grid),), grid.past())
+    tokens = make_tokens(grid, generator)
+
+    def run_with(extra: float) -> Tensor:
+        def denoise(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+            clean = mixing(noisy, levels, present)
+            clean[:, -1, 2] += extra
+            return clean
+
+        return sample(denoise, schedule, tokens, PRESENT, LAYOUT, torch.Generator().manual_seed(0))
+
+    a, b = run_with(0.0), run_with(50.0)
+    own = LAYOUT.groups() == 0
+    assert torch.equal(a[:, -1, :2], b[:, -1, :2])
+    assert not torch.equal(a[:, -1, 2][..., own], b[:, -1, 2][..., own])
+
+
+def test_grid_and_tokens_must_fit(generator):
+    with pytest.raises(ValueError, match="tokens are 7 x 3"):
+        run(GRID, torch.zeros(2, 7, 3, LAYOUT.width))

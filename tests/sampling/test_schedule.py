@@ -1,0 +1,82 @@
+import pytest
+import torch
+
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+
+GRIDS = [
+    Grid(tokens=46, agents=2, context=8),
+    Grid(tokens=12, agents=3, context=8, steps=5),
+    Grid(tokens=20, agents=1, context=0, steps=3),
+    Grid(tokens=9, agents=4, context=1, steps=2, window=4, stride=2),
+    Grid(tokens=100, agents=2, context=1, steps=2),
+]
+
+
+def joint(grid: Grid) -> MaskSchedule:
+    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=str)
+def test_everything_asked_for_ends_clean(grid: Grid):
+    assert joint(grid).finished.all()
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=str)
+def test_each_token_is_denoised_in_exactly_the_steps_asked_for(grid: Grid):
+    rows = torch.stack(list(joint(grid).rows()))
+    changes = (rows.diff(dim=0) != 0).sum(dim=0)
+    assert (changes[grid.context :] == grid.steps).all()
+    assert (changes[: grid.context] == 0).all()
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=str)
+def test_later_windows_see_at_least_window_minus_stride_finished_steps(grid: Grid):
+    for stage in joint(grid).stages[1:]:
+        finished = (stage.levels[0] == 0).all(dim=1).sum()
+        assert finished >= min(grid.window, grid.tokens) - grid.stride
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=str)
+def test_no_window_is_longer_than_what_the_model_was_trained_on(grid: Grid):
+    assert all(stage.levels.shape[1] <= grid.window for stage in joint(grid).stages)
+
+
+def stage(*rows: int) -> Stage:
+    return Stage(0, torch.tensor(rows)[:, None, None])
+
+
+def schedule(*stages: Stage, known: bool = False) -> MaskSchedule:
+    return MaskSchedule(1, 1, stages, torch.tensor([[known]]))
+
+
+@pytest.mark.parametrize(
+    ("stages", "known", "message"),
+    [
+        ([stage(1000, 400, 500, 0)], False, "token 0 of agent 0 rises from 400 to 500 at step 2"),
+        ([stage(1000, 500), stage(600, 0)], False, "rises from 500 to 600"),
+        ([stage(1000, 500), stage(400, 0)], False, "begins at level 400 but was left at 500"),
+        ([stage(900, 0)], False, "begins at level 900 but was left at 1000"),
+        ([stage(1000, 0)], True, "rises from 0 to 1000"),
+        ([stage(1000, 500, 500, 0)], False, "step 1 changes nothing"),
+        ([stage(1000, 500, -3)], False, "outside 0..1000"),
+        ([Stage(1, torch.tensor([[[1000]], [[0]]]))], False, "do not fit"),
+    ],
+)
+def test_a_broken_law_names_the_place(stages, known, message):
+    with pytest.raises(ValueError, match=message):
+        schedule(*stages, known=known)
+
+
+def test_unfinished_columns_stay_where_they_are():
+    plan = schedule(stage(1000, 500))
+    assert plan.final_levels().item() == 500
+    assert not plan.finished.any()
+
+
+def test_a_lone_unknown_future_stays_at_pure_noise():
+    grid = Grid(tokens=16, agents=2, context=8)
+    target = ~grid.past()
+    target[:, 1] = False
+    plan = MaskSchedule.together(grid.past(), target, grid)
+    assert (plan.final_levels()[8:, 1] == LEVELS).all()
