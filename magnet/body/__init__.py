@@ -1,0 +1,17 @@
+"""Body models: shape, joints, vertices and capsules of a person; the mirror image of a scene."""
+
+from magnet.body.base import JOINT_NAMES, MIRROR, PARENTS, Body, load_body
+from magnet.body.capsules import CAPSULES, Capsule, capsule_segments
+from magnet.body.mirror import mirror_scene
+
+__all__ = [
+    "CAPSULES",
+    "JOINT_NAMES",
+    "MIRROR",
+    "PARENTS",
+    "Body",
+    "Capsule",
+    "capsule_segments",
+    "load_body",
+    "mirror_scene",
+]

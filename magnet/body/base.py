@@ -1,0 +1,322 @@
+"""What a body model is: shape numbers to rest joints, rotations and pelvis poses to joints or vertices.
+
+A body is read from an npz file with SMPL-X's keys. Hands, jaw and eyes stay at rest, so that every joint
+beyond the 22 moves rigidly with its nearest ancestor among them; their skinning weights are added to it.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+JOINT_NAMES: tuple[str, ...] = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+MIRROR: tuple[int, ...] = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20)
+"""Index of each joint's counterpart on the other side; joints on the midline are their own."""
+
+SHAPES = 10
+"""Shape numbers a body has; further ones in a file are left out."""
+
+
+def _levels() -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
+    """Joints of equal depth below the pelvis, and where each one's parent stands in the level above."""
+    levels: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
+    above: tuple[int, ...] = (0,)
+    while above:
+        here = tuple(j for j, parent in enumerate(PARENTS) if parent in above)
+        if here:
+            levels.append((here, tuple(above.index(PARENTS[j]) for j in here)))
+        above = here
+    return tuple(levels)
+
+
+LEVELS = _levels()
+BY_LEVEL = (0, *(j for joints, _ in LEVELS for j in joints))
+FROM_LEVEL = tuple(BY_LEVEL.index(j) for j in range(BODY_JOINTS))
+
+
+class Body(nn.Module):
+    """A frozen body model; its tensors are float32 buffers that checkpoints do not store.
+
+    They stay out of checkpoints because a user's body may not be redistributed; `id` says which one it was.
+    Input in float64 is computed in float64; half precision is computed in float32.
+
+    Args:
+        id: name that scenes and checkpoints carry, so that shapes never meet another body.
+        J_template: (22, 3) rest joints at zero shape, metres.
+        J_shapedirs: (22, 3, 10) what a unit of each shape number adds.
+        v_template, shapedirs: (V, 3), (V, 3, 10), the same for the vertices.
+        weights: (V, 22) skinning weights; rows sum to one.
+        faces: (F, 3) int.
+        posedirs: (V, 3, 189) pose correctives over the 21 rotations less the identity, or None.
+    """
+
+    J_template: Tensor
+    J_shapedirs: Tensor
+    v_template: Tensor
+    shapedirs: Tensor
+    weights: Tensor
+    faces: Tensor
+    posedirs: Tensor | None
+
+    def __init__(
+        self,
+        id: str,
+        J_template: Tensor,
+        J_shapedirs: Tensor,
+        v_template: Tensor,
+        shapedirs: Tensor,
+        weights: Tensor,
+        faces: Tensor,
+        posedirs: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.id = id
+        tensors = {
+            "J_template": J_template,
+            "J_shapedirs": J_shapedirs,
+            "v_template": v_template,
+            "shapedirs": shapedirs,
+            "weights": weights,
+            "faces": faces,
+            "posedirs": posedirs,
+        }
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor, persistent=False)
+
+    def rest_joints(self, betas: Tensor) -> Tensor:
+        """Joints in the rest pose, in the body file's own frame. (..., 10) -> (..., 22, 3) metres"""
+        betas = _wide(betas)
+        return self.J_template.to(betas) + _blend(self.J_shapedirs, betas)
+
+    def forward_kinematics(self, body_rot: Tensor, T_world_root: Tensor, betas: Tensor) -> Tensor:
+        """World joints. (..., 21, 3, 3), (..., 4, 4), (..., 10) -> (..., 22, 3) metres
+
+        Leading dimensions broadcast. Differentiable in all three.
+        """
+        return self._chain(body_rot, T_world_root, self.rest_joints(betas))[1]
+
+    def joints(self, scene: Scene) -> Tensor:
+        """World joints of everybody in a scene. -> (B, T, P, 22, 3) metres; absent agents stand at the origin.
+
+        Raises:
+            ValueError: the scene's shapes belong to another body.
+        """
+        self._check(scene)
+        return self.forward_kinematics(scene.body_rot, scene.T_world_root, scene.betas[:, None])
+
+    def vertices(self, scene: Scene) -> Tensor:
+        """World vertices of everybody in a scene, by linear blend skinning. -> (B, T, P, V, 3) metres
+
+        Raises:
+            ValueError: the scene's shapes belong to another body.
+        """
+        self._check(scene)
+        rest_joints = self.rest_joints(scene.betas[:, None])
+        R, t = self._chain(scene.body_rot, scene.T_world_root, rest_joints)
+        rest = self.v_template.to(rest_joints) + _blend(self.shapedirs, scene.betas[:, None].to(rest_joints))
+        with _exact(R):
+            if self.posedirs is not None:
+                bend = _wide(scene.body_rot) - torch.eye(3, dtype=R.dtype, device=R.device)
+                rest = rest + _blend(self.posedirs, bend.flatten(-3))
+            # A joint takes a point x of the rest body to R (x - rest joint) + t = R x + shift.
+            shift = t - (R @ rest_joints[..., None])[..., 0]
+            # Vertices last: every product below runs along long rows.
+            blended = torch.cat([R.flatten(-2), shift], dim=-1).transpose(-1, -2) @ self.weights.to(R).T
+            turn = blended[..., :9, :].unflatten(-2, (3, 3))
+            moved = (turn * rest.transpose(-1, -2)[..., None, :, :]).sum(-2) + blended[..., 9:, :]
+            return moved.transpose(-1, -2).contiguous()
+
+    def _check(self, scene: Scene) -> None:
+        if scene.body != self.id:
+            raise ValueError(
+                f"the scene's shape numbers belong to body {scene.body!r}, but this body is {self.id!r}; load the "
+                f"scene's own body with load_body, or fit this one to the scene's joints with fit_body"
+            )
+
+    def _chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
+        """World rotations (..., 22, 3, 3) and positions (..., 22, 3): one batch of products a level of the tree."""
+        body_rot, T_world_root = _wide(body_rot), _wide(T_world_root)
+        parents = list(PARENTS[1:])
+        offset = (rest_joints[..., 1:, :] - rest_joints[..., parents, :])[..., None]
+        with _exact(body_rot):
+            R, t = T_world_root[..., None, :3, :3], T_world_root[..., None, :3, 3]
+            Rs, ts = [R], [t]
+            for joints, parent in LEVELS:
+                mine = [j - 1 for j in joints]
+                R, t = R[..., parent, :, :], t[..., parent, :]
+                t = t + (R @ offset[..., mine, :, :])[..., 0]
+                R = R @ body_rot[..., mine, :, :]
+                Rs.append(R)
+                ts.append(t)
+            lead = torch.broadcast_shapes(Rs[-1].shape[:-3], ts[-1].shape[:-2])
+            Rs = [level.expand(*lead, *level.shape[-3:]) for level in Rs]
+            ts = [level.expand(*lead, *level.shape[-2:]) for level in ts]
+            order = list(FROM_LEVEL)
+            return torch.cat(Rs, dim=-3)[..., order, :, :], torch.cat(ts, dim=-2)[..., order, :]
+
+
+def _exact(like: Tensor) -> torch.autocast:
+    """Mixed precision would round a chain of matrix products to centimetres."""
+    return torch.autocast(like.device.type, enabled=False)
+
+
+def _wide(tensor: Tensor) -> Tensor:
+    return tensor if tensor.dtype == torch.float64 else tensor.float()
+
+
+def _blend(directions: Tensor, amounts: Tensor) -> Tensor:
+    """(N, 3, C), (..., C) -> (..., N, 3)"""
+    with _exact(amounts):
+        flat = directions.flatten(0, 1).to(amounts)
+        return (amounts @ flat.T).unflatten(-1, (directions.shape[0], 3))
+
+
+# -- reading a file ----------------------------------------------------------------------------
+
+
+def load_body(which: str | Path = "open") -> Body:
+    """The open body that ships with the package ("open"), or one from a file with SMPL-X's npz keys.
+
+    The file is never unpickled. Its id is its own `body_id` if it has one, else made from the file's name:
+    SMPLX_NEUTRAL.npz is "smplx-neutral". Each call gives a module of its own; "open" is read only once.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, lacks a key, or a shape does not fit; says which.
+    """
+    if str(which) == "open":
+        return Body(**_open_body())
+    return Body(**_read(Path(which)))  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=1)
+def _open_body() -> dict:
+    with resources.as_file(resources.files("magnet.body") / "open_body.npz") as path:
+        return _read(path)
+
+
+KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
+
+
+def _arrays(path: Path) -> dict[str, NDArray]:
+    """The numeric arrays of an npz that a body is made from."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such body file; give the path of a SMPL-X npz, or 'open'")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not a readable body file (no npz archive, or cut short); download or copy it again")
+    wanted = (*KEYS, "J_regressor", "J_template", "J_shapedirs", "posedirs", "body_id")
+    name = ""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            there = set(file.files)
+            arrays = {}
+            for name in wanted:
+                if name in there:
+                    arrays[name] = file[name]
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        at = f" at key {name!r}" if name else ""
+        raise ValueError(
+            f"{path}: not a readable body file{at} ({error}); expected SMPL-X's npz with plain numeric arrays "
+            f"(pickles are refused); download or copy it again"
+        ) from error
+    missing = [key for key in KEYS if key not in arrays]
+    if "J_regressor" not in arrays and not {"J_template", "J_shapedirs"} <= set(arrays):
+        missing.append("J_regressor")
+    if missing:
+        has = ", ".join(sorted(there))
+        raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {has}; expected SMPL-X's npz")
+    return arrays
+
+
+def _check_shapes(path: Path, arrays: dict[str, NDArray]) -> None:
+    V, columns = arrays["v_template"].shape[:1], arrays["shapedirs"].shape[-1:]
+    K = arrays["kintree_table"].shape[-1:]
+    if (columns or (0,))[0] < SHAPES or (K or (0,))[0] < BODY_JOINTS:
+        raise ValueError(
+            f"{path}: shapedirs {arrays['shapedirs'].shape} and kintree_table {arrays['kintree_table'].shape}: "
+            f"expected (V, 3, at least {SHAPES}) and (2, at least {BODY_JOINTS})"
+        )
+    J_columns = arrays["J_shapedirs"].shape[-1:] if "J_shapedirs" in arrays else columns
+    expected = {
+        "v_template": (*V, 3),
+        "shapedirs": (*V, 3, *columns),
+        "weights": (*V, *K),
+        "kintree_table": (2, *K),
+        "f": (*arrays["f"].shape[:1], 3),
+        "J_regressor": (*K, *V),
+        "J_template": (*K, 3),
+        "J_shapedirs": (*K, 3, *J_columns),
+        "posedirs": (*V, 3, 9 * (K[0] - 1)),
+    }
+    for name, want in expected.items():
+        if name in arrays and arrays[name].shape != want:
+            raise ValueError(f"{path}: {name} is {arrays[name].shape}, expected {want}")
+    if (J_columns or (0,))[0] < SHAPES:
+        raise ValueError(f"{path}: J_shapedirs is {arrays['J_shapedirs'].shape}, expected at least {SHAPES} columns")
+
+
+def _read(path: Path) -> dict[str, object]:
+    arrays = _arrays(path)
+    body_id = str(arrays.pop("body_id", path.stem.lower().replace("_", "-")))
+    for name, array in arrays.items():
+        if array.dtype.kind not in "iuf":
+            raise ValueError(f"{path}: {name} holds {array.dtype}, expected numbers")
+    _check_shapes(path, arrays)
+    V, faces = len(arrays["v_template"]), arrays["f"].astype(np.int64)
+    if faces.size and (faces.min() < 0 or faces.max() >= V):
+        raise ValueError(f"{path}: f names vertices {faces.min()} to {faces.max()}, but there are {V}")
+    double = {name: array.astype(np.float64) for name, array in arrays.items() if name not in ("f", "kintree_table")}
+    bad = [name for name, array in double.items() if not np.isfinite(array).all()]
+    if bad:
+        raise ValueError(f"{path}: {', '.join(bad)} hold NaN or infinity; download or copy it again")
+    shapedirs = double["shapedirs"][..., :SHAPES]
+    if "J_template" in double and "J_shapedirs" in double:
+        J_template, J_shapedirs = double["J_template"], double["J_shapedirs"][..., :SHAPES]
+    else:
+        J_template = double["J_regressor"] @ double["v_template"]
+        J_shapedirs = np.einsum("kv,vcs->kcs", double["J_regressor"], shapedirs)
+    posedirs = double.get("posedirs")
+    if posedirs is not None:
+        posedirs = posedirs[..., : 9 * (BODY_JOINTS - 1)]
+    fields = {
+        "J_template": J_template[:BODY_JOINTS],
+        "J_shapedirs": J_shapedirs[:BODY_JOINTS],
+        "v_template": double["v_template"],
+        "shapedirs": shapedirs,
+        "weights": _fold(path, double["weights"], arrays["kintree_table"]),
+        "posedirs": posedirs,
+    }
+    tensors = {name: None if a is None else torch.from_numpy(a.astype(np.float32)) for name, a in fields.items()}
+    return {"id": body_id, "faces": torch.from_numpy(faces), **tensors}
+
+
+def _fold(path: Path, weights: NDArray, kintree_table: NDArray) -> NDArray:
+    """Weights of joints beyond the 22 added to their nearest ancestor among them. (V, K) -> (V, 22)"""
+    parents = kintree_table[0].astype(np.int64)
+    parents[0] = -1  # files write 2^32 - 1
+    if tuple(parents[:BODY_JOINTS]) != PARENTS:
+        raise ValueError(f"{path}: the first 22 parents are {parents[:BODY_JOINTS].tolist()}, expected {list(PARENTS)}")
+    folded = np.zeros((len(weights), BODY_JOINTS))
+    for joint in range(len(parents)):
+        ancestor = joint
+        while ancestor >= BODY_JOINTS:
+            if not 0 <= parents[ancestor] < ancestor:
+                raise ValueError(f"{path}: joint {ancestor} has parent {parents[ancestor]}, expected an earlier joint")
+            ancestor = int(parents[ancestor])
+        folded[:, ancestor] += weights[:, joint]
+    return folded

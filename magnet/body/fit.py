@@ -1,0 +1,300 @@
+"""Fitting a body to joint positions: one shape a person, one pose a frame.
+
+A closed-form start, from known rotations or from the directions between joints alone, is refined by a short
+optimisation over all frames at once. Whatever is not our body model comes in this way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.body.base import JOINT_NAMES, PARENTS, Body
+from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_6d, to_6d
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+CENTIMETRE = 0.01
+NEARLY_RIGID = ((1, 2), (16, 17), (1, 16), (2, 17))
+"""Distances that say something of a shape although joints between them bend a little: hips, shoulders, flanks."""
+TORSO, CHEST, PELVIS = (0, 1, 2, 3, 6, 9, 12, 16, 17), (9, 12, 13, 14, 16, 17), (0, 1, 2, 3, 6)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted scene (B = 1) and how far its joints are from the targets."""
+
+    scene: Scene
+    residual: Tensor  # (T, P, M) metres
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Weights against one square centimetre of one joint's error in one frame."""
+
+    steps: int = 80
+    shape_steps: int = 160
+    shape_frames: int = 96  # frames, evenly spaced, that the shape is refined on
+    learning_rate: float = 0.03
+    hint: float = 6.0  # of the squared chordal distance to a joint's known rotation
+    rest: float = 0.5  # the same, to the closed-form start, for joints without one
+    smooth: float = 20.0  # of squared second differences of rotations (at 30 fps)
+    shape: float = 2.0  # of a squared shape number, in the refinement of shapes
+    shape_prior: float = 0.5  # of a squared shape number, against a square centimetre of a length's error
+
+
+# -- small rotations ---------------------------------------------------------------------------
+
+
+def swing(a: Tensor, b: Tensor) -> Tensor:
+    """Smallest rotation that takes direction a to direction b. (..., 3) x 2 -> (..., 3, 3)
+
+    Opposite directions have no smallest one; some half turn is returned.
+    """
+    a, b = torch.nn.functional.normalize(a, dim=-1), torch.nn.functional.normalize(b, dim=-1)
+    cross, cos = torch.linalg.cross(a, b, dim=-1), (a * b).sum(-1)[..., None, None]
+    K = torch.zeros(*cross.shape, 3, dtype=cross.dtype, device=cross.device)
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -cross[..., 2], cross[..., 1], -cross[..., 0]
+    K = K - K.transpose(-1, -2)
+    eye = torch.eye(3, dtype=a.dtype, device=a.device)
+    turned = eye + K + K @ K / (1 + cos).clamp_min(1e-6)
+    side = torch.zeros_like(a)
+    side.scatter_(-1, a.abs().argmin(dim=-1, keepdim=True), 1.0)
+    axis = torch.nn.functional.normalize(torch.linalg.cross(a, side, dim=-1), dim=-1)
+    half = 2 * axis[..., :, None] * axis[..., None, :] - eye
+    return torch.where(cos > -1 + 1e-6, turned, half)
+
+
+def kabsch(rest: Tensor, posed: Tensor) -> Tensor:
+    """Rotation that best takes centred points to centred points. (..., N, 3) x 2 -> (..., 3, 3)"""
+    rest = rest - rest.mean(dim=-2, keepdim=True)
+    posed = posed - posed.mean(dim=-2, keepdim=True)
+    U, _, Vh = torch.linalg.svd(posed.transpose(-1, -2) @ rest)
+    flip = torch.ones_like(U[..., 0])
+    flip[..., 2] = torch.linalg.det(U @ Vh).sign()
+    return (U * flip[..., None, :]) @ Vh
+
+
+# -- the fit -----------------------------------------------------------------------------------
+
+
+def fit_body(
+    targets: Tensor,
+    joints: Sequence[int],
+    body: Body,
+    *,
+    rotations: Tensor | None = None,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
+    betas: Tensor | None = None,
+    fps: float = 30.0,
+    refuse_above: float = 0.04,
+    settings: FitSettings | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Fit:
+    """Poses and shapes of `body` whose joints lie at the targets.
+
+    Args:
+        targets: (T, P, M, 3) world positions of M of the 22 joints, metres, y up.
+        joints: which ones; both hips and both shoulders must be among them.
+        rotations: (T, P, 22, 3, 3) world rotations from the body's rest pose where known, NaN elsewhere.
+        weights: (M,) or (T, P, M), how much each target matters; None: equally.
+        valid: (T, P) bool; frames that are not valid are filled but count for nothing.
+        betas: (P, 10) known shapes; None: fitted, one a person.
+        fps: of the targets.
+        refuse_above: largest mean distance in metres that is still a fit.
+        progress: called with (steps done, steps in all).
+
+    Raises:
+        ValueError: shapes do not match, joints are missing, no valid frame, NaN, or the fit is too bad.
+    """
+    settings = settings or FitSettings()
+    valid = _checked(targets, joints, rotations, valid)
+    T, P, M = targets.shape[:3]
+    targets = targets.float()
+    if weights is None:
+        weights = torch.ones(M, device=targets.device)
+    weights = weights.to(targets).expand(T, P, M) * valid[..., None]
+    hints = None if rotations is None else rotations.to(targets)
+    total = settings.steps + (settings.shape_steps if betas is None else 0)
+    tell = progress or (lambda done, total: None)
+    if betas is None:
+        betas = shape_from_lengths(targets, joints, body, valid, settings.shape_prior)
+        # An even choice of frames is enough for ten numbers, and far cheaper than all of them.
+        good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
+        some = good[torch.linspace(0, len(good) - 1, min(settings.shape_frames, len(good))).long()]
+        problem = _Problem(
+            body, targets[some], joints, weights[some], None if hints is None else hints[some], settings, 0.0
+        )
+        betas = problem.solve(betas, settings.shape_steps, True, lambda done: tell(done, total))[2]
+    problem = _Problem(body, targets, joints, weights, hints, settings, settings.smooth * (fps / 30.0) ** 4)
+    done_before = total - settings.steps
+    R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(done_before + done, total))
+    scene = Scene(
+        body_rot=R[None, :, :, 1:],
+        T_world_root=rigid(R[:, :, 0], t)[None],
+        betas=betas[None],
+        present=torch.ones(1, P, dtype=torch.bool, device=targets.device),
+        fps=fps,
+        body=body.id,
+        valid=valid.all(dim=1)[None],
+    )
+    residual = (body.joints(scene)[0][:, :, list(joints)] - targets).norm(dim=-1)
+    mean = float(residual[valid].mean())
+    if not mean <= refuse_above:
+        worst = JOINT_NAMES[joints[int(residual[valid].mean(dim=0).argmax())]]
+        raise ValueError(
+            f"the body fits with a mean error of {100 * mean:.1f} cm, expected at most {100 * refuse_above:.1f} cm; "
+            f"worst is {worst}: check units (metres), the up axis (y) and which target is which joint"
+        )
+    return Fit(scene, residual)
+
+
+def _checked(targets: Tensor, joints: Sequence[int], rotations: Tensor | None, valid: Tensor | None) -> Tensor:
+    if targets.dim() != 4 or targets.shape[2:] != (len(joints), 3):
+        raise ValueError(f"targets: got {tuple(targets.shape)}, expected (T, P, {len(joints)}, 3) for these joints")
+    T, P = targets.shape[:2]
+    lacking = [JOINT_NAMES[j] for j in (1, 2, 16, 17) if j not in joints]
+    if lacking:
+        raise ValueError(f"targets lack {', '.join(lacking)}; both hips and both shoulders are needed")
+    if rotations is not None and tuple(rotations.shape) != (T, P, BODY_JOINTS, 3, 3):
+        raise ValueError(f"rotations: got {tuple(rotations.shape)}, expected {(T, P, BODY_JOINTS, 3, 3)}")
+    if valid is None:
+        valid = torch.ones(T, P, dtype=torch.bool, device=targets.device)
+    if tuple(valid.shape) != (T, P) or not bool(valid.any(dim=0).all()):
+        raise ValueError(f"valid: got {tuple(valid.shape)}, expected {(T, P)} with a valid frame for everybody")
+    if not bool(targets.isfinite().all()):
+        raise ValueError("targets hold NaN or infinity; fill such frames in and mask them with `valid`")
+    return valid
+
+
+def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, valid: Tensor, prior: float) -> Tensor:
+    """Shapes whose bones are as long as the targets' are, each length its median over valid frames. -> (P, 10)"""
+    place = {joint: i for i, joint in enumerate(joints)}
+    bones = [(PARENTS[j], j) for j in joints if PARENTS[j] in place]
+    pairs = [*bones, *((a, b) for a, b in NEARLY_RIGID if a in place and b in place)]
+    here, there = zip(*((place[a], place[b]) for a, b in pairs), strict=True)
+    a, b = zip(*pairs, strict=True)
+    lengths = (targets[:, :, list(here)] - targets[:, :, list(there)]).norm(dim=-1)
+    shapes = []
+    for p in range(targets.shape[1]):
+        want = lengths[valid[:, p], p].double().median(dim=0).values
+
+        def measure(beta: Tensor) -> Tensor:
+            rest = body.rest_joints(beta)
+            return (rest[list(a)] - rest[list(b)]).norm(dim=-1)
+
+        beta = torch.zeros(10, dtype=torch.float64, device=targets.device)
+        for _ in range(8):  # Gauss-Newton: lengths are all but linear in the shape
+            J = torch.func.jacfwd(measure)(beta) / CENTIMETRE
+            off = (want - measure(beta)) / CENTIMETRE
+            eye = torch.eye(10, dtype=beta.dtype, device=beta.device)
+            beta = torch.linalg.solve(J.T @ J + prior * eye, J.T @ (off + J @ beta))
+        shapes.append(beta.float())
+    return torch.stack(shapes)
+
+
+class _Problem:
+    """Everything that the optimisation looks at."""
+
+    def __init__(
+        self,
+        body: Body,
+        targets: Tensor,
+        joints: Sequence[int],
+        weights: Tensor,
+        hints: Tensor | None,
+        settings: FitSettings,
+        smooth: float,
+    ) -> None:
+        self.body, self.targets, self.joints, self.weights = body, targets, list(joints), weights
+        self.hints, self.settings, self.smooth = hints, settings, smooth
+
+    def solve(
+        self, betas: Tensor, steps: int, shape: bool, tell: Callable[[int], None]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Local rotations with the pelvis's first (T, P, 22, 3, 3), pelvis positions (T, P, 3), shapes (P, 10)."""
+        R, t, known = start(self.targets, self.joints, self.body.rest_joints(betas), self.hints)
+        trust = torch.where(known, self.settings.hint, self.settings.rest)
+        prior = R
+        six = to_6d(R).clone().requires_grad_()
+        t = t.clone().requires_grad_()
+        betas = betas.clone().requires_grad_(shape)
+        rate = self.settings.learning_rate
+        groups = [{"params": [six], "lr": rate}, {"params": [t], "lr": rate / 3}]
+        if shape:
+            groups.append({"params": [betas], "lr": 2 * rate})
+        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.98))
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, [g["lr"] for g in groups], total_steps=steps, pct_start=0.1, div_factor=5
+        )
+        for step in range(steps):
+            optimiser.zero_grad()
+            loss = self._loss(from_6d(six), t, betas, prior, trust)
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            tell(step + 1)
+        return from_6d(six.detach()), t.detach(), betas.detach()
+
+    def _loss(self, R: Tensor, t: Tensor, betas: Tensor, prior: Tensor, trust: Tensor) -> Tensor:
+        found = self.body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
+        off = (found[:, :, self.joints] - self.targets) / CENTIMETRE
+        loss = (self.weights * off.square().sum(-1)).sum()
+        loss = loss + (trust * (R - prior).square().sum((-1, -2))).sum()
+        loss = loss + self.settings.shape * len(self.targets) * betas.square().sum()
+        if self.smooth and len(R) > 2:
+            loss = loss + self.smooth * (R[2:] - 2 * R[1:-1] + R[:-2]).square().sum()
+            bend = (t[2:] - 2 * t[1:-1] + t[:-2]) / CENTIMETRE
+            loss = loss + self.smooth / 20 * bend.square().sum()
+        return loss
+
+
+def start(
+    targets: Tensor, joints: Sequence[int], rest: Tensor, hints: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Closed-form local rotations (T, P, 22, 3, 3), pelvis positions (T, P, 3), which rotations were known (bool).
+
+    targets (T, P, M, 3), rest (P, 22, 3), hints (T, P, 22, 3, 3) or None
+    """
+    T, P = targets.shape[:2]
+    place = {joint: i for i, joint in enumerate(joints)}
+
+    def rigid_part(of: Sequence[int]) -> Tensor | None:
+        there = [j for j in of if j in place]
+        if len(there) < 3:
+            return None
+        return kabsch(rest[:, there].expand(T, P, len(there), 3), targets[:, :, [place[j] for j in there]])
+
+    torso = rigid_part(TORSO)
+    pelvis, chest = rigid_part(PELVIS), rigid_part(CHEST)
+    if torso is None:
+        raise ValueError("the torso's targets do not say how it is turned")
+    pelvis = torso if pelvis is None else pelvis
+    chest = torso if chest is None else chest
+    world = torch.empty(T, P, BODY_JOINTS, 3, 3, dtype=targets.dtype, device=targets.device)
+    known = torch.zeros(T, P, BODY_JOINTS, dtype=torch.bool, device=targets.device)
+    if hints is not None:
+        known = hints.isfinite().all(dim=-1).all(dim=-1)
+    for j in range(BODY_JOINTS):
+        guess = {0: pelvis, 3: _between(pelvis, chest, 1 / 3), 6: _between(pelvis, chest, 2 / 3), 9: chest}.get(j)
+        guess = world[:, :, PARENTS[j]] if guess is None else guess
+        world[:, :, j] = guess if hints is None else torch.where(known[:, :, j, None, None], hints[:, :, j], guess)
+        child = [c for c in range(BODY_JOINTS) if PARENTS[c] == j]
+        if j not in TORSO[:6] and len(child) == 1 and child[0] in place and j in place:
+            bone = (world[:, :, j] @ (rest[:, child[0]] - rest[:, j])[..., None])[..., 0]
+            want = targets[:, :, place[child[0]]] - targets[:, :, place[j]]
+            world[:, :, j] = swing(bone, want) @ world[:, :, j]
+    local = world.clone()
+    local[:, :, 1:] = world[:, :, list(PARENTS[1:])].transpose(-1, -2) @ world[:, :, 1:]
+    hips = [place[1], place[2]]
+    t = (targets[:, :, hips] - (world[:, :, :1] @ (rest[:, [1, 2]] - rest[:, :1])[..., None])[..., 0]).mean(dim=2)
+    return local, t, known
+
+
+def _between(a: Tensor, b: Tensor, share: float) -> Tensor:
+    """A rotation on the way from a to b, which must not be opposite. (..., 3, 3) x 2 -> (..., 3, 3)"""
+    return from_6d(to_6d(a) * (1 - share) + to_6d(b) * share)

@@ -1,0 +1,265 @@
+"""What every data set is to the rest: a list of clips, from which batches of `Scene` are made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+
+from magnet.body import Body, load_body
+from magnet.datamodules.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
+from magnet.datamodules.loaders import FixedLoader, TrainLoader
+from magnet.datamodules.windows import Clip, Draw, Split, Store
+from magnet.motion.scene import Scene
+from magnet.seeding import derive
+
+__all__ = ["Clip", "MotionDataModule", "Split"]
+
+
+class MotionDataModule(LightningDataModule):
+    """Base of all data sets; a subclass implements `clips` and perhaps `prepare_data`.
+
+    All frames of a split live in memory, on the trainer's device where there is one, and batches are gathered
+    there. Without a trainer the loaders yield scenes on the CPU. Augmentation is training's alone. A random
+    yaw is not among it: tokens do not change under one (paper 3.1).
+
+    Args:
+        window_frames: frames of a training and validation window; 64 are 16 tokens (the paper does not say).
+        batch_size: scenes a training batch and process (paper A.3).
+        max_agents: slots P of every batch; smaller scenes leave slots empty (paper 4, 2 to 4 people).
+        mirror: mirror every other training window, left and right exchanged (paper A.4.1).
+        shuffle_agents: random order of slots, empty ones included, in every training window (paper A.4.1).
+        drop_agent: probability that a training scene of two or more loses one person (paper 4: agents are
+            randomly masked during training).
+        compose: probability that a second, independent clip's people join a training scene where slots are
+            free, which makes scenes of three and four (ours); has no effect with two slots.
+        compose_apart: shortest and longest distance in metres between the two groups' centres, drawn evenly.
+        compose_clearance: metres that pelvises of different groups keep apart at every frame; they are placed
+            further away than drawn where that takes it.
+        weights: share of each source of clips among training windows; None: as many as it has frames.
+        epoch_size: training windows an epoch over all processes; None: as many as fit side by side into the
+            training frames, times four.
+        context_frames: known frames of a test scene.
+        horizon_frames: frames of a test scene to predict; 150 are five seconds.
+        test_stride: frames between the starts of test scenes of a clip; None: they do not overlap.
+        test_limit: at most so many test scenes, evenly spaced over all; None: all.
+        composed_test: so many more test scenes of three and four people in turn, composed of two clips.
+        test_batch_size: scenes a test and prediction batch.
+        val_batch_size: scenes a validation batch.
+        seed: of all randomness here: sample i of epoch e depends only on (seed, e, i).
+        body_model: "open" or the path of a body file in SMPL-X's npz layout.
+        device_resident: keep all frames on the trainer's device; False: gather on the CPU and send batches,
+            for data sets larger than the GPU's memory.
+
+    Raises:
+        ValueError: a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        window_frames: int = 64,
+        batch_size: int = 256,
+        max_agents: int = 2,
+        mirror: bool = True,
+        shuffle_agents: bool = True,
+        drop_agent: float = 0.1,
+        compose: float = 0.25,
+        compose_apart: tuple[float, float] = (1.6, 3.5),
+        compose_clearance: float = 0.9,
+        weights: dict[str, float] | None = None,
+        epoch_size: int | None = None,
+        context_frames: int = 32,
+        horizon_frames: int = 150,
+        test_stride: int | None = None,
+        test_limit: int | None = None,
+        composed_test: int = 0,
+        test_batch_size: int = 16,
+        val_batch_size: int = 256,
+        seed: int = 1111,
+        body_model: str = "open",
+        device_resident: bool = True,
+    ) -> None:
+        super().__init__()
+        at_least_one = {
+            "window_frames": window_frames,
+            "batch_size": batch_size,
+            "max_agents": max_agents,
+            "context_frames": context_frames,
+            "horizon_frames": horizon_frames,
+            "test_batch_size": test_batch_size,
+            "val_batch_size": val_batch_size,
+            "epoch_size": epoch_size,
+            "test_stride": test_stride,
+            "test_limit": test_limit,
+        }
+        for name, number in at_least_one.items():
+            if number is not None and number < 1:
+                raise ValueError(f"{name}: got {number}, expected at least 1")
+        for name, share in {"drop_agent": drop_agent, "compose": compose}.items():
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
+        self.window_frames = window_frames
+        self.batch_size = batch_size
+        self.max_agents = max_agents
+        self.augmentation = Augmentation(
+            mirror=0.5 if mirror else 0.0,
+            shuffle=shuffle_agents,
+            drop=drop_agent,
+            compose=compose,
+            apart=(compose_apart[0], compose_apart[1]),
+        )
+        self.compose_clearance = compose_clearance
+        self.weights: Mapping[str, float] | None = weights
+        self.epoch_size = epoch_size
+        self.context_frames = context_frames
+        self.horizon_frames = horizon_frames
+        self.test_stride = test_stride
+        self.test_limit = test_limit
+        self.composed_test = composed_test
+        self.test_batch_size = test_batch_size
+        self.val_batch_size = val_batch_size
+        self.seed = seed
+        self.body_model = body_model
+        self.device_resident = device_resident
+        self._stores: dict[tuple[str, torch.device], Store] = {}
+        self._train_loader: TrainLoader | None = None
+        self._resume: dict[str, int] | None = None
+
+    # -- what a data set implements ------------------------------------------------------------
+
+    def clips(self, split: Split) -> list[Clip]:
+        """Clips of a split: 30 fps, y up, floor at height 0, all of `self.body`. Called once a split."""
+        raise NotImplementedError(f"{type(self).__name__} must implement clips(split)")
+
+    @cached_property
+    def body(self) -> Body:
+        """The body model that shape numbers of all clips belong to."""
+        return load_body(self.body_model)
+
+    # -- clips in memory -----------------------------------------------------------------------
+
+    def store(self, split: Split, device: torch.device | str = "cpu") -> Store:
+        """All clips of a split as flat tensors; read once, kept on each device asked for.
+
+        Raises:
+            ValueError: the split has no clips.
+        """
+        device = torch.device(device)
+        if (split, device) not in self._stores:
+            if device.type == "cpu":
+                clips = self.clips(split)
+                if not clips:
+                    raise ValueError(
+                        f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
+                    )
+                self._stores[split, device] = Store(clips, self.max_agents)
+            else:
+                self._stores[split, device] = self.store(split).to(device)
+        return self._stores[split, device]
+
+    def _gather(self, split: Split, frames: int, draw: Draw) -> Scene:
+        device = torch.device("cpu")
+        if self.device_resident and self.trainer is not None:
+            device = self.trainer.strategy.root_device
+        return self.store(split, device).gather(draw, frames, self.compose_clearance)
+
+    def _shard(self) -> tuple[int, int]:
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+    # -- loaders -------------------------------------------------------------------------------
+
+    def train_dataloader(self) -> TrainLoader:
+        """Random windows (batch_size, window_frames, max_agents); resumes where a loaded state stood."""
+        store = self.store("train")
+        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed)
+        size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
+        self._train_loader = TrainLoader(
+            draws, lambda draw: self._gather("train", self.window_frames, draw), self.batch_size, size, *self._shard()
+        )
+        if self._resume is not None:
+            self._train_loader.load_state_dict(self._resume)
+            self._resume = None
+        return self._train_loader
+
+    def statistics_batches(self, batches: int = 8) -> Iterator[Scene]:
+        """Training batches to take statistics from: the same on every rank, and no part of the training stream."""
+        store = self.store("train")
+        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, derive(self.seed, "statistics"))
+        for number in range(batches):
+            yield self._gather("train", self.window_frames, draws(0, number * self.batch_size, self.batch_size))
+
+    def val_dataloader(self) -> FixedLoader:
+        """Windows of the val split side by side, nothing random (val_batch_size, window_frames, max_agents)."""
+        draw = fixed_draws(self.store("val"), self.window_frames, self.window_frames, pad=True)
+        return self._fixed("val", draw, self.window_frames, self.val_batch_size)
+
+    def test_dataloader(self) -> FixedLoader:
+        """Context and horizon of scenes of the test split (test_batch_size, context + horizon, max_agents)."""
+        frames = self.context_frames + self.horizon_frames
+        return self._fixed("test", self.test_draw(), frames, self.test_batch_size)
+
+    def predict_dataloader(self) -> FixedLoader:
+        """The same scenes as `test_dataloader`."""
+        return self.test_dataloader()
+
+    def _fixed(self, split: Split, draw: Draw, frames: int, batch_size: int) -> FixedLoader:
+        if not len(draw):
+            longest = int(self.store(split).length.max())
+            raise ValueError(
+                f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"
+                f" {longest}; ask for fewer frames"
+            )
+        return FixedLoader(draw, lambda part: self._gather(split, frames, part), batch_size, *self._shard())
+
+    def test_draw(self) -> Draw:
+        """Which windows the test scenes are; composed ones come last."""
+        store, frames = self.store("test"), self.context_frames + self.horizon_frames
+        plain = draw = fixed_draws(store, frames, self.test_stride or frames)
+        if self.test_limit is not None and len(plain) > self.test_limit:
+            kept = np.arange(self.test_limit) * len(plain) // self.test_limit
+            draw = Draw.concatenate([plain[slice(k, k + 1)] for k in kept])
+        if self.composed_test and len(plain):
+            composed = composed_draws(store, plain, self.composed_test, self.augmentation.apart, self.seed)
+            draw = Draw.concatenate([draw, composed])
+        return draw
+
+    def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
+        """Clean training stretches of `frames` frames, `stride` apart, as recorded, and so many composed ones. -> Scene
+
+        Raises:
+            ValueError: no clip is long enough.
+        """
+        store = self.store("train")
+        draw = fixed_draws(store, frames, stride)
+        if not len(draw):
+            raise ValueError(
+                f"{type(self).__name__}: split train has no clean stretch of {frames} frames; its longest clip has"
+                f" {int(store.length.max())}; ask for fewer frames"
+            )
+        if composed:
+            draw = Draw.concatenate([draw, composed_draws(store, draw, composed, self.augmentation.apart, self.seed)])
+        return store.gather(draw, frames)
+
+    # -- Lightning -----------------------------------------------------------------------------
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Scenes know how to move; anything else goes Lightning's way."""
+        if isinstance(batch, Scene | Tensor):
+            return batch.to(device)
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Place in the training stream. Lightning restores a loader's own state only within an epoch."""
+        return {} if self._train_loader is None else self._train_loader.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Training goes on with the sample that comes next."""
+        if state_dict:
+            self._resume = {"epoch": state_dict["epoch"], "sample": state_dict["sample"]}
+            if self._train_loader is not None:
+                self._train_loader.load_state_dict(self._resume)

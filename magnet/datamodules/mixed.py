@@ -1,0 +1,53 @@
+"""Several data sets as one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from magnet.datamodules.base import Clip, MotionDataModule, Split
+
+
+class Mixed(MotionDataModule):
+    """Trains on several data sets at once; tests on one of them, or on all.
+
+    Of each data set only the clips are used: window, batch and augmentation are set here.
+
+    Args:
+        data: the data sets; all of one body.
+        test_on: position in `data` of the one whose test split is used; None: all of them.
+        val_on: the same for the val split.
+        **kwargs: as for MotionDataModule; `weights` says how the sources of clips are mixed.
+
+    Raises:
+        ValueError: no data sets, bodies differ, or no such position.
+    """
+
+    def __init__(
+        self, data: list[MotionDataModule], test_on: int | None = None, val_on: int | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        if not data:
+            raise ValueError("data: got no data sets, expected at least one")
+        for name, position in {"test_on": test_on, "val_on": val_on}.items():
+            if position is not None and not 0 <= position < len(data):
+                raise ValueError(f"{name}: got {position}, expected a position from 0 to {len(data) - 1}")
+        bodies = {part.body_model for part in data} | {self.body_model}
+        if len(bodies) > 1:
+            raise ValueError(f"body_model: data sets of one body can be mixed, got {sorted(bodies)}")
+        self.data, self.chosen = list(data), {"train": None, "val": val_on, "test": test_on}
+
+    def prepare_data(self) -> None:
+        """Let every data set prepare its files."""
+        for part in self.data:
+            part.prepare_data()
+
+    def setup(self, stage: str) -> None:
+        """Let every data set set itself up."""
+        for part in self.data:
+            part.setup(stage)
+
+    def clips(self, split: Split) -> list[Clip]:
+        """Clips of all data sets, or of the one chosen for the split."""
+        chosen = self.chosen[split]
+        parts = self.data if chosen is None else [self.data[chosen]]
+        return [clip for part in parts for clip in part.clips(split)]

@@ -1,0 +1,34 @@
+"""DIV: how far samples of one scene lie apart (metrics.md B.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.futures import Futures, without_pelvis
+
+
+def diversity(generated: Tensor) -> Tensor:
+    """Unbiased variance over samples, summed over the 63 coordinates. (S, ..., 22, 3) -> (...) m^2, S at least 2"""
+    return without_pelvis(generated).var(dim=0).sum(dim=(-1, -2))
+
+
+class Diversity(ClipMeans):
+    """`div` in m^2: mean over frames and agents of a clip, then over clips.
+
+    One sample has no variance: such clips are left out. Equal samples (a deterministic method) have 0.
+    """
+
+    higher_is_better = True
+
+    def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
+        super().__init__(["div"], of, agents, confidence)
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        places = futures.scored.sum(dim=1) * futures.frames
+        if futures.samples < 2:
+            return [(torch.zeros_like(places), torch.zeros_like(places))]
+        variance = diversity(futures.generated)  # (B, T, P)
+        total = torch.where(futures.scored[:, None], variance, 0.0).sum(dim=(1, 2))
+        return [(total / places.clamp(min=1), places > 0)]

@@ -1,0 +1,120 @@
+"""MI: whether agents move with each other as recorded ones do (metrics.md B.3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.futures import Futures, without_pelvis
+
+MAX_AGENTS = 8
+
+STILL = 1e-5
+"""A coordinate whose deviation is under this share of its root mean square is constant."""
+
+
+class Correlation(NamedTuple):
+    """Pearson correlation where both coordinates move, 0 elsewhere."""
+
+    value: Tensor
+    moves: Tensor  # bool
+
+
+def correlation_sums(x: Tensor, y: Tensor, dim: int) -> Tensor:
+    """n, x, y, xx, yy, xy summed over `dim`, which add up over batches. (...) x 2 -> (..., 6)"""
+    n = torch.ones_like(x).sum(dim=dim)
+    products = [(a * b).sum(dim=dim) for a, b in ((x, x), (y, y), (x, y))]
+    return torch.stack([n, x.sum(dim=dim), y.sum(dim=dim), *products], dim=-1)
+
+
+def pearson(sums: Tensor) -> Correlation:
+    """Correlation from `correlation_sums`. (..., 6) -> (...)"""
+    n, x, y, xx, yy, xy = sums.unbind(-1)
+    n = n.clamp(min=1)
+    var_x, var_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2
+    moves = (var_x > STILL**2 * xx / n) & (var_y > STILL**2 * yy / n)
+    scale = torch.where(moves, var_x * var_y, 1.0).sqrt()
+    value = torch.where(moves, (xy / n - x * y / n**2) / scale, 0.0)
+    return Correlation(value.clamp(-1, 1), moves)
+
+
+def paired_coordinates(joints: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """The same 63 coordinates of both of two people. (..., P, 22, 3), (Q,) x 2 -> (..., Q, 63) x 2"""
+    flat = without_pelvis(joints).flatten(-2)
+    return flat[..., first, :], flat[..., second, :]
+
+
+class MotionInteraction(MotionMetric):
+    """`mi`: difference between the agents' correlation as generated and as recorded; 0 is best.
+
+    For each two slots and each of 63 world coordinates the correlation of the two people, over all
+    samples, frames and clips pooled; mean over coordinates, then over pairs of slots. Beside it
+    `mi_generated` and `mi_truth`, and `mi_left_out`: how many coordinates were constant in either and
+    left out of both. Pooled world coordinates mostly tell where people stand, and depend on the yaw of
+    the world; that is the paper's measure all the same.
+
+    Args:
+        per_clip: (ours) correlation inside each sample of each clip, averaged over coordinates and clips:
+            tells how people move with each other, wherever they are. Here `mi_left_out` counts the
+            coordinates of every clip and sample.
+    """
+
+    higher_is_better = False
+
+    sums: Tensor  # (2, Q, 63, 6) pooled: generated and truth
+    clip_totals: Tensor  # (2, Q, 2) per clip: sum of correlations, and how many
+    still: Tensor
+
+    def __init__(self, per_clip: bool = False, of: Of = "generated", agents: Tensor | None = None) -> None:
+        super().__init__(of, agents)
+        self.per_clip = per_clip
+        pairs = MAX_AGENTS * (MAX_AGENTS - 1) // 2
+        if per_clip:
+            self.add_sum("clip_totals", 2, pairs, 2)
+            self.add_sum("still", 1)
+        else:
+            self.add_sum("sums", 2, pairs, 63, 6)
+
+    def add(self, futures: Futures) -> None:
+        first, second, counts = futures.pairs()
+        if futures.truth.shape[2] > MAX_AGENTS:
+            raise ValueError(f"{futures.truth.shape[2]} agent slots; correlations are kept for up to {MAX_AGENTS}")
+        # Numbered so that two slots keep their place whatever the number of slots of a batch.
+        place = second * (second - 1) // 2 + first
+        for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
+            sums = correlation_sums(*paired_coordinates(joints, first, second), dim=1)  # (B, Q, 63, 6)
+            if self.per_clip:
+                correlation = pearson(sums)  # (B, Q, 63)
+                moves = correlation.moves & counts[:, :, None]
+                value = torch.where(moves, correlation.value, 0.0)
+                totals = torch.stack([value.sum(dim=(0, 2)), moves.sum(dim=(0, 2)).double()], dim=-1)
+                self.clip_totals[which, place] += totals
+                self.still += (~correlation.moves & counts[:, :, None]).sum()
+            else:
+                self.sums[which, place] += torch.where(counts[:, :, None, None], sums, 0.0).sum(dim=0)
+
+    def compute(self) -> dict[str, Tensor]:
+        if self.per_clip:
+            total, count = self.clip_totals.unbind(-1)
+            both = (count > 0).all(dim=0)
+            values = (total / count.clamp(min=1))[:, both]
+            left_out = self.still[0].clone()
+        else:
+            correlation = pearson(self.sums)  # (2, Q, 63)
+            seen = self.sums[0, :, 0, 0] > 0
+            moves = correlation.moves.all(dim=0)  # (Q, 63)
+            both = moves.any(dim=-1)
+            values = torch.where(moves, correlation.value, 0.0).sum(dim=-1)[:, both] / moves[both].sum(dim=-1)
+            left_out = (~moves[seen]).sum().double()
+        if not bool(both.any()):
+            return {"mi_left_out": left_out}
+        generated, truth = values.mean(dim=1)
+        return {
+            "mi": (truth - generated).abs(),
+            "mi_generated": generated,
+            "mi_truth": truth,
+            "mi_left_out": left_out,
+        }

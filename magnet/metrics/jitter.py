@@ -1,0 +1,30 @@
+"""Jitter: how much acceleration changes from frame to frame (metrics.md B.7)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.futures import Futures, without_pelvis
+
+
+def jitter(joints: Tensor, fps: float = 30.0) -> Tensor:
+    """Mean length of the third difference over 21 joints. (..., T, P, 22, 3) -> (..., T - 3, P) in 10 m/s^3"""
+    return without_pelvis(joints).diff(n=3, dim=-4).norm(dim=-1).mean(dim=-1) * fps**3 / 10
+
+
+class Jitter(ClipMeans):
+    """`jitter` in 10 m/s^3; to be read beside the ground truth's, which is not 0."""
+
+    def __init__(
+        self,
+        fps: float = 30.0,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["jitter"], of, agents, confidence)
+        self.fps = fps
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        return [clip_sums(jitter(futures.generated, self.fps), futures.scored[:, None])]

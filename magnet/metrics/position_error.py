@@ -1,0 +1,52 @@
+"""MPJPE: mean distance between predicted and true joints (metrics.md B.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.futures import Futures, without_pelvis
+
+
+def joint_error(generated: Tensor, truth: Tensor) -> Tensor:
+    """Mean distance over the 21 joints, in the world, nothing aligned. (..., 22, 3) x 2 -> (...) metres"""
+    return without_pelvis(generated - truth).norm(dim=-1).mean(dim=-1)
+
+
+class PositionError(ClipMeans):
+    """`mpjpe` in metres: mean over samples, frames, agents and 21 joints; not best of S.
+
+    Also `mpjpe_best`, each scene's best sample as a whole, and `mpjpe@<t>s`, the mean over frames up
+    to t seconds, measured only on clips at least that long.
+    """
+
+    higher_is_better = False
+
+    def __init__(
+        self,
+        fps: float = 30.0,
+        seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0),
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["mpjpe", "mpjpe_best", *(f"mpjpe@{s:g}s" for s in seconds)], of, agents, confidence)
+        self.until = tuple(round(s * fps) for s in seconds)
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        error = joint_error(futures.generated, futures.truth)  # (S, B, T, P)
+        by_frame = torch.where(futures.scored[:, None], error, 0.0).sum(dim=-1)  # (S, B, T)
+        people = futures.scored.sum(dim=-1)
+        samples, frames = futures.samples, futures.frames
+        shares = [
+            (by_frame.sum(dim=(0, 2)), people * frames * samples),
+            (by_frame.sum(dim=2).min(dim=0).values, people * frames),
+        ]
+        for until in self.until:
+            long_enough = 0 < until <= frames
+            count = people * until * samples if long_enough else torch.zeros_like(people)
+            shares.append((by_frame[:, :, : until if long_enough else 0].sum(dim=(0, 2)), count))
+        return shares

@@ -1,0 +1,71 @@
+"""FS: how fast feet slide while they stand (metrics.md B.4)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.futures import Futures
+
+TOES = (10, 11)
+
+PRESETS = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
+"""Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""
+
+
+def toe_steps(joints: Tensor, fps: float = 30.0, height: float = 0.05) -> tuple[Tensor, Tensor]:
+    """Horizontal speed of each toe and whether it stands, being under `height` metres in both frames.
+
+    The floor is y = 0 and is not estimated again, which would hide floating.
+    (..., T, P, 22, 3) -> (..., T - 1, P, 2) m/s, same bool
+    """
+    toes = joints[..., TOES, :]
+    speed = toes[..., [0, 2]].diff(dim=-4).norm(dim=-1) * fps
+    low = toes[..., 1] < height
+    return speed, low[..., 1:, :, :] & low[..., :-1, :, :]
+
+
+class FootSkating(ClipMeans):
+    """`fs` in m/s: mean speed of standing toes that slide; 0 where none does.
+
+    Beside it `fs_ratio`, the share of all toe steps that slide, `fs_contact`, the share that stands, and
+    `fs_contacts`, how many stand: where that is 0, an `fs` of 0 says nothing.
+
+    Args:
+        preset: thresholds: `"default"`, or `"reference"`, those of the paper's released code, which
+            count only toes 1 cm inside the floor.
+        height, speed: instead of the preset's.
+    """
+
+    higher_is_better = False
+
+    def __init__(
+        self,
+        fps: float = 30.0,
+        preset: Literal["default", "reference"] = "default",
+        height: float | None = None,
+        speed: float | None = None,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["fs", "fs_ratio", "fs_contact"], of, agents, confidence)
+        self.fps = fps
+        self.height = PRESETS[preset][0] if height is None else height
+        self.speed = PRESETS[preset][1] if speed is None else speed
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        speed, stands = toe_steps(futures.generated, self.fps, self.height)
+        scored = futures.scored[:, None, :, None].expand_as(speed)
+        slides = stands & (speed > self.speed) & scored
+        return [
+            clip_sums(speed, slides),
+            clip_sums(slides.double(), scored),
+            clip_sums(stands.double(), scored),
+        ]
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"fs": torch.zeros_like(self.total[0]), **super().compute(), "fs_contacts": self.total[2].clone()}

@@ -1,0 +1,40 @@
+"""MPJVE: mean distance between predicted and true joint velocities (metrics.md B.6)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.futures import Futures
+from magnet.metrics.position_error import joint_error
+
+
+def velocity_error(generated: Tensor, truth: Tensor) -> Tensor:
+    """Mean distance of the 21 joints' steps from frame to frame. (..., T, P, 22, 3) x 2 -> (..., T - 1, P) metres"""
+    return joint_error(generated.diff(dim=-4), truth.diff(dim=-4))
+
+
+class VelocityError(ClipMeans):
+    """`mpjve`: mean over samples, steps, agents and 21 joints.
+
+    Args:
+        per_second: m/s. The default is metres a *frame* at the given fps, which is what the paper's
+            tables hold.
+    """
+
+    higher_is_better = False
+
+    def __init__(
+        self,
+        fps: float = 30.0,
+        per_second: bool = False,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["mpjve"], of, agents, confidence)
+        self.scale = fps if per_second else 1.0
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        error = velocity_error(futures.generated, futures.truth) * self.scale
+        return [clip_sums(error, futures.scored[:, None])]

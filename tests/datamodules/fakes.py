@@ -1,0 +1,54 @@
+"""A data set of random smooth clips in memory, and a trainer that says only where it runs."""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.testing import random_scene
+
+
+def random_clip(
+    name: str,
+    frames: int = 200,
+    agents: int = 2,
+    source: str = "duets",
+    split: Split = "train",
+    bad: tuple[int, ...] = (),
+) -> Clip:
+    """A clip that only its name decides; the frames `bad` are invalid."""
+    generator = torch.Generator().manual_seed(sum(map(ord, name)) * 7919 + frames)
+    valid = torch.ones(1, frames, dtype=torch.bool)
+    valid[:, list(bad)] = False
+    return Clip(random_scene(1, frames, agents, generator).replace(valid=valid), name, source, split)
+
+
+class FakeData(MotionDataModule):
+    """Any clips as a data set."""
+
+    def __init__(self, given: list[Clip], **kwargs: Any) -> None:
+        super().__init__(**{"batch_size": 16, "epoch_size": 64, **kwargs})
+        self.given = given
+
+    def clips(self, split: Split) -> list[Clip]:
+        return [clip for clip in self.given if clip.split == split]
+
+
+PLAIN: dict[str, Any] = {"mirror": False, "shuffle_agents": False, "drop_agent": 0.0, "compose": 0.0}
+"""No augmentation at all."""
+
+
+def couples_and_singles(split: Split = "train") -> list[Clip]:
+    couples = [random_clip(f"couple{k}", 150 + 40 * k, 2, "couples", split) for k in range(3)]
+    return couples + [random_clip(f"single{k}", 120 + 30 * k, 1, "singles", split) for k in range(2)]
+
+
+@dataclass
+class FakeTrainer:
+    """Where a process stands among others, as Lightning's trainer says it."""
+
+    global_rank: int = 0
+    world_size: int = 1
+    strategy: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(root_device=torch.device("cpu")))

@@ -1,0 +1,442 @@
+"""Laws of the common data room: what a batch shows, that it can be repeated, resumed and shared."""
+
+import re
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch import Tensor, nn
+
+from magnet.body.mirror import mirror_scene
+from magnet.datamodules import Clip, Mixed
+from magnet.datamodules.draws import uniforms
+from magnet.motion.scene import Scene, concatenate
+from magnet.testing import random_scene
+
+from .fakes import PLAIN, FakeData, FakeTrainer, couples_and_singles, random_clip
+
+
+def same(a: Scene, b: Scene) -> bool:
+    """Bit for bit, names too."""
+    return a.names == b.names and all(torch.equal(value, b.tensors()[name]) for name, value in a.tensors().items())
+
+
+def one_epoch(data: FakeData) -> Scene:
+    return concatenate(list(data.train_dataloader()))
+
+
+def shown(name: str) -> tuple[str, int, int]:
+    """Clip, first frame and end of a label such as "60_05 [120:184]"."""
+    match = re.fullmatch(r"(.+) \[(\d+):(\d+)]", name)
+    assert match, name
+    return match[1], int(match[2]), int(match[3])
+
+
+# -- what a window shows -----------------------------------------------------------------------
+
+
+def test_a_window_is_the_frames_it_names() -> None:
+    clips = couples_and_singles()
+    by_name = {clip.name: clip.scene for clip in clips}
+    batch = one_epoch(FakeData(clips, max_agents=3, **PLAIN))
+    assert batch.frames == 64 and batch.agents == 3 and batch.scenes == 64
+    for b, name in enumerate(batch.names):
+        clip, start, stop = shown(name)
+        window = by_name[clip].cut(start, stop).pad_agents(3)
+        got = batch.pick([b])
+        for field in ("body_rot", "T_world_root", "betas", "present"):
+            assert torch.equal(getattr(got, field), getattr(window, field)), (name, field)
+        assert bool(got.valid.all())
+
+
+def test_every_valid_start_is_equally_likely() -> None:
+    clips = [random_clip("a", 70), random_clip("b", 66), random_clip("c", 64)]
+    names = Counter(one_epoch(FakeData(clips, epoch_size=11 * 400, batch_size=440, **PLAIN)).names)
+    assert len(names) == 7 + 3 + 1
+    assert min(names.values()) > 320 and max(names.values()) < 480
+
+
+def test_windows_avoid_invalid_frames() -> None:
+    clips = [random_clip("a", 200, bad=(70, 71, 140)), random_clip("b", 100)]
+    batch = one_epoch(FakeData(clips, epoch_size=512, **PLAIN))
+    assert bool(batch.valid.all())
+    assert {name for name in batch.names if name.startswith("a")} <= {f"a [{s}:{s + 64}]" for s in range(200)}
+    assert all(not start <= frame < stop for n in batch.names for c, start, stop in [shown(n)] if c == "a"
+               for frame in (70, 71, 140))  # fmt: skip
+
+
+def test_a_clip_without_a_clean_window_carries_its_mask() -> None:
+    batch = one_epoch(FakeData([random_clip("a", 90, bad=(40, 45))], **PLAIN))
+    assert batch.valid is not None
+    for b, name in enumerate(batch.names):
+        _, start, stop = shown(name)
+        assert [start + f for f in torch.nonzero(~batch.valid[b])[:, 0].tolist()] == [
+            f for f in (40, 45) if start <= f < stop
+        ]
+
+
+def test_a_short_clip_repeats_its_last_frame_and_says_so() -> None:
+    clip = random_clip("short", 40)
+    batch = one_epoch(FakeData([clip], epoch_size=16, **PLAIN))
+    assert batch.valid is not None and batch.names[0] == "short [0:40]"
+    assert torch.equal(batch.valid[0], torch.arange(64) < 40)
+    assert torch.equal(batch.T_world_root[0, :40, :2], clip.scene.T_world_root[0])
+    assert torch.equal(batch.T_world_root[0, 40:, :2], clip.scene.T_world_root[0, -1:].expand(24, -1, -1, -1))
+
+
+def test_weights_are_shares_of_sources() -> None:
+    data = FakeData(couples_and_singles(), epoch_size=4096, batch_size=512, weights={"singles": 3, "couples": 1})
+    names = one_epoch(data).names
+    share = sum("single" in name for name in names) / len(names)
+    assert share == pytest.approx(0.75, abs=0.03)
+
+
+def test_a_source_without_weight_is_never_shown() -> None:
+    names = one_epoch(FakeData(couples_and_singles(), weights={"couples": 1.0})).names
+    assert all("couple" in name for name in names)
+
+
+# -- augmentation ------------------------------------------------------------------------------
+
+
+def test_agent_order_permutes_everything_of_a_person() -> None:
+    options: dict[str, Any] = {**PLAIN, "max_agents": 4, "drop_agent": 0.3, "compose": 0.5}
+    ordered = one_epoch(FakeData(couples_and_singles(), **options))
+    shuffled = one_epoch(FakeData(couples_and_singles(), **{**options, "shuffle_agents": True}))
+    moved = 0
+    for b in range(ordered.scenes):
+        left, right = ordered.pick([b]), shuffled.pick([b])
+        assert int(left.present.sum()) == int(right.present.sum())
+        mine = [int(p) for p in left.present[0].nonzero()[:, 0]]
+        theirs = [
+            next(q for q in range(4) if right.present[0, q] and torch.equal(right.betas[0, q], left.betas[0, p]))
+            for p in mine
+        ]
+        assert len(set(theirs)) == len(mine)
+        rest_l = [p for p in range(4) if p not in mine]
+        rest_r = [q for q in range(4) if q not in theirs]
+        order = torch.empty(4, dtype=torch.long)
+        order[mine + rest_l] = torch.tensor(theirs + rest_r)
+        again = right.order(order)
+        # Placing a second group sums over people, so another order may round differently.
+        torch.testing.assert_close(again.T_world_root, left.T_world_root, atol=1e-5, rtol=0)
+        assert torch.equal(again.body_rot, left.body_rot) and torch.equal(again.present, left.present)
+        moved += mine != theirs
+    assert moved > ordered.scenes / 2
+
+
+def test_every_person_stands_in_every_slot_equally_often() -> None:
+    clip = random_clip("a", 64)
+    batch = one_epoch(FakeData([clip], max_agents=4, epoch_size=2000, batch_size=250, drop_agent=0, mirror=False))
+    for person in range(2):
+        where = (batch.betas == clip.scene.betas[0, person]).all(dim=-1).float().mean(dim=0)
+        torch.testing.assert_close(where, torch.full((4,), 0.25), atol=0.05, rtol=0)
+
+
+def test_empty_slots_hold_nobody() -> None:
+    batch = one_epoch(FakeData(couples_and_singles(), max_agents=4, drop_agent=0.5))
+    empty = ~batch.present
+    assert bool(empty.any())
+    assert bool((batch.betas[empty] == 0).all())
+    roots, rotations = batch.T_world_root.transpose(1, 2)[empty], batch.body_rot.transpose(1, 2)[empty]
+    assert torch.equal(roots, torch.eye(4).expand_as(roots))
+    assert torch.equal(rotations, torch.eye(3).expand_as(rotations))
+
+
+def test_dropping_one_leaves_the_others_as_they_were() -> None:
+    clips = [random_clip("trio", 150, 3), random_clip("single", 150, 1)]
+    whole = one_epoch(FakeData(clips, max_agents=3, epoch_size=512, **PLAIN))
+    fewer = one_epoch(FakeData(clips, max_agents=3, epoch_size=512, **{**PLAIN, "drop_agent": 0.4}))
+    lost = whole.present.sum(dim=1) - fewer.present.sum(dim=1)
+    trios = whole.present.all(dim=1)
+    assert set(lost.tolist()) == {0, 1} and bool((lost[~trios] == 0).all())
+    assert lost[trios].float().mean().item() == pytest.approx(0.4, abs=0.1)
+    left = fewer.present
+    assert torch.equal(fewer.T_world_root.transpose(1, 2)[left], whole.T_world_root.transpose(1, 2)[left])
+
+
+def test_half_of_the_windows_are_mirror_images() -> None:
+    clips = couples_and_singles()
+    plain = one_epoch(FakeData(clips, epoch_size=256, **PLAIN))
+    batch = one_epoch(FakeData(clips, epoch_size=256, **{**PLAIN, "mirror": True}))
+    mirrored = (plain.T_world_root != batch.T_world_root).flatten(1).any(dim=1)
+    assert 0.4 < mirrored.float().mean().item() < 0.6
+    assert same(batch.pick(mirrored), mirror_scene(plain.pick(mirrored)))
+    assert same(batch.pick(~mirrored), plain.pick(~mirrored))
+
+
+# -- again, resumed, shared --------------------------------------------------------------------
+
+
+def test_uniforms_of_a_sample_do_not_depend_on_its_neighbours() -> None:
+    whole = uniforms(1, 2, 0, 20, 13)
+    assert np.array_equal(whole[7:12], uniforms(1, 2, 7, 5, 13))
+    assert not np.array_equal(whole, uniforms(2, 2, 0, 20, 13))
+    assert not np.array_equal(whole, uniforms(1, 3, 0, 20, 13))
+    assert abs(uniforms(1, 2, 0, 4000, 5).mean() - 0.5) < 0.01
+
+
+def test_a_sample_depends_only_on_seed_epoch_and_number() -> None:
+    clips = couples_and_singles()
+    options: dict[str, Any] = {"max_agents": 4, "compose": 0.5, "drop_agent": 0.3, "epoch_size": 96}
+    small, large = (FakeData(clips, batch_size=size, **options).train_dataloader() for size in (8, 32))
+    for _ in range(2):
+        assert same(concatenate(list(small)), concatenate(list(large)))
+    other = FakeData(clips, batch_size=32, seed=2, **options)
+    first, second = FakeData(clips, batch_size=32, **options), FakeData(clips, batch_size=32, **options)
+    assert same(one_epoch(first), one_epoch(second))
+    assert one_epoch(other).names != one_epoch(FakeData(clips, batch_size=32, **options)).names
+
+
+def test_epochs_differ() -> None:
+    loader = FakeData(couples_and_singles()).train_dataloader()
+    assert len(loader) == 4
+    first, second = [b.names for b in loader], [b.names for b in loader]
+    assert len(first) == len(second) == 4 and first != second
+
+
+@pytest.mark.parametrize("seen", [0, 1, 3, 4, 6, 8])
+def test_a_restored_stream_goes_on_exactly(seen: int) -> None:
+    clips = couples_and_singles()
+
+    def stream(data: FakeData) -> Any:
+        loader = data.train_dataloader()
+        while True:
+            yield from loader
+
+    whole, first, resumed = FakeData(clips), FakeData(clips), FakeData(clips)
+    expected = stream(whole)
+    running = stream(first)
+    for _ in range(seen):
+        assert same(next(expected), next(running))
+    state = first.state_dict()
+    resumed.load_state_dict(state)
+    again = stream(resumed)
+    for _ in range(6):
+        assert same(next(expected), next(again))
+
+
+class Recorder(LightningModule):
+    """A model that learns one number and remembers what it was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.seen: list[tuple[str, ...]] = []
+        self.checked: list[tuple[str, ...]] = []
+
+    def training_step(self, batch: Scene) -> Tensor:
+        assert isinstance(batch, Scene)
+        self.seen.append(batch.names)
+        return (self.weight - batch.T_world_root[..., 0, 3].mean()) ** 2
+
+    def validation_step(self, batch: Scene) -> None:
+        self.checked.append(batch.names)
+
+    def test_step(self, batch: Scene) -> None:
+        self.checked.append(batch.names)
+
+    def predict_step(self, batch: Scene) -> tuple[str, ...]:
+        return batch.names
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def quiet(path: Path, **options: Any) -> Trainer:
+    return Trainer(
+        accelerator="cpu",
+        default_root_dir=path,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **options,
+    )
+
+
+@pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`")
+@pytest.mark.parametrize(("stop", "limit"), [(2, "max_steps"), (4, "max_steps"), (7, "max_steps"), (1, "max_epochs")])
+def test_training_interrupted_by_a_checkpoint_sees_what_it_would_have_seen(
+    tmp_path: Path, stop: int, limit: str
+) -> None:
+    clips = couples_and_singles() + couples_and_singles("val")
+    enough = {"max_steps": 12, "max_epochs": 3}[limit]
+    whole = Recorder()
+    quiet(tmp_path / "a", enable_checkpointing=False, **{limit: enough}).fit(whole, FakeData(clips))
+    save = ModelCheckpoint(tmp_path, save_top_k=-1, **({"every_n_train_steps": 1} if limit == "max_steps" else {}))
+    begun = Recorder()
+    quiet(tmp_path / "b", callbacks=[save], **{limit: stop}).fit(begun, FakeData(clips))
+    resumed = Recorder()
+    checkpoint = save.best_model_path if limit == "max_epochs" else max(tmp_path.glob("*step=*.ckpt"), key=_step)
+    quiet(tmp_path / "c", enable_checkpointing=False, **{limit: enough}).fit(
+        resumed, FakeData(clips), ckpt_path=checkpoint
+    )
+    assert len(whole.seen) == 12
+    assert begun.seen + resumed.seen == whole.seen
+    assert torch.equal(resumed.weight, whole.weight)
+
+
+def _step(path: Path) -> int:
+    match = re.search(r"step=(\d+)", path.name)
+    assert match
+    return int(match[1])
+
+
+@pytest.mark.filterwarnings("ignore:Lightning couldn't infer the indices")
+def test_a_trainer_is_given_what_plain_iteration_gives(tmp_path: Path) -> None:
+    clips = couples_and_singles("test") + couples_and_singles("val")
+    options: dict[str, Any] = {"context_frames": 16, "horizon_frames": 32, "test_batch_size": 3}
+    expected = [batch.names for batch in FakeData(clips, **options).test_dataloader()]
+    model = Recorder()
+    trainer = quiet(tmp_path)
+    trainer.test(model, FakeData(clips, **options), verbose=False)
+    assert model.checked == expected
+    assert trainer.predict(model, FakeData(clips, **options)) == expected
+    model.checked.clear()
+    trainer.validate(model, FakeData(clips, **options), verbose=False)
+    assert model.checked == [batch.names for batch in FakeData(clips, **options).val_dataloader()]
+
+
+def rank_of(rank: int, world: int, **options: Any) -> FakeData:
+    data = FakeData(couples_and_singles() + couples_and_singles("test"), **options)
+    data.trainer = FakeTrainer(rank, world)  # type: ignore[assignment]
+    return data
+
+
+@pytest.mark.parametrize("world", [2, 3])
+def test_training_shards_together_are_the_single_process(world: int) -> None:
+    alone = [b.names for b in rank_of(0, 1, batch_size=4 * world, epoch_size=48).train_dataloader()]
+    options = {"batch_size": 4, "epoch_size": 48}
+    shards = [[b.names for b in rank_of(r, world, **options).train_dataloader()] for r in range(world)]
+    assert [sum(parts, ()) for parts in zip(*shards, strict=True)] == alone
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 5, 100])
+@pytest.mark.parametrize("world", [1, 2, 4, 11])
+def test_test_shards_are_disjoint_complete_and_equally_many_batches(world: int, batch_size: int) -> None:
+    options: dict[str, Any] = {"context_frames": 8, "horizon_frames": 32, "test_batch_size": batch_size}
+    alone = [name for batch in rank_of(0, 1, **options).test_dataloader() for name in batch.names]
+    loaders = [rank_of(rank, world, **options).test_dataloader() for rank in range(world)]
+    shards = [[batch.names for batch in loader] for loader in loaders]
+    names = [name for shard in shards for batch in shard for name in batch]
+    assert len(set(alone)) == len(alone) and sorted(names) == sorted(alone)
+    assert {len(shard) for shard in shards} == {len(loader) for loader in loaders} == {len(shards[0])}
+    assert max(len(batch) for shard in shards for batch in shard) <= batch_size + 1
+
+
+def test_more_processes_than_test_scenes_are_refused() -> None:
+    with pytest.raises(ValueError, match="windows for 50 processes"):
+        rank_of(0, 50, context_frames=8, horizon_frames=32).test_dataloader()
+
+
+# -- validation, test, all of training ---------------------------------------------------------
+
+
+def test_validation_windows_lie_side_by_side_and_repeat() -> None:
+    loader = FakeData([random_clip("a", 200, split="val"), random_clip("b", 30, split="val")]).val_dataloader()
+    batch = concatenate(list(loader))
+    assert batch.names == ("a [0:64]", "a [64:128]", "a [128:192]", "b [0:30]")
+    assert same(batch, concatenate(list(loader)))
+
+
+def test_test_scenes_step_over_invalid_frames() -> None:
+    data = FakeData([random_clip("a", 400, split="test", bad=(50,))], test_batch_size=2, horizon_frames=68)
+    assert concatenate(list(data.test_dataloader())).names == ("a [51:151]", "a [151:251]", "a [251:351]")
+
+
+def test_the_limit_spreads_over_all_test_scenes() -> None:
+    data = FakeData(
+        [random_clip(n, 400, split="test") for n in "ab"], test_limit=4, context_frames=20, horizon_frames=30
+    )
+    assert concatenate(list(data.test_dataloader())).names == ("a [0:50]", "a [200:250]", "b [0:50]", "b [200:250]")
+
+
+def test_training_scenes_are_all_clean_stretches() -> None:
+    clips = [random_clip("a", 200, bad=(100,)), random_clip("b", 130, agents=1), random_clip("c", 20)]
+    scene = FakeData(clips, max_agents=3).train_scenes(64, stride=32)
+    assert scene.names == (
+        "a [0:64]",
+        "a [32:96]",
+        "a [101:165]",
+        "a [133:197]",
+        *(f"b [{s}:{s + 64}]" for s in (0, 32, 64)),
+    )
+    assert torch.equal(scene.T_world_root[2, :, :2], clips[0].scene.T_world_root[0, 101:165])
+
+
+def test_mixed_trains_on_all_and_tests_on_the_chosen_one() -> None:
+    one = FakeData([random_clip("a"), random_clip("at", split="test", source="x")])
+    two = FakeData([random_clip("b", source="solo", agents=1), random_clip("bt", split="test")])
+    mixed = Mixed([one, two], test_on=1, batch_size=64, epoch_size=256, horizon_frames=32)
+    assert {name[0] for name in one_epoch(mixed).names} == {"a", "b"}  # type: ignore[arg-type]
+    assert {name.split()[0] for batch in mixed.test_dataloader() for name in batch.names} == {"bt"}
+    both = Mixed([one, two], horizon_frames=32)
+    assert {name.split()[0] for batch in both.test_dataloader() for name in batch.names} == {"at", "bt"}
+
+
+# -- bad input ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loader", ["train_dataloader", "val_dataloader", "test_dataloader"])
+def test_an_empty_split_is_named(loader: str) -> None:
+    with pytest.raises(ValueError, match=f"split {loader[: loader.index('_')]} is empty"):
+        getattr(FakeData([]), loader)()
+
+
+def test_what_is_too_long_for_the_clips_is_named() -> None:
+    data = FakeData([random_clip("a", 100, split="test"), random_clip("b", 100)])
+    with pytest.raises(ValueError, match="no clean stretch of 182 frames; its longest clip has 100"):
+        data.test_dataloader()
+    with pytest.raises(ValueError, match="no clean stretch of 150 frames"):
+        data.train_scenes(150)
+
+
+def test_people_without_a_slot_are_refused() -> None:
+    with pytest.raises(ValueError, match="clip trio has 3 people, but max_agents is 2"):
+        FakeData([random_clip("trio", agents=3)]).train_dataloader()
+
+
+def test_clips_of_another_body_are_refused() -> None:
+    smplx = random_clip("b")
+    smplx = Clip(smplx.scene.replace(body="smplx-neutral"), "b", "duets", "train")
+    with pytest.raises(ValueError, match="clip b: body is smplx-neutral, but clip a has open-1"):
+        FakeData([random_clip("a"), smplx]).train_dataloader()
+
+
+def test_bad_clips_are_refused(generator: torch.Generator) -> None:
+    scene = random_scene(1, 8, 2, generator)
+    broken = scene.T_world_root.clone()
+    broken[0, 3, 1, 0, 3] = torch.nan
+    with pytest.raises(ValueError, match="clip x: T_world_root holds NaN"):
+        Clip(scene.replace(T_world_root=broken), "x", "s", "train")
+    with pytest.raises(ValueError, match="clip x: has an absent agent"):
+        Clip(scene.pad_agents(3), "x", "s", "train")
+    with pytest.raises(ValueError, match="clip x: got split 'tset'"):
+        Clip(scene, "x", "s", "tset")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [{"batch_size": 0}, {"drop_agent": 1.5}, {"test_stride": 0}])
+def test_numbers_out_of_range_are_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        FakeData([], **bad)
+
+
+def test_a_weight_for_no_source_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"source \['salsa'\]; there are \['couples', 'singles'\]"):
+        FakeData(couples_and_singles(), weights={"salsa": 1.0}).train_dataloader()
+
+
+def test_batches_come_fast(capsys: pytest.CaptureFixture[str]) -> None:
+    data = FakeData([random_clip(f"c{k}", 2000) for k in range(5)], max_agents=4, batch_size=256, epoch_size=2048)
+    loader = data.train_dataloader()
+    next(iter(loader))
+    begin = time.perf_counter()
+    windows = sum(batch.scenes for batch in loader)
+    with capsys.disabled():
+        print(f"\n{windows / (time.perf_counter() - begin):.0f} windows of 64 frames, 4 slots, a second on this CPU")

@@ -1,0 +1,443 @@
+"""Metrics against slow references and known inputs."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from torch import Tensor
+from torchmetrics import Metric, MetricCollection
+
+from magnet.metrics import (
+    Diversity,
+    FootSkating,
+    FrechetDistance,
+    Futures,
+    HandsHeld,
+    Interpenetration,
+    Jitter,
+    MotionInteraction,
+    PartnerDistance,
+    PositionError,
+    VelocityError,
+    all_metrics,
+    bootstrap_interval,
+    frechet_distance,
+    ground_truth_metrics,
+)
+from magnet.metrics.frechet import pose_features
+from magnet.motion.frames import from_planar
+
+Batch = tuple[Tensor, Tensor, Tensor]
+
+
+def draw_batch(scenes: int = 3, people: int = 3, samples: int = 4, frames: int = 20, seed: int = 0) -> Batch:
+    """Crowded made-up joints, low enough to touch the floor; the last agent of every second scene is absent, NaN."""
+    draw = torch.Generator().manual_seed(seed)
+    place = torch.randn(scenes, 1, people, 1, 3, generator=draw) * torch.tensor([0.3, 0.0, 0.3])
+    steps = torch.randn(scenes, frames, people, 22, 3, generator=draw) * 0.02
+    truth = place + torch.rand(scenes, 1, people, 22, 3, generator=draw) * 0.8 + steps.cumsum(dim=1)
+    generated = truth + (torch.randn(samples, scenes, frames, people, 22, 3, generator=draw) * 0.02).cumsum(dim=2)
+    present = torch.ones(scenes, people, dtype=torch.bool)
+    if people > 2:
+        present[::2, -1] = False
+        truth[::2, :, -1] = math.nan
+        generated[:, ::2, :, -1] = math.nan
+    return generated, truth, present
+
+
+def result(metric: Metric, *batch: Tensor, agents: Tensor | None = None) -> dict[str, float]:
+    metric.update(*batch, agents=agents)
+    return {name: float(value) for name, value in metric.compute().items()}
+
+
+def people(batch: Batch, agents: Tensor | None = None) -> list[tuple[int, int]]:
+    """(scene, agent) of everybody scored."""
+    scored = batch[2] if agents is None else batch[2] & agents
+    return [(b, p) for b, p in itertools.product(*map(range, scored.shape)) if scored[b, p]]
+
+
+ONLY_SECOND = torch.tensor([False, True, False])
+WHO = pytest.mark.parametrize("agents", [None, ONLY_SECOND], ids=["everybody", "one agent"])
+
+
+# -- against slow references -------------------------------------------------------------------
+
+
+@WHO
+def test_position_errors_equal_a_plain_loop(agents: Tensor | None) -> None:
+    batch = draw_batch(frames=40)
+    generated, truth, _ = (x.double().numpy() for x in batch)
+    distances: dict[tuple[int, ...], float] = {}
+    for b, p in people(batch, agents):
+        for s, t, j in itertools.product(range(4), range(40), range(1, 22)):
+            distances[b, p, s, t, j] = math.dist(generated[s, b, t, p, j], truth[b, t, p, j])
+    got = result(PositionError(fps=30.0), *batch, agents=agents)
+    assert got["mpjpe"] == pytest.approx(np.mean(list(distances.values())), abs=1e-12)
+    for name, until in (("mpjpe@0.5s", 15), ("mpjpe@1s", 30)):
+        upto = [d for (_, _, _, t, _), d in distances.items() if t < until]
+        assert got[name] == pytest.approx(np.mean(upto), abs=1e-12)
+    assert "mpjpe@2s" not in got  # 40 frames are not 2 s
+    best, weight = 0.0, 0
+    for b in {b for b, _ in people(batch, agents)}:
+        by_sample = [[d for (c, _, r, _, _), d in distances.items() if (c, r) == (b, s)] for s in range(4)]
+        best += min(map(sum, by_sample))
+        weight += len(by_sample[0])
+    assert got["mpjpe_best"] == pytest.approx(best / weight, abs=1e-12)
+
+
+@WHO
+def test_velocity_error_equals_a_plain_loop(agents: Tensor | None) -> None:
+    batch = draw_batch()
+    generated, truth, _ = (x.double().numpy() for x in batch)
+    errors = [
+        math.dist(generated[s, b, t + 1, p, j] - generated[s, b, t, p, j], truth[b, t + 1, p, j] - truth[b, t, p, j])
+        for b, p in people(batch, agents)
+        for s, t, j in itertools.product(range(4), range(19), range(1, 22))
+    ]
+    assert result(VelocityError(), *batch, agents=agents)["mpjve"] == pytest.approx(np.mean(errors), abs=1e-12)
+    per_second = result(VelocityError(fps=30.0, per_second=True), *batch, agents=agents)["mpjve"]
+    assert per_second == pytest.approx(30 * np.mean(errors), abs=1e-10)
+
+
+@WHO
+def test_diversity_equals_a_plain_loop(agents: Tensor | None) -> None:
+    batch = draw_batch()
+    generated = batch[0].double().numpy()
+    by_clip: dict[int, list[float]] = {}
+    for b, p in people(batch, agents):
+        for t in range(20):
+            by_clip.setdefault(b, []).append(np.var(generated[:, b, t, p, 1:], axis=0, ddof=1).sum())
+    expected = np.mean([np.mean(values) for values in by_clip.values()])
+    assert result(Diversity(), *batch, agents=agents)["div"] == pytest.approx(expected, abs=1e-12)
+
+
+@WHO
+@pytest.mark.parametrize("features", ["world_joints", "canonical_joints", "velocity", "pair"])
+def test_frechet_distance_equals_the_textbook_with_sqrtm(features: str, agents: Tensor | None) -> None:
+    batch = draw_batch(scenes=6, frames=60)
+    generated, truth, present = (x.double() if x.is_floating_point() else x for x in batch)
+    rows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    scored = people(batch, agents)
+    for b, p in itertools.product(range(6), range(3)):
+        for which, motions in enumerate((generated[:, b], truth[None, b])):
+            for motion in motions:
+                found = pose_features(motion, features)  # type: ignore[arg-type]
+                if features != "pair":
+                    if (b, p) in scored:
+                        rows[which].append(found[:, p].numpy())
+                    continue
+                for slot, q in enumerate(q for q in range(3) if q != p):
+                    if present[b, p] and present[b, q] and ((b, p) in scored or (b, q) in scored):
+                        rows[which].append(found[:, p, slot].numpy())
+    moments = []
+    for part in rows:
+        every = np.concatenate(part)
+        cov = np.cov(every, rowvar=False)
+        moments.append((every.mean(axis=0), cov + 1e-6 * (np.trace(cov) + 1) * np.eye(63)))
+    (mu1, s1), (mu2, s2) = moments
+    expected = ((mu1 - mu2) ** 2).sum() + np.trace(s1 + s2 - 2 * scipy.linalg.sqrtm(s1 @ s2).real)
+    name = "fd" if features == "world_joints" else f"fd_{features}"
+    got = result(FrechetDistance(features), *batch, agents=agents)  # type: ignore[arg-type]
+    assert got[name] == pytest.approx(expected, rel=1e-7, abs=1e-9)
+
+
+@WHO
+def test_interaction_equals_numpys_correlation(agents: Tensor | None) -> None:
+    batch = draw_batch(scenes=4)
+    generated, truth, present = batch[0].double(), batch[1].double(), batch[2]
+    scored = people(batch, agents)
+    by_pair = []
+    for p, q in itertools.combinations(range(3), 2):
+        clips = [b for b in range(4) if present[b, p] and present[b, q] and ((b, p) in scored or (b, q) in scored)]
+        if clips:
+            values = []
+            for motion in (generated[:, clips], truth[None, clips]):
+                x, y = (motion[:, :, :, who, 1:].reshape(-1, 63).numpy() for who in (p, q))
+                values.append(np.mean([np.corrcoef(x[:, d], y[:, d])[0, 1] for d in range(63)]))
+            by_pair.append(values)
+    expected = np.mean(by_pair, axis=0)
+    got = result(MotionInteraction(), *batch, agents=agents)
+    assert (got["mi_generated"], got["mi_truth"]) == pytest.approx(tuple(expected), abs=1e-9)
+    assert got["mi"] == pytest.approx(abs(expected[0] - expected[1]), abs=1e-9)
+    assert got["mi_left_out"] == 0
+
+
+def test_interaction_inside_clips_equals_numpys_correlation() -> None:
+    generated, truth, present = draw_batch(people=2)
+    expected = [
+        np.mean(
+            [
+                np.corrcoef(motion[s, b, :, 0, j, c], motion[s, b, :, 1, j, c])[0, 1]
+                for s in range(len(motion))
+                for b, j, c in itertools.product(range(3), range(1, 22), range(3))
+            ]
+        )
+        for motion in (generated.double().numpy(), truth.double().numpy()[None])
+    ]
+    got = result(MotionInteraction(per_clip=True), generated, truth, present)
+    assert (got["mi_generated"], got["mi_truth"]) == pytest.approx(tuple(expected), abs=1e-9)
+
+
+@WHO
+@pytest.mark.parametrize("preset", ["default", "reference"])
+def test_foot_skating_equals_a_plain_loop(preset: str, agents: Tensor | None) -> None:
+    batch = draw_batch(scenes=8)
+    batch[0][..., (10, 11), 1] -= 0.4
+    generated = batch[0].double().numpy()
+    height = {"default": 0.05, "reference": -0.01}[preset]
+    sliding, standing, every = [], 0, 0
+    for b, p in people(batch, agents):
+        for s, t, toe in itertools.product(range(4), range(19), (10, 11)):
+            now, then = generated[s, b, t, p, toe], generated[s, b, t + 1, p, toe]
+            every += 1
+            if now[1] < height and then[1] < height:
+                standing += 1
+                speed = math.hypot(then[0] - now[0], then[2] - now[2]) * 30
+                if speed > 0.05:
+                    sliding.append(speed)
+    assert sliding
+    got = result(FootSkating(preset=preset), *batch, agents=agents)  # type: ignore[arg-type]
+    expected = (np.mean(sliding), len(sliding) / every, standing / every, standing)
+    assert tuple(got.values()) == pytest.approx(expected, abs=1e-10)
+
+
+@WHO
+def test_partners_equal_a_plain_loop(agents: Tensor | None) -> None:
+    batch = draw_batch(scenes=4)
+    generated = batch[0].double().numpy()
+    scored = people(batch, agents)
+    held, apart = [], []
+    for b, s, t in itertools.product(range(4), range(4), range(20)):
+        frame = []
+        for p, q in itertools.combinations(range(3), 2):
+            if batch[2][b, p] and batch[2][b, q] and ((b, p) in scored or (b, q) in scored):
+                one, other = generated[s, b, t, p], generated[s, b, t, q]
+                frame.append(min(math.dist(one[i], other[j]) for i in (20, 21) for j in (20, 21)))
+                apart.append(math.dist(one[0, [0, 2]], other[0, [0, 2]]))
+        held += [min(frame) < 0.5] if frame else []
+    assert 0.1 < np.mean(held) < 0.9
+    assert result(HandsHeld(within=0.5), *batch, agents=agents)["hands_held"] == pytest.approx(np.mean(held), abs=1e-12)
+    median = result(PartnerDistance(), *batch, agents=agents)["partner_distance"]
+    assert median == pytest.approx(np.median(apart), abs=0.006)
+
+
+def test_jitter_is_the_third_derivative() -> None:
+    """x = t^3 has third derivative 6 m/s^3."""
+    seconds = torch.arange(20).double() / 30
+    joints = torch.zeros(1, 1, 20, 1, 22, 3, dtype=torch.float64)
+    joints[..., 0] = seconds[:, None, None] ** 3
+    assert result(Jitter(), joints, joints[0], torch.ones(1, 1, dtype=torch.bool))["jitter"] == pytest.approx(0.6)
+
+
+# -- known inputs ------------------------------------------------------------------------------
+
+
+def test_a_shift_of_one_metre_costs_what_arithmetic_says() -> None:
+    _, truth, present = draw_batch(scenes=8, frames=60)
+    shifted = (truth + torch.tensor([1.0, 0.0, 0.0]))[None].repeat(3, 1, 1, 1, 1, 1)
+    metrics = all_metrics()
+    metrics.update(shifted, truth, present)
+    got = metrics.compute()
+    assert float(got["fd"]) == pytest.approx(21.0, abs=1e-3)
+    assert float(got["mpjpe"]) == pytest.approx(1.0, abs=1e-6)
+    assert float(got["mpjpe_best"]) == pytest.approx(1.0, abs=1e-6)
+    assert float(got["mpjve"]) == pytest.approx(0.0, abs=1e-6)
+    assert float(got["div"]) == pytest.approx(0.0, abs=1e-12)
+    assert float(got["mi"]) == pytest.approx(0.0, abs=1e-9)
+    assert float(got["fd_pair"]) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_frechet_distance_of_a_set_to_its_own_repeats_is_small_and_never_negative() -> None:
+    _, truth, present = draw_batch(scenes=8, frames=60)
+    got = result(FrechetDistance(), truth[None].repeat(3, 1, 1, 1, 1, 1), truth, present)["fd"]
+    assert -1e-9 < got < 1e-3
+
+
+def test_frechet_distance_between_two_gaussians_in_closed_form() -> None:
+    """Diagonal covariances commute: the distance is that of means and of standard deviations."""
+    draw = torch.Generator().manual_seed(0)
+    mu1, mu2 = torch.randn(2, 63, generator=draw, dtype=torch.float64)
+    v1, v2 = torch.rand(2, 63, generator=draw, dtype=torch.float64) + 0.1
+    expected = ((mu1 - mu2) ** 2).sum() + ((v1.sqrt() - v2.sqrt()) ** 2).sum()
+    got = frechet_distance(mu1, v1.diag(), mu2, v2.diag(), jitter=0)
+    torch.testing.assert_close(got, expected, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("frames", [2, 5, 40])
+def test_frechet_distance_stands_fewer_frames_than_dimensions(frames: int) -> None:
+    generated, truth, present = draw_batch(scenes=1, people=1, samples=1, frames=frames)
+    got = result(FrechetDistance(), generated, truth, present)["fd"]
+    assert math.isfinite(got) and got > 0
+    assert result(FrechetDistance(), truth[None], truth, present)["fd"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("features", ["canonical_joints", "pair"])
+def test_own_frame_features_do_not_see_where_the_world_is(features: str) -> None:
+    joints = draw_batch(people=2)[1].double()
+    T = from_planar(torch.tensor(1.1).double(), torch.tensor([3.0, -2.0]).double())
+    moved = joints @ T[:3, :3].T + T[:3, 3]
+    a, b = (pose_features(motion, features) for motion in (joints, moved))  # type: ignore[arg-type]
+    torch.testing.assert_close(a, b, atol=1e-10, rtol=0)
+
+
+def test_still_coordinates_are_left_out_of_interaction_and_counted() -> None:
+    generated, truth, present = draw_batch(people=2)
+    generated[..., 0, 5, 1] = 1.7  # one of the 63 coordinates, of one person
+    truth[..., 1, 7, 2] = 0.3  # another, of the other, in the truth
+    got = result(MotionInteraction(), generated, truth, present)
+    assert got["mi_left_out"] == 2
+    assert all(map(math.isfinite, got.values()))
+
+
+def test_standing_or_flying_feet_skate_at_zero_and_say_which() -> None:
+    generated, truth, present = draw_batch()
+    still = generated.clone()
+    still[..., (10, 11), :] = 0.0
+    flying = generated.clone()
+    flying[..., (10, 11), 1] = 1.0
+    got = result(FootSkating(), still, truth, present)
+    assert got["fs"] == 0 and got["fs_contact"] == 1 and got["fs_contacts"] > 0
+    got = result(FootSkating(), flying, truth, present)
+    assert got["fs"] == 0 and got["fs_contacts"] == 0
+
+
+def test_feet_that_slide_at_a_known_speed_say_so() -> None:
+    joints = torch.ones(1, 1, 30, 1, 22, 3)
+    joints[..., (10, 11), 1] = 0.02
+    joints[..., 2] = (torch.arange(30) * 0.4 / 30)[:, None, None]
+    got = result(FootSkating(), joints, joints[0], torch.ones(1, 1, dtype=torch.bool))
+    assert got["fs"] == pytest.approx(0.4, abs=1e-5) and got["fs_ratio"] == 1
+
+
+# -- what must hold for all of them ------------------------------------------------------------
+
+
+def every_metric() -> dict[str, Callable[[], Metric]]:
+    makers: dict[str, Callable[[], Metric]] = {
+        f"FD {f}": lambda f=f: FrechetDistance(f) for f in ("canonical_joints", "velocity")
+    }
+    makers["MI per clip"] = lambda: MotionInteraction(per_clip=True)
+    for name in all_metrics():
+        makers[str(name)] = lambda name=name: all_metrics()[name]
+    return makers
+
+
+EVERY = pytest.mark.parametrize("make", every_metric().values(), ids=every_metric().keys())
+
+
+@EVERY
+def test_absent_agents_make_no_difference(make: Callable[[], Metric]) -> None:
+    generated, truth, present = draw_batch()
+    for filler in (math.nan, 1e6):
+        here = present[:, None, :, None, None]
+        filled = [torch.where(here, x, filler) for x in (generated, truth)]
+        assert result(make(), *filled, present) == result(make(), generated, truth, present)
+
+
+@EVERY
+def test_split_updates_merge_to_one_pass(make: Callable[[], Metric]) -> None:
+    batches = [draw_batch(seed=seed, scenes=scenes) for seed, scenes in ((1, 3), (2, 1), (3, 4))]
+    whole = make()
+    generated, truth, present = zip(*batches, strict=True)
+    whole.update(torch.cat(generated, dim=1), torch.cat(truth), torch.cat(present))
+    total = make()
+    total.update(*batches[0])
+    for batch in batches[1:]:
+        part = make()
+        part.update(*batch)
+        total.merge_state(part)
+    torch.testing.assert_close(whole.compute(), total.compute(), atol=1e-10, rtol=1e-12)
+
+
+@EVERY
+def test_a_longer_sample_is_cut_to_the_truth_and_the_other_way_round(make: Callable[[], Metric]) -> None:
+    generated, truth, present = draw_batch(frames=24)
+    expected = result(make(), generated[:, :, :20], truth[:, :20], present)
+    assert result(make(), generated, truth[:, :20], present) == expected
+    assert result(make(), generated[:, :, :20], truth, present) == expected
+
+
+@EVERY
+def test_numbers_are_finite_or_absent(make: Callable[[], Metric]) -> None:
+    for scenes, group, samples, frames in ((1, 1, 1, 1), (1, 1, 1, 5), (2, 2, 1, 3), (1, 3, 2, 2)):
+        got = result(make(), *draw_batch(scenes, group, samples, frames))
+        assert all(math.isfinite(value) for value in got.values()), got
+
+
+@EVERY
+def test_a_nan_joint_of_somebody_present_is_named(make: Callable[[], Metric]) -> None:
+    generated, truth, present = draw_batch()
+    generated[1, 1, 7, 0, 3, 2] = math.nan
+    with pytest.raises(ValueError, match="generated: joint 3 of agent 0, frame 7, scene 1"):
+        result(make(), generated, truth, present)
+
+
+@EVERY
+def test_a_metric_without_a_batch_says_nothing_but_zero_counts(make: Callable[[], Metric]) -> None:
+    with pytest.warns(UserWarning, match="before the ``update``"):
+        got = make().compute()
+    assert all(float(value) == 0 for value in got.values())
+
+
+def test_pair_metrics_of_solo_scenes_are_absent_not_flattering() -> None:
+    metrics = all_metrics()
+    metrics.update(*draw_batch(people=1))
+    got = metrics.compute()
+    assert not {"mi", "ip_ratio", "hands_held", "partner_distance", "fd_pair"} & set(got)
+    assert {"fd", "div", "fs", "mpjpe", "mpjve"} <= set(got)
+
+
+def test_ground_truths_row_does_not_read_what_was_generated() -> None:
+    generated, truth, present = draw_batch()
+    own, other = ground_truth_metrics(), ground_truth_metrics()
+    own.update(generated, truth, present)
+    other.update(truth[None], truth, present)
+    assert own.compute() == other.compute()
+    as_generated = all_metrics()
+    as_generated.update(truth[None], truth, present)
+    got = as_generated.compute()
+    for name, value in own.compute().items():
+        assert float(got[name]) == pytest.approx(float(value), abs=1e-12)
+
+
+def test_all_metrics_have_names_of_their_own_and_may_score_one_agent() -> None:
+    batch = draw_batch()
+    collection = all_metrics(scored=ONLY_SECOND)
+    assert isinstance(collection, MetricCollection)
+    collection.update(*batch)
+    got = collection.compute()
+    assert len(got) == sum(len(metric.compute()) for metric in collection.values())
+    assert float(got["mpjpe"]) == result(PositionError(), *batch, agents=ONLY_SECOND)["mpjpe"]
+    assert float(got["ip_ratio"]) == result(Interpenetration(), *batch, agents=ONLY_SECOND)["ip_ratio"]
+
+
+def test_a_mean_lies_inside_its_interval_and_clips_order_makes_no_difference() -> None:
+    generated, truth, present = draw_batch(scenes=10)
+    got = result(PositionError(confidence=0.95), generated, truth, present)
+    assert got["mpjpe_low"] < got["mpjpe"] < got["mpjpe_high"]
+    back = result(PositionError(confidence=0.95), generated.flip(1), truth.flip(0), present.flip(0))
+    assert back == pytest.approx(got, abs=1e-12)
+
+
+def test_the_interval_of_a_mean_is_as_wide_as_statistics_say() -> None:
+    values = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 3 + 1
+    low, high = bootstrap_interval(values)
+    half = 1.96 * float(values.std()) / 20
+    assert float(low) == pytest.approx(float(values.mean()) - half, abs=0.15 * half)
+    assert float(high) == pytest.approx(float(values.mean()) + half, abs=0.15 * half)
+
+
+def test_shapes_that_do_not_fit_are_named() -> None:
+    generated, truth, present = draw_batch()
+    with pytest.raises(ValueError, match=r"expected \(S, B, T, P, 22, 3\)"):
+        Futures.of(generated[0], truth, present)
+    with pytest.raises(ValueError, match="3 scenes of 3 agents"):
+        Futures.of(generated[:, :2], truth, present)
+    with pytest.raises(ValueError, match="present"):
+        Futures.of(generated, truth, present.float())
+    with pytest.raises(ValueError, match="agents"):
+        Futures.of(generated, truth, present, torch.ones(2, dtype=torch.bool))
