@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 MODEL, TRUTH = "magnet", "ground truth"
 CONFIDENCE = 0.95
+BASELINE_COMPOSED = 500
+"""Composed training stretches that baselines choose from where test scenes are composed too."""
 
 Predictor = Callable[[Scene, int, torch.Generator], Scene]
 """A method under test: whole test scenes, samples, randomness -> (B * samples, horizon, P). It must read of the
@@ -73,7 +75,9 @@ class Evaluation:
         self.methods: dict[str, Predictor] = {MODEL: self._model(model)}
         train = None
         if self.baselines:
-            train = datamodule.train_scenes(self.context + self.horizon, self.baseline_stride).to(model.device)
+            composed = BASELINE_COMPOSED if datamodule.composed_test else 0
+            frames = self.context + self.horizon
+            train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(model.device)
             self.methods |= {
                 "NN": self._baseline(NearestNeighbour(train)),
                 "RS": self._baseline(RandomSample(train)),
@@ -82,12 +86,11 @@ class Evaluation:
                 "RS, not aligned": self._baseline(RandomSample(train, aligned=False)),
             }
         scored = self.scored_agents(model, self.horizon)
-        self.metrics = {
-            name: all_metrics(datamodule.fps, scored, CONFIDENCE).to(model.device) for name in self.methods
-        }
-        self.metrics[TRUTH] = ground_truth_metrics(datamodule.fps, scored, CONFIDENCE).to(model.device)
+        fps = datamodule.store("test").fps
+        self.metrics = {name: all_metrics(fps, scored, CONFIDENCE).to(model.device) for name in self.methods}
+        self.metrics[TRUTH] = ground_truth_metrics(fps, scored, CONFIDENCE).to(model.device)
         self.train_features = self._train_features(train, scored)
-        self.halves = FrechetDistance(fps=datamodule.fps, agents=scored).to(model.device)
+        self.halves = FrechetDistance(fps=fps, agents=scored).to(model.device)
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
         self.scenes = 0
 
@@ -150,14 +153,10 @@ class Evaluation:
     def finish(self, model: Denoiser) -> dict[str, Tensor]:
         """Close the run; the table is in `results`. Returns what to log, the model's metrics first."""
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
-        truth_moments = None
-        pooled = self.metrics[MODEL]["FD"]
-        if bool((pooled.count >= 2).all()):
-            truth_moments = moments(pooled.count[1], pooled.sum[1], pooled.outer[1])
-        if self.train_features is not None and truth_moments is not None:
-            real = self.train_features
-            real_moments = moments(real.count[1], real.sum[1], real.outer[1])
-            rows["training windows"] = {"fd": float(frechet_distance(*real_moments, *truth_moments))}
+        if self.train_features is not None:
+            tested = self.metrics[MODEL]["FD"]
+            assert isinstance(tested, FrechetDistance)
+            rows["training windows"] = {"fd": _distance(self.train_features, tested)}
         rows[TRUTH]["fd halves"] = float(self.halves.compute().get("fd", torch.tensor(torch.nan)))
         meta = {
             "task": type(self.task).__name__,
@@ -204,11 +203,19 @@ def aligned(scene: Scene, frame: int) -> Scene:
     return scene.moved(inverse(from_planar(facing, middle))[:, None, None])
 
 
+def _distance(a: FrechetDistance, b: FrechetDistance) -> float:
+    """FD between the recorded poses that two metrics have pooled."""
+    return float(
+        frechet_distance(*moments(a.count[1], a.sum[1], a.outer[1]), *moments(b.count[1], b.sum[1], b.outer[1]))
+    )
+
+
 def _plain(metrics: MetricCollection) -> dict[str, Any]:
     return {name: float(value) for name, value in metrics.compute().items()}
 
 
+
 def save(results: Results, folder: Path) -> None:
-    """Table as JSON and CSV."""
+    """The table as JSON and CSV."""
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")

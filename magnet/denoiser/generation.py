@@ -97,18 +97,26 @@ def generate(
     grid = Grid(tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride)
     schedule = task.schedule(grid)
     given = scrub(scene.to(model.device).pad_agents(model.layout.agents), schedule.known)
-    canvas = Canvas(model, given, schedule, options, samples)
-    packed = sample(
-        model.denoise,
-        schedule,
-        known_tokens(model, given, schedule.known).repeat_interleave(samples, dim=0),
-        canvas.given.present,
-        model.layout,
-        generator=generator,
-        settle=canvas.settle,
-        progress=progress,
-    )
-    return canvas.scene(packed).cut(0, context + frames)
+    kind = model.device.type
+    precision = {"dtype": torch.get_autocast_dtype(kind), "enabled": torch.is_autocast_enabled(kind)}
+
+    def denoise(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        with torch.autocast(kind, **precision):
+            return model.denoise(noisy, levels, present).float()
+
+    with torch.autocast(kind, enabled=False):  # only the network may run in half precision, never the geometry
+        canvas = Canvas(model, given, schedule, options, samples)
+        packed = sample(
+            denoise,
+            schedule,
+            known_tokens(model, given, schedule.known).repeat_interleave(samples, dim=0),
+            canvas.given.present,
+            model.layout,
+            generator=generator,
+            settle=canvas.settle,
+            progress=progress,
+        )
+        return canvas.scene(packed).cut(0, context + frames)
 
 
 def scrub(scene: Scene, known: Tensor) -> Scene:

@@ -16,9 +16,8 @@ from magnet.denoiser.losses import consistency_losses, token_losses
 from magnet.denoiser.statistics import Statistics
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
-from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, scene_steps, scene_transforms
+from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tasks.base import Task
@@ -40,6 +39,9 @@ class Denoiser(L.LightningModule):
         heads: attention heads, paper Table A.2.
         mlp_ratio: MLP size over d, paper Table A.2.
         dropout: in attention and MLPs; the paper does not say.
+        level_width: size of the noise-level embedding, paper Table A.2.
+        agent_width: size of the agent embedding, paper Table A.2.
+        slot_width: size of the level embedding of each partner slot (ours; see relation_noise).
         rope: where time enters: `hidden` as in paper Table A.2, `heads` as usual elsewhere, `none` (ablation,
             Table A.5).
         agent_embedding: False takes the agents' identities away (ablation, paper Table A.5).
@@ -57,7 +59,7 @@ class Denoiser(L.LightningModule):
         learning_rate: paper A.3.
         weight_decay: paper A.3.
         warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
-        compile: compile the transformer for training; worth it on a GPU, not on a CPU.
+        compile: compile the transformer's blocks for training; worth it on a GPU, not on a CPU.
         seed: all training noise follows from it.
     """
 
@@ -71,6 +73,9 @@ class Denoiser(L.LightningModule):
         heads: int = 8,
         mlp_ratio: int = 4,
         dropout: float = 0.05,
+        level_width: int = 256,
+        agent_width: int = 256,
+        slot_width: int = 32,
         rope: Rope = "hidden",
         agent_embedding: bool = True,
         relations: bool = True,
@@ -113,10 +118,12 @@ class Denoiser(L.LightningModule):
             heads=h.heads,
             mlp_ratio=h.mlp_ratio,
             dropout=h.dropout,
+            level_width=h.level_width,
+            agent_width=h.agent_width,
+            slot_width=h.slot_width,
             rope=h.rope,
             agent_embedding=h.agent_embedding,
         )
-        self._forward: Callable[[Tensor, Tensor, Tensor], Tensor] = self.transformer
 
     @property
     def built(self) -> bool:
@@ -150,8 +157,8 @@ class Denoiser(L.LightningModule):
     # -- what the model does -------------------------------------------------------------------
 
     def encode(self, scene: Scene) -> Tensor:
-        """Quantised latents of a scene. -> (B, N, P, C)"""
-        return self.tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene))
+        """Quantised latents of a scene; frames that are not valid are not looked at. -> (B, N, P, C)"""
+        return self.tokenizer.encode_scene(scene)
 
     def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Predict clean tokens. noisy (B, N, P, D) normalised, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
@@ -159,7 +166,7 @@ class Denoiser(L.LightningModule):
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        return self._forward(self._without_lead(noisy), levels, present)
+        return self.transformer(self._without_lead(noisy), levels, present)
 
     def _without_lead(self, tokens: Tensor) -> Tensor:
         lead = slice(self.layout.latent, self.layout.latent + 9)
@@ -172,7 +179,9 @@ class Denoiser(L.LightningModule):
     def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
         scene = scene.pad_agents(self.layout.agents)
-        tokens = self.layout.pack(self.encode(scene), *scene_transforms(scene))
+        latent = self.encode(scene).float()
+        with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
+            tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
         if scene.valid is not None:
             whole = scene.valid.unflatten(1, (-1, STRIDE)).all(dim=-1)
@@ -198,11 +207,11 @@ class Denoiser(L.LightningModule):
     # -- training ------------------------------------------------------------------------------
 
     def on_fit_start(self) -> None:
-        self._require_tokenizer()
         if not self.statistics.ready:
             self._fit_statistics()
         if self.hparams.compile:
-            self._forward = torch.compile(self.transformer)
+            for block in self.transformer.blocks:
+                block.compile(dynamic=True)
 
     @torch.no_grad()
     def _fit_statistics(self) -> None:
@@ -249,6 +258,7 @@ class Denoiser(L.LightningModule):
         return {"loss": total, **losses}
 
     def configure_optimizers(self) -> Any:
+        self._require_tokenizer()
         h = self.hparams
         fused = self.device.type == "cuda"
         optimizer = torch.optim.AdamW(

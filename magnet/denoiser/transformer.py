@@ -35,12 +35,6 @@ def rotate(x: Tensor, time: Tensor, base: float = 10_000.0) -> Tensor:
     return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
 
 
-def used_slots(present: Tensor) -> int:
-    """Number of slots up to the last one used in any scene. (B, P) bool"""
-    used = present.any(dim=0).nonzero()
-    return int(used[-1]) + 1 if len(used) else 1
-
-
 class Block(nn.Module):
     """Post-norm transformer encoder block: self-attention over all tokens of a scene, then a GELU MLP."""
 
@@ -60,13 +54,13 @@ class Block(nn.Module):
         self.norm_mlp = nn.LayerNorm(width)
         self.drop = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, time: Tensor, mask: Tensor | None) -> Tensor:
-        """x (B, L, d), time (L,), mask (B, 1, 1, L) bool (True: may be looked at) or None -> (B, L, d)"""
+    def forward(self, x: Tensor, time: Tensor) -> Tensor:
+        """x (B, L, d), time (L,) -> (B, L, d)"""
         query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         if self.rope_heads:
             query, key = rotate(query, time), rotate(key, time)
         dropout = self.dropout if self.training else 0.0
-        looked = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)
+        looked = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)
         x = self.norm_attention(x + self.drop(self.out(looked.transpose(1, 2).flatten(-2))))
         return self.norm_mlp(x + self.drop(self.mlp(x)))
 
@@ -132,20 +126,28 @@ class Transformer(nn.Module):
         there = self.layout.group_present(present)[:, None]  # (B, 1, P, 1 + slots)
         group_levels = torch.where(there, self.layout.group_levels(levels), LEVELS)
         noisy = torch.where(there[..., self.groups], noisy, 0.0)
-        if not self.training:  # slots after the last one that anybody uses need not be computed
-            P = used_slots(present)
-            noisy, group_levels = noisy[:, :, :P], group_levels[:, :, :P]
         parts = [noisy, sinusoids(group_levels[..., 0], self.level_width).to(noisy.dtype)]
         if self.layout.slots:
             parts.append(sinusoids(group_levels[..., 1:], self.slot_width).flatten(-2).to(noisy.dtype))
         if self.agent is not None:
-            parts.append(self.agent[:P].to(noisy.dtype).expand(B, N, P, -1))
-        x = self.enter(torch.cat(parts, dim=-1)).flatten(1, 2)
-        time = torch.arange(N, device=x.device).repeat_interleave(P)
-        if self.rope == "hidden":
-            x = x + rotate(x, time)
-        mask = present[:, None, :P].expand(B, N, P).flatten(1)[:, None, None]
-        for block in self.blocks:
-            x = block(x, time, mask)
-        clean = self.leave(x).unflatten(1, (N, P))
-        return F.pad(clean, (0, 0, 0, present.shape[1] - P))
+            parts.append(self.agent.to(noisy.dtype).expand(B, N, P, -1))
+        return self.leave(self._blocks(self.enter(torch.cat(parts, dim=-1)), present))
+
+    def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
+        """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)"""
+        people = present.sum(dim=1)
+        slots_in_use = (~present).int().argsort(dim=1, stable=True)
+        finished = torch.zeros_like(x)
+        for size in people.unique().tolist():
+            if size == 0:
+                continue
+            rows = (people == size).nonzero()
+            slots = slots_in_use[rows[:, 0], :size]
+            y = x[rows, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
+            time = torch.arange(x.shape[1], device=x.device).repeat_interleave(size)
+            if self.rope == "hidden":
+                y = y + rotate(y, time)
+            for block in self.blocks:
+                y = block(y, time)
+            finished[rows, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
+        return finished

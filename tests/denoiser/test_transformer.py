@@ -1,7 +1,10 @@
+from unittest import mock
+
 import pytest
 import torch
+from torch.nn import functional as F
 
-from magnet.denoiser.transformer import Transformer
+from magnet.denoiser.transformer import Transformer, rotate
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
 
@@ -42,14 +45,41 @@ def test_absent_agents_change_nothing(generator, training, rope):
     assert torch.equal(a[1, :, :3], b[1, :, :3])
 
 
-def test_unused_slots_need_not_be_computed(generator):
-    """In training all slots run, in use only those up to the last one used: same result."""
-    model = build(dropout=0.0)
+def test_groups_of_any_size_in_one_batch_equal_each_alone(generator):
+    """Scenes are run by group size; which others are in the batch, and in which slots, changes nothing."""
+    model = build()
     noisy, levels = batch(generator)
-    present = torch.tensor([[True, True, False, False]]).expand(2, 4)
-    short = model(noisy, levels, present)
-    full = model.train()(noisy, levels, present)
-    assert torch.allclose(short[:, :, :2], full[:, :, :2], atol=1e-5)
+    present = torch.tensor([[True, False, True, False], [True, True, True, True]])
+    together = model(noisy, levels, present)
+    for scene in range(2):
+        alone = model(noisy[[scene]], levels[[scene]], present[[scene]])
+        assert torch.allclose(together[scene][:, present[scene]], alone[0][:, present[scene]], atol=1e-6)
+
+
+def test_leaving_absent_agents_out_equals_masking_them(generator):
+    """The plain reference: everybody runs, absent agents are masked as keys."""
+    model = build()
+    noisy, levels = batch(generator)
+    present = torch.tensor([[True, False, True, False], [True, True, True, False]])
+    mask = present[:, None, :].expand(2, 6, 4).flatten(1)[:, None, None]
+    original = torch.nn.functional.scaled_dot_product_attention
+
+    def dense(x: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        time = torch.arange(6).repeat_interleave(4)
+        y = x.flatten(1, 2)
+        y = y + rotate(y, time)
+        for block in model.blocks:
+            y = block(y, time)
+        return y.unflatten(1, (6, 4))
+
+    def masked(query, key, value, dropout_p=0.0):
+        return original(query, key, value, attn_mask=mask)
+
+    packed = model(noisy, levels, present)
+    with mock.patch.object(model, "_blocks", dense), mock.patch.object(F, "scaled_dot_product_attention", masked):
+        reference = model(noisy, levels, present)
+    there = present[:, None, :, None].expand_as(packed)
+    assert torch.allclose(packed[there], reference[there], atol=1e-5)
 
 
 @pytest.mark.parametrize("field", ["rope", "agent_embedding"])

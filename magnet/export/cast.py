@@ -1,0 +1,142 @@
+"""Scenes made ready for drawing: who is present, in which colour, on which body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.export.figures import add_capsules, add_mesh, add_sticks
+from magnet.export.stage import AGENTS, CONTEXT, Array, Canvas
+from magnet.motion.scene import Scene
+
+Scenes = Scene | list[tuple[str, Scene]] | dict[str, Scene]
+"""A scene, each of its B a panel, or labelled scenes."""
+
+Style = Literal["skeleton", "capsules", "body"]
+STYLES: tuple[Style, ...] = ("skeleton", "capsules", "body")
+
+
+class Posable(Protocol):
+    """What drawing asks of a body model (`magnet.body.Body` is one)."""
+
+    faces: Tensor  # (F, 3)
+
+    def joints(self, scene: Scene) -> Tensor: ...
+
+    def vertices(self, scene: Scene) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Cast:
+    """The people of one picture: T moments of the P agents who are present."""
+
+    joints: Array  # (T, P, 22, 3)
+    colours: Array  # (T, P, 3), 0 to 255
+    known: NDArray[np.bool_]  # (T, P)
+    scene: Scene  # B = 1, present agents only
+    body: Posable
+    style: Style
+
+    @property
+    def frames(self) -> int:
+        return len(self.joints)
+
+    def vertices(self, frame: int) -> Array:
+        """(P, V, 3)"""
+        return self.body.vertices(self.scene.cut(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
+
+    def draw(self, canvas: Canvas, frame: int) -> None:
+        """Put everybody on the canvas; nothing is painted yet."""
+        joints, colours = self.joints[frame], self.colours[frame]
+        if self.style == "skeleton":
+            add_sticks(canvas, joints, colours)
+        elif self.style == "capsules":
+            add_capsules(canvas, joints, colours)
+        else:
+            add_mesh(canvas, self.vertices(frame), self.body.faces.cpu().numpy(), colours)
+
+
+def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None) -> Cast:
+    """One scene (B = 1) made ready for drawing. known: (T, P) bool, what is drawn pink.
+
+    Raises:
+        ValueError: no such style, nobody present, or joints that are not finite.
+    """
+    if style not in STYLES:
+        raise ValueError(f"style {style!r}: expected one of {', '.join(STYLES)}")
+    slots = scene.present[0].nonzero()[:, 0]
+    label = f"scene {scene.names[0]!r}" if scene.names else "scene"
+    if not len(slots):
+        raise ValueError(f"{label}: nobody is present, so there is nothing to draw")
+    shown = scene.order(slots)
+    joints = body.joints(shown)[0].detach().cpu().numpy().astype(np.float64)
+    broken = ~np.isfinite(joints).all(axis=(1, 2, 3))
+    if broken.any():
+        raise ValueError(
+            f"{label}: {broken.sum()} of {len(joints)} frames hold joints that are not finite, "
+            f"the first is frame {broken.argmax()}"
+        )
+    slot = slots.cpu().numpy()
+    marked = np.zeros(joints.shape[:2], dtype=bool)
+    if known is not None:
+        marked |= known.cpu().numpy()[:, slot]
+    pink, own = (np.array(palette, dtype=np.float64)[slot % len(palette)] for palette in (CONTEXT, AGENTS))
+    return Cast(joints, np.where(marked[..., None], pink, own), marked, shown, body, style)
+
+
+def default_body(scene: Scene) -> Posable:
+    """The packaged open body, for scenes that belong to it.
+
+    Raises:
+        ValueError: the scene belongs to another body, which must be given.
+    """
+    from magnet.body import load_body  # late: drawing with a given body needs no packaged one
+
+    body = load_body("open")
+    if scene.body != body.id:
+        raise ValueError(
+            f"the scene belongs to body {scene.body!r}, the packaged one is {body.id!r}; give body=load_body(...)"
+        )
+    return body
+
+
+def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
+    """Labelled scenes with B = 1 each.
+
+    Raises:
+        ValueError: no scene, or scenes of different length.
+    """
+    if isinstance(scenes, Scene):
+        labels = scenes.names or ("",) * scenes.scenes
+        pairs = [(label, scenes.pick([b])) for b, label in enumerate(labels)]
+    else:
+        items = list(scenes.items()) if isinstance(scenes, dict) else list(scenes)
+        pairs = [
+            (label if scene.scenes == 1 else f"{label} {b + 1}", scene.pick([b]))
+            for label, scene in items
+            for b in range(scene.scenes)
+        ]
+    lengths = sorted({scene.frames for _, scene in pairs})
+    if len(lengths) != 1 or lengths[0] == 0:
+        raise ValueError(f"got scenes of {lengths or 'no'} frames, expected one length; cut them with Scene.cut")
+    return pairs
+
+
+def known_frames(scene: Scene, context_frames: int, known: Tensor | None) -> Tensor:
+    """(T, P) bool: the mask given, or the first `context_frames` of everybody.
+
+    Raises:
+        ValueError: the mask has another shape, or more context than frames.
+    """
+    if known is not None:
+        if tuple(known.shape) != (scene.frames, scene.agents):
+            raise ValueError(f"known: got {tuple(known.shape)}, expected (T, P) = {(scene.frames, scene.agents)}")
+        return known
+    if not 0 <= context_frames <= scene.frames:
+        raise ValueError(f"context_frames: got {context_frames}, expected 0 to {scene.frames}, the scene's frames")
+    return (torch.arange(scene.frames) < context_frames)[:, None].expand(scene.frames, scene.agents)

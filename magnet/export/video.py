@@ -1,0 +1,254 @@
+"""Moving pictures of scenes: people on a floor, known motion pink, several recordings side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
+from magnet.export.figures import add_ghosts, add_shadows
+from magnet.export.stage import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
+from magnet.motion.scene import Scene
+
+Report = Callable[[int, int], None]
+"""Told after each frame: frames done, frames in all."""
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+PINK = CONTEXT[0]
+GENERATED = (72, 84, 106)
+PAGE = (255, 255, 255)
+
+
+def render_video(
+    scenes: Scenes,
+    path: str | Path,
+    *,
+    context_frames: int,
+    known: Tensor | None = None,
+    body: Posable | None = None,
+    style: Style = "skeleton",
+    fps: float = 30.0,
+    size: Size = (640, 480),
+    title: str | None = None,
+    ghosts: Scene | None = None,
+    camera: Camera | None = None,
+    trail: float = 1.5,
+    progress: bool | Report = False,
+) -> Path:
+    """Write a moving picture of one scene, or of several side by side at one scale and from one side.
+
+    Args:
+        scenes: a scene, each of its B a panel, or labelled scenes; all of one length.
+        path: .mp4 (needs PyAV), .gif or .webp.
+        context_frames: how many first frames were given to the model; they are pink and marked in the time bar.
+        known: (T, P) bool instead, when not everybody's first frames were given.
+        body: the scenes' body model; the packaged one if None.
+        style: `skeleton` strokes, `capsules` mannequins, or the `body`'s own skin.
+        fps: frames a second of the picture; the scene's are repeated or left out.
+        size: pixels of one panel, even numbers.
+        ghosts: a scene (B = 1) drawn pale behind every panel, such as the ground truth.
+        trail: seconds of the way of each pelvis that are drawn on the floor.
+        progress: True for a progress bar, or a function told (done, all) after each frame.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ValueError: unknown suffix, odd size, or scenes that cannot be drawn; says which and why.
+        ImportError: .mp4 without PyAV.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
+    if size[0] % 2 or size[1] % 2:
+        raise ValueError(f"size {size}: video needs even numbers of pixels")
+    film = Film(scenes, context_frames, known, body, style, fps, size, title, ghosts, camera or Camera(), trail)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # A name of its own until it is whole, so that an interrupted run leaves no half picture behind.
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        with _reporting(progress, path.name) as report:
+            {".mp4": _write_mp4, ".gif": _write_gif, ".webp": _write_webp}[path.suffix](film, part, report)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+class Film:
+    """The frames of a moving picture, drawn when asked for."""
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        context_frames: int,
+        known: Tensor | None,
+        body: Posable | None,
+        style: Style,
+        fps: float,
+        size: Size,
+        title: str | None,
+        ghosts: Scene | None,
+        camera: Camera,
+        trail: float,
+    ) -> None:
+        labelled = panels(scenes)
+        first = labelled[0][1]
+        body = body or default_body(first)
+        self.fps, self.size, self.title, self.trail = fps, size, title, trail
+        self.scene_fps = first.fps
+        self.labels = [label for label, _ in labelled]
+        self.casts = [cast(s, body, style, known_frames(s, context_frames, known)) for _, s in labelled]
+        self.ghost = None if ghosts is None else cast(ghosts, body, "skeleton").joints
+        if self.ghost is not None and len(self.ghost) != self.casts[0].frames:
+            raise ValueError(f"ghosts have {len(self.ghost)} frames, the scenes {self.casts[0].frames}; cut them alike")
+        groups = [c.joints for c in self.casts]
+        if self.ghost is not None:
+            groups = [np.concatenate([joints, self.ghost], axis=1) for joints in groups]
+        self.views = plan_views(groups, camera, size, self.scene_fps)
+        duration = self.casts[0].frames / self.scene_fps
+        self.frames = max(1, round(duration * fps))
+        self.columns = len(labelled) if len(labelled) <= 3 else math.ceil(math.sqrt(len(labelled)))
+        self.rows = math.ceil(len(labelled) / self.columns)
+        self.header = 0 if title is None else round(0.08 * size[1] / 2) * 2
+        self.context_end = int(self.casts[0].known.all(axis=1).cumprod().sum())
+        self.size_all = (self.columns * size[0], self.rows * size[1] + self.header)
+
+    def draw(self, index: int) -> Image.Image:
+        """Frame `index` of the picture."""
+        frame = min(int(index * self.scene_fps / self.fps + 1e-6), self.casts[0].frames - 1)
+        page = Image.new("RGB", self.size_all, PAGE)
+        gap = 1 if len(self.casts) > 1 else 0
+        for i, people in enumerate(self.casts):
+            panel = paint(people, self.views[i][frame], frame, self.ghost, round(self.trail * self.scene_fps))
+            corner = (i % self.columns * self.size[0], i // self.columns * self.size[1] + self.header)
+            inner = panel.crop((gap, gap, self.size[0] - gap, self.size[1] - gap))
+            page.paste(inner, (corner[0] + gap, corner[1] + gap))
+            if self.labels[i]:
+                place = (corner[0] + 0.028 * self.size[0], corner[1] + 0.03 * self.size[1])
+                ImageDraw.Draw(page).text(place, self.labels[i], fill=INK, font=font(0.040 * self.size[1]))
+        if self.title:
+            middle = (self.size_all[0] / 2, self.header / 2)
+            ImageDraw.Draw(page).text(middle, self.title, fill=INK, font=font(0.046 * self.size[1]), anchor="mm")
+        self._time_bar(page, frame)
+        return page
+
+    def _time_bar(self, page: Image.Image, frame: int) -> None:
+        """A bar from the first to the last frame: known part pink, a knob at now, and what now is."""
+        unit = self.size[1] / 480
+        left, right, y = 18 * unit, page.width - 18 * unit, page.height - 17 * unit
+        last = max(self.casts[0].frames - 1, 1)
+        at = left + (right - left) * frame / last
+        border = left + (right - left) * min(self.context_end / last, 1.0)
+        known = frame < self.context_end
+        scale = 2  # the bar alone is drawn larger and shrunk, for smooth ends
+        upper = int(y - 8 * unit)
+        strip = page.crop((0, upper, page.width, upper + int(16 * unit)))
+        strip = strip.resize((strip.width * scale, strip.height * scale))
+        draw = ImageDraw.Draw(strip)
+        middle, half = strip.height / 2, 2.5 * unit * scale
+
+        def bar(start: float, stop: float, colour: tuple[int, int, int]) -> None:
+            if stop > start:
+                box = (start * scale, middle - half, stop * scale, middle + half)
+                draw.rounded_rectangle(box, radius=half, fill=colour)
+
+        bar(left, right, (214, 218, 226))
+        bar(left, border, (250, 196, 220))
+        bar(left, at, GENERATED)
+        bar(left, min(at, border), PINK)
+        knob = 6 * unit * scale
+        now = PINK if known else GENERATED
+        box = (at * scale - knob, middle - knob, at * scale + knob, middle + knob)
+        draw.ellipse(box, fill=now, outline=PAGE, width=scale)
+        page.paste(strip.reduce(scale), (0, upper))
+        words = ImageDraw.Draw(page)
+        face = font(15 * unit)
+        if self.context_end:
+            words.text((left, y - 16 * unit), "context" if known else "generated", fill=now, font=face, anchor="ls")
+        seconds = (frame - self.context_end + 1 if self.context_end else frame) / self.scene_fps
+        stamp = f"{seconds:+.1f} s" if self.context_end else f"{seconds:.1f} s"
+        words.text((right, y - 16 * unit), stamp, fill=PALE, font=face, anchor="rs")
+
+
+def paint(people: Cast, view: View, frame: int, ghost: Array | None = None, trail: int = 0) -> Image.Image:
+    """One panel: floor, shadows, trails, ghosts, people."""
+    canvas = Canvas.of(view)
+    canvas.floor()
+    joints = people.joints[frame]
+    if trail:
+        start = max(0, frame - trail)
+        for p in range(joints.shape[0]):
+            way = people.joints[start : frame + 1 : 2, p, 0]
+            own = people.colours[start : frame + 1 : 2, p][1:]
+            age = np.linspace(0.10, 0.55, len(own))[:, None]
+            canvas.trail(way, age * own + (1 - age) * np.array((232, 236, 242)))
+    add_shadows(canvas, joints)
+    if ghost is not None:
+        add_ghosts(canvas, ghost[frame])
+    people.draw(canvas, frame)
+    return canvas.finished()
+
+
+# -- files -------------------------------------------------------------------------------------
+
+
+def _frames(film: Film, report: Report) -> Iterator[Image.Image]:
+    for index in range(film.frames):
+        yield film.draw(index)
+        report(index + 1, film.frames)
+
+
+def _write_mp4(film: Film, path: Path, report: Report) -> None:
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError('.mp4 needs PyAV: pip install "magnet-motion[video]"; .gif and .webp do not') from error
+    with av.open(str(path), "w") as container:
+        rate = Fraction(film.fps).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
+        stream.width, stream.height = film.size_all
+        stream.pix_fmt = "yuv420p"
+        for image in _frames(film, report):
+            container.mux(stream.encode(av.VideoFrame.from_image(image)))
+        container.mux(stream.encode())
+
+
+def _write_gif(film: Film, path: Path, report: Report) -> None:
+    # One palette from the start, the middle and the end, so that colours do not flicker.
+    probes = [np.asarray(film.draw(i)) for i in sorted({0, film.frames // 2, film.frames - 1})]
+    palette = Image.fromarray(np.concatenate(probes)).quantize(200, method=Image.Quantize.MEDIANCUT)
+    images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _frames(film, report))
+    next(images).save(path, save_all=True, append_images=images, duration=_durations(film, 10), loop=0, disposal=1)
+
+
+def _write_webp(film: Film, path: Path, report: Report) -> None:
+    first, *rest = _frames(film, report)
+    first.save(path, save_all=True, append_images=rest, duration=_durations(film, 1), loop=0, quality=75, method=2)
+
+
+def _durations(film: Film, tick: int) -> list[int]:
+    """Milliseconds of each frame, whole ticks that keep to the true time on the whole."""
+    ends = np.round(np.arange(film.frames + 1) * 1000 / film.fps / tick) * tick
+    return np.maximum(np.diff(ends), tick).astype(int).tolist()
+
+
+@contextmanager
+def _reporting(progress: bool | Report, name: str) -> Iterator[Report]:
+    if callable(progress):
+        yield progress
+    elif not progress:
+        yield lambda done, total: None
+    else:
+        frames = (MofNCompleteColumn(), TextColumn("frames"), TimeRemainingColumn())
+        with Progress(TextColumn("{task.description}"), BarColumn(), *frames) as bar:
+            task = bar.add_task(f"drawing {name}", total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)

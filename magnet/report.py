@@ -1,0 +1,326 @@
+"""Results of a test run: one table of methods and metrics, on the screen, as JSON, CSV and markdown."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+LOW, HIGH = "_low", "_high"
+"""Endings under which a row holds the ends of a metric's interval."""
+
+REFERENCES = ("ground truth", "training windows")
+"""Rows of recorded motion: something to compare with, not something that can be best."""
+
+RESULTS_FORMAT = 1
+
+Better = Literal["low", "high", "real", ""]
+ARROWS: dict[Better, str] = {"low": " ↓", "high": " ↑", "real": " →", "": ""}
+
+
+class Column(NamedTuple):
+    """How a metric is shown: title, unit, and whether low, high or near the recorded value is good."""
+
+    title: str
+    unit: str
+    better: Better
+    meaning: str
+
+
+COLUMNS: dict[str, Column] = {
+    "fd": Column("FD", "m²", "low", "distance between the distributions of generated and recorded poses"),
+    "fd_pair": Column("FD pair", "m²", "low", "the same of two people in one's frame"),
+    "fd halves": Column("FD halves", "m²", "low", "between two halves of the recordings"),
+    "div": Column("DIV", "m²", "high", "variance over the samples of a scene"),
+    "mi": Column("MI", "", "low", "error of the correlation between people"),
+    "fs": Column("FS", "m/s", "low", "speed of standing toes that slide"),
+    "fs_ratio": Column("FS ratio", "", "low", "share of toe steps that slide"),
+    "fs_contact": Column("contact", "", "real", "share of toe steps that stand"),
+    "ip_ratio": Column("IP", "", "low", "share of frames in which people run through each other"),
+    "ip_mean_total_depth": Column("IP depth", "m", "low", "summed depth of penetration, mean over all frames"),
+    "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
+    "mpjpe": Column("MPJPE", "m", "low", "distance to the recorded joints, mean over samples"),
+    "mpjpe_best": Column("MPJPE best", "m", "low", "distance to the recorded joints, best sample"),
+    "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities"),
+    "jitter": Column("jitter", "10 m/s³", "real", "mean third difference"),
+    "partner_distance": Column("distance", "m", "real", "median between two pelvises over the ground"),
+    "hands_held": Column("hands", "", "real", "share of frames with wrists of two people close"),
+}
+
+MAIN = (
+    "fd",
+    "div",
+    "mi",
+    "fs",
+    "ip_ratio",
+    "mpjpe@0.5s",
+    "mpjpe@1s",
+    "mpjpe@2s",
+    "mpjpe@5s",
+    "mpjpe",
+    "mpjve",
+    "jitter",
+)
+"""Metrics that a table shows when nothing else is asked for, where they were measured."""
+
+
+def column(metric: str) -> Column:
+    """How a metric is shown; an unknown one by its own name."""
+    base, at, horizon = metric.partition("@")
+    known = COLUMNS.get(base, Column(base, "", "", ""))
+    if not at:
+        return known
+    return known._replace(title=f"{known.title} {horizon}", meaning=f"{known.meaning}, up to {horizon}")
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a test run measured.
+
+    Args:
+        rows: method -> metric -> value; `<metric>_low` and `<metric>_high` beside it are its interval.
+        meta: how it came about, JSON-ready: command, commit, machine, date, seed, data, task, sampler, runtime.
+    """
+
+    rows: dict[str, dict[str, float]]
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> list[str]:
+        """All metrics that any method has, in the order met, without interval ends."""
+        names = dict.fromkeys(name for row in self.rows.values() for name in row)
+        ends = {name + end for name in names for end in (LOW, HIGH)}
+        return [name for name in names if name not in ends]
+
+    def value(self, method: str, metric: str) -> float:
+        """NaN where it was not measured."""
+        return float(self.rows[method].get(metric, math.nan))
+
+    def interval(self, method: str, metric: str) -> tuple[float, float] | None:
+        row = self.rows[method]
+        return (row[metric + LOW], row[metric + HIGH]) if metric + LOW in row and metric + HIGH in row else None
+
+    def best(self, metric: str) -> set[str]:
+        """Methods whose shown value no other beats; recorded motion does not compete. Empty without a rival."""
+        values = {m: self.value(m, metric) for m in self.rows if m not in REFERENCES}
+        values = {m: v for m, v in values.items() if math.isfinite(v)}
+        better = column(metric).better
+        if len(values) < 2 or not better:
+            return set()
+        goal = 0.0
+        if better == "real":
+            goal = self.value(REFERENCES[0], metric) if REFERENCES[0] in self.rows else math.nan
+            if not math.isfinite(goal):
+                return set()
+        badness = {m: -v if better == "high" else abs(v - goal) if better == "real" else v for m, v in values.items()}
+        least = three(min(badness.values()))
+        return {m for m, b in badness.items() if three(b) == least}
+
+    # -- files -----------------------------------------------------------------------------
+
+    def save_json(self, path: str | Path) -> Path:
+        """Everything, a value that is not a number as null."""
+        rows = {m: {k: v if math.isfinite(v) else None for k, v in row.items()} for m, row in self.rows.items()}
+        content = {"format": RESULTS_FORMAT, "meta": self.meta, "rows": rows}
+        return _write(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False, default=str) + "\n")
+
+    @staticmethod
+    def load_json(path: str | Path) -> Results:
+        """Read what `save_json` wrote.
+
+        Raises:
+            ValueError: the file holds something else, or a later format.
+        """
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+            version, meta, rows = content["format"], content["meta"], content["rows"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not a results file ({error!r}); write one with Results.save_json") from error
+        if version > RESULTS_FORMAT:
+            raise ValueError(f"{path}: results format {version}, this version reads up to {RESULTS_FORMAT}")
+        numbers = {m: {k: math.nan if v is None else float(v) for k, v in row.items()} for m, row in rows.items()}
+        return Results(numbers, meta)
+
+    def save_csv(self, path: str | Path) -> Path:
+        """One line a number: method, metric, value, low, high; full precision, without meta."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(("method", "metric", "value", "low", "high"))
+            for method, row in self.rows.items():
+                for metric in self.metrics:
+                    if metric in row:
+                        span = self.interval(method, metric) or ("", "")
+                        writer.writerow((method, metric, self.value(method, metric), *span))
+        return path
+
+    @staticmethod
+    def load_csv(path: str | Path) -> Results:
+        """Read what `save_csv` wrote."""
+        rows: dict[str, dict[str, float]] = {}
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            for line in csv.DictReader(file):
+                row = rows.setdefault(line["method"], {})
+                row[line["metric"]] = float(line["value"])
+                if line["low"]:
+                    row |= {line["metric"] + LOW: float(line["low"]), line["metric"] + HIGH: float(line["high"])}
+        return Results(rows)
+
+    def to_markdown(self, metrics: Sequence[str] | None = None, intervals: bool = False) -> str:
+        """The table in markdown, with its footnotes."""
+        chosen = self._chosen(metrics)
+        lines = ["| method | " + " | ".join(_title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
+        best = {metric: self.best(metric) for metric in chosen}
+        for method in self.rows:
+            cells = []
+            for metric in chosen:
+                shown = three(self.value(method, metric))
+                span = self.interval(method, metric)
+                shown = f"**{shown}**" if method in best[metric] else shown
+                cells.append(f"{shown} [{three(span[0])}, {three(span[1])}]" if intervals and span else shown)
+            lines.append(f"| {method} | " + " | ".join(cells) + " |")
+        return "\n".join(lines) + "\n\n" + "  \n".join(_footnotes(chosen)) + "\n"
+
+    def _chosen(self, metrics: Sequence[str] | None) -> list[str]:
+        """Metrics to show: those asked for, else the main ones that were measured, else all."""
+        measured = self.metrics
+        if metrics is not None:
+            unknown = sorted(set(metrics) - set(measured))
+            if unknown:
+                raise ValueError(f"no metric {', '.join(unknown)} in these results; they have {', '.join(measured)}")
+            return list(metrics)
+        return [m for m in MAIN if m in measured] or measured
+
+
+def print_table(
+    results: Results,
+    metrics: Sequence[str] | None = None,
+    *,
+    intervals: bool = False,
+    title: str | None = None,
+    console: Console | None = None,
+) -> None:
+    """Print methods as rows and metrics as columns, the best in bold, and what the columns mean.
+
+    A table wider than the screen is cut into several, never its numbers.
+
+    Args:
+        metrics: which, in this order; None: the main ones.
+        intervals: also the interval of each value that has one.
+    """
+    console = console or Console()
+    chosen = results._chosen(metrics)
+    best = {metric: results.best(metric) for metric in chosen}
+    parts: list[list[str]] = [[]]
+    for metric in chosen:
+        wider = _table(results, [*parts[-1], metric], best, intervals)
+        if parts[-1] and _natural_width(wider, console) > console.width:
+            parts.append([])
+        parts[-1].append(metric)
+    if title:
+        console.print(Text(title, style="bold"))
+    for part in parts:
+        table = _table(results, part, best, intervals)
+        console.print(table, width=_natural_width(table, console), crop=False)
+    for note in _footnotes(chosen):
+        console.print(Text(note, style="dim"))
+
+
+def _table(results: Results, metrics: list[str], best: dict[str, set[str]], intervals: bool) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    for metric in metrics:
+        name = _title(metric).replace(" ", "\n", 1) if "@" in metric else _title(metric)
+        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    for method in results.rows:
+        cells = [Text(method, style="italic" if method in REFERENCES else "")]
+        for metric in metrics:
+            cell = Text(three(results.value(method, metric)), style="bold green" if method in best[metric] else "")
+            span = results.interval(method, metric)
+            if intervals and span:
+                cell.append(f"\n[{three(span[0])}, {three(span[1])}]", style="not bold dim")
+            cells.append(cell)
+        table.add_row(*cells)
+    return table
+
+
+def _natural_width(table: Table, console: Console) -> int:
+    return table.__rich_measure__(console, console.options.update(max_width=10_000)).maximum
+
+
+def _title(metric: str) -> str:
+    shown = column(metric)
+    return shown.title + ARROWS[shown.better]
+
+
+def _footnotes(metrics: list[str]) -> list[str]:
+    shown: dict[str, str] = {}
+    for metric in metrics:
+        at = column(metric.partition("@")[0])
+        if at.meaning:
+            shown[at.title] = f"{at.title}{f' ({at.unit})' if at.unit else ''}: {at.meaning}."
+    arrows = {column(metric).better for metric in metrics}
+    words: dict[Better, str] = {"low": "lower", "high": "higher", "real": "nearer the ground truth"}
+    legend = "; ".join(
+        f"{ARROWS[better].strip()} {text} is better" for better, text in words.items() if better in arrows
+    )
+    horizons = [metric.partition("@")[2] for metric in metrics if "@" in metric]
+    if horizons:
+        shown["@"] = f"A time behind a name, such as {horizons[0]}: mean over frames up to then."
+    return [*shown.values(), *([legend + "."] if legend else [])]
+
+
+def three(value: float) -> str:
+    """A number with three significant digits; a dash for none."""
+    if not math.isfinite(value):
+        return "-" if math.isnan(value) else str(value)
+    if value == 0:
+        return "0"
+    digits = 2 - math.floor(math.log10(abs(float(f"{value:.2e}"))))
+    if digits > 6:
+        return f"{value:.2e}"
+    return f"{round(value, digits):.{max(digits, 0)}f}"
+
+
+def machine() -> dict[str, Any]:
+    """What this machine is: processor, cores at hand, accelerator, versions."""
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "cpu": _processor(),
+        "cores": cores,
+        "gpu": ", ".join(gpus) or None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _write(path: str | Path, text: str) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path

@@ -1,0 +1,62 @@
+"""Reading a tokenizer's checkpoint without running anything in it."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+SHAPING = ("latent", "hidden", "codes", "levels", "depth", "causal")
+"""Fields that decide the shape of the weights, or what they mean."""
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Fields and weights of the tokenizer in a tokenizer's checkpoint, or in that of a denoiser.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or holds no tokenizer.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such tokenizer checkpoint; train one with `magnet fit`")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+        fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
+    except Exception as error:  # whatever a damaged or foreign file makes torch raise
+        reason = str(error).strip().split("\n")[0]
+        raise ValueError(
+            f"{path}: not a tokenizer's checkpoint ({type(error).__name__}: {reason}); expected one written by "
+            f"`magnet fit`"
+        ) from error
+    if "tokenizer_hyper_parameters" in checkpoint:
+        fields = checkpoint["tokenizer_hyper_parameters"]
+        if fields is None:
+            raise ValueError(f"{path}: this denoiser was trained on raw poses and holds no tokenizer")
+        prefix = "tokenizer."
+        state = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+    return dict(fields), state
+
+
+def check_fields(stored: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Raises ValueError where a checkpoint's fields make other weights than `mine`."""
+    for name in SHAPING:
+        if name in stored and stored[name] != mine[name]:
+            raise ValueError(
+                f"{name}: the checkpoint's tokenizer has {stored[name]}, this one {mine[name]}; "
+                f"give --model.{name} {stored[name]}, or start without the checkpoint"
+            )
+
+
+def check_weights(path: Path, state: Mapping[str, Tensor], expected: Mapping[str, Tensor], fields: object) -> None:
+    """Raises ValueError that names the first weight of a checkpoint that is missing or of another shape."""
+    if missing := sorted(expected.keys() - state.keys()):
+        raise ValueError(f"{path}: not a tokenizer's checkpoint: it lacks {', '.join(missing[:3])}")
+    for name, want in expected.items():
+        if state[name].shape != want.shape:
+            raise ValueError(
+                f"{path}: {name} is {tuple(state[name].shape)}, expected {tuple(want.shape)} by its fields {fields}"
+            )

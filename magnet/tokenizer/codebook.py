@@ -1,0 +1,261 @@
+"""A codebook that follows its vectors by a moving average, in step over all processes (paper 3.1, Table A.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+KMEANS_ROUNDS = 10
+KMEANS_VECTORS = 8
+"""Vectors a code, over all processes, that the k-means start looks at; more only cost time."""
+
+CROWD = 4.0
+"""With at least this many vectors a code in a batch, `revive_below` means what it says."""
+
+
+@dataclass(frozen=True)
+class Quantised:
+    """What a codebook makes of vectors (..., D)."""
+
+    latent: Tensor  # (..., D) sum of the chosen codes; gradients pass straight to the vectors
+    index: Tensor  # (..., levels) int, the code chosen at each level; -1 where masked out
+    commitment: Tensor  # () mean squared distance from a vector to its code, gradient to the vectors only
+    counts: Tensor  # (levels, codes) how often each code was chosen, over all processes in training
+
+
+class Codebook(nn.Module):
+    """Residual vector quantiser: each level holds codes for what the levels before it left over.
+
+    Codes are buffers: no gradient moves them. In training mode they follow the vectors that chose them, by an
+    exponential moving average; in evaluation, or when `frozen`, nothing moves. Whether to sum over processes
+    is asked at every call, because Lightning makes its process group after its modules; every process then
+    holds the same bits.
+
+    Args:
+        codes: codes a level, paper Table A.2.
+        dim: numbers in a code, paper Table A.2.
+        levels: 1 is the paper's single codebook.
+        decay: of the moving averages.
+        revive_below: a code whose average count a batch falls below this is moved to a vector of the batch. With
+            fewer than 4 vectors a code in a batch the bar is lowered in proportion, or small batches would
+            keep throwing good codes away (ours).
+    """
+
+    codes: Tensor  # (levels, codes, D)
+    ema_count: Tensor  # (levels, codes)
+    ema_sum: Tensor  # (levels, codes, D)
+    started: Tensor  # () bool
+
+    def __init__(
+        self, codes: int = 1024, dim: int = 512, levels: int = 1, decay: float = 0.99, revive_below: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.size, self.dim, self.levels = codes, dim, levels
+        self.decay, self.revive_below = decay, revive_below
+        self.frozen = False
+        self.register_buffer("codes", torch.zeros(levels, codes, dim))
+        self.register_buffer("ema_count", torch.ones(levels, codes))
+        self.register_buffer("ema_sum", torch.zeros(levels, codes, dim))
+        self.register_buffer("started", torch.tensor(False))
+
+    # -- looking up ----------------------------------------------------------------------------
+
+    def forward(
+        self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Quantised:
+        """Nearest codes; in training the codes then move.
+
+        Args:
+            vectors: (..., D), computed in float32 whatever the autocast.
+            mask: (...) bool; False: looked up like the others, but touches neither codes, loss nor counts.
+            generator: draws the vectors that start and revive codes; only that of rank 0 counts.
+        """
+        with torch.autocast(vectors.device.type, enabled=False):
+            flat = vectors.float().flatten(0, -2)
+            keep = torch.ones_like(flat[:, 0], dtype=torch.bool) if mask is None else mask.flatten()
+            update = self.training and not self.frozen
+            if update and not bool(self.started):
+                self.start(flat.detach()[keep], generator)
+            residual, latent = flat, torch.zeros_like(flat)
+            index, commitment, counts = [], flat.new_zeros(()), []
+            for level in range(self.levels):
+                chosen = self._nearest(residual.detach(), level)
+                code = self.codes[level][chosen]
+                distance = (residual - code).square().mean(-1)
+                commitment = commitment + torch.where(keep, distance, 0.0).sum() / keep.sum().clamp(min=1)
+                counts.append(self._follow(residual.detach(), chosen, keep, level, generator, update))
+                index.append(torch.where(keep, chosen, -1))
+                latent, residual = latent + code, residual - code
+            if flat.requires_grad:
+                latent = flat + (latent - flat).detach()
+            return Quantised(
+                latent=latent.view(vectors.shape),
+                index=torch.stack(index, dim=-1).view(*vectors.shape[:-1], self.levels),
+                commitment=commitment / self.levels,
+                counts=torch.stack(counts),
+            )
+
+    @torch.no_grad()
+    def nearest(self, vectors: Tensor) -> Tensor:
+        """The sum of codes nearest to each vector, level by level; nothing moves. (..., D) -> (..., D) float32"""
+        with torch.autocast(vectors.device.type, enabled=False):
+            residual = vectors.float().flatten(0, -2)
+            latent = torch.zeros_like(residual)
+            for level in range(self.levels):
+                code = self.codes[level][self._nearest(residual, level)]
+                latent, residual = latent + code, residual - code
+            return latent.view(vectors.shape)
+
+    def _nearest(self, vectors: Tensor, level: int) -> Tensor:
+        return _nearest(vectors, self.codes[level])
+
+    # -- following -----------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def _follow(
+        self,
+        vectors: Tensor,
+        chosen: Tensor,
+        keep: Tensor,
+        level: int,
+        generator: torch.Generator | None,
+        update: bool,
+    ) -> Tensor:
+        """Count who chose each code, (codes,); in training also move the codes."""
+        onto = F.one_hot(chosen, self.size).to(vectors.dtype) * keep[:, None]
+        count = onto.sum(0)
+        if not update:
+            return count
+        # As a matrix product and not a scatter, which would add in another order each time on a GPU.
+        total = onto.T @ torch.where(keep[:, None], vectors, 0.0)
+        summed = sum_over_processes(torch.cat([count[:, None], total], dim=1))
+        count, total = summed[:, 0], summed[:, 1:]
+        several = count.sum()
+        decay = torch.where(several > 0, self.decay, 1.0)
+        ema_count = decay * self.ema_count[level] + (1 - decay) * count
+        ema_sum = decay * self.ema_sum[level] + (1 - decay) * total
+
+        least = self.revive_below * (several / (CROWD * self.size)).clamp(max=1.0)
+        dead = ema_count < least
+        fresh = self._picks(vectors, keep, generator)
+        # Just enough weight to stay if the coming batches choose it.
+        ema_count = torch.where(dead, least, ema_count)
+        ema_sum = torch.where(dead[:, None], least * fresh, ema_sum)
+        # A code that nobody chose stays where it is to the bit.
+        codes = torch.where((count > 0)[:, None], ema_sum / ema_count[:, None], self.codes[level])
+        codes = torch.where(dead[:, None], fresh, codes)
+        self.ema_count[level], self.ema_sum[level], self.codes[level] = ema_count, ema_sum, codes
+        return count
+
+    def _picks(self, vectors: Tensor, keep: Tensor, generator: torch.Generator | None) -> Tensor:
+        """One vector for each code out of those kept in any process, the same in every process. (codes, D)"""
+        draws = _rand(self.size, vectors.device, generator)
+        mine = keep.sum()
+        before, everyone = _before_mine(mine)
+        pick = torch.minimum((draws * everyone).long(), everyone - 1) - before
+        ours = (pick >= 0) & (pick < mine)
+        # Kept vectors first, in their order, so that a pick is an index among them.
+        order = torch.argsort((~keep).to(torch.uint8), stable=True)
+        fresh = vectors[order[pick.clamp(min=0, max=len(order) - 1)]]
+        return sum_over_processes(torch.where(ours[:, None], fresh, 0.0))
+
+    # -- starting ------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def start(self, vectors: Tensor, generator: torch.Generator | None = None) -> None:
+        """Set the codes by k-means over the vectors (M, D) of all processes; called once, by training.
+
+        With fewer vectors than codes, codes start equal and are told apart by revival. No vectors: no start.
+        """
+        pool = _gather(_some(vectors.float(), KMEANS_VECTORS * self.size, generator))
+        if not len(pool):
+            return
+        pool = _some(pool, KMEANS_VECTORS * self.size, generator)
+        for level in range(self.levels):
+            codes = _broadcast(_kmeans(pool, self.size, generator))
+            self.codes[level] = codes
+            pool = pool - codes[_nearest(pool, codes)]
+        self.ema_count.fill_(1.0)
+        self.ema_sum.copy_(self.codes)
+        self.started.fill_(True)
+
+
+def _nearest(vectors: Tensor, codes: Tensor) -> Tensor:
+    """Index of the code nearest to each vector. (M, D), (codes, D) -> (M,)"""
+    # |v|^2 is the same for every code.
+    return (codes.square().sum(-1) - 2 * vectors @ codes.T).argmin(-1)
+
+
+def _kmeans(vectors: Tensor, codes: int, generator: torch.Generator | None) -> Tensor:
+    """Centres (codes, D) of vectors (M, D); a centre without vectors stays where it was drawn."""
+    order = _rand(len(vectors), vectors.device, generator).argsort()
+    centres = vectors[order[torch.arange(codes, device=vectors.device) % len(vectors)]]
+    for _ in range(KMEANS_ROUNDS):
+        chosen = _nearest(vectors, centres)
+        onto = F.one_hot(chosen, codes).to(vectors.dtype)
+        count = onto.sum(0)[:, None]
+        centres = torch.where(count > 0, onto.T @ vectors / count.clamp(min=1), centres)
+    return centres
+
+
+def _some(vectors: Tensor, most: int, generator: torch.Generator | None) -> Tensor:
+    if len(vectors) <= most:
+        return vectors
+    return vectors[_rand(len(vectors), vectors.device, generator, shared=False).argsort()[:most]]
+
+
+# -- over processes ----------------------------------------------------------------------------
+
+
+def together() -> bool:
+    """Whether several processes train one model right now."""
+    return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
+
+
+def sum_over_processes(tensor: Tensor) -> Tensor:
+    """The sum of a tensor over all processes, the same bits in each; alone, the tensor."""
+    if together():
+        tensor = tensor.contiguous()
+        dist.all_reduce(tensor)
+    return tensor
+
+
+def _broadcast(tensor: Tensor) -> Tensor:
+    if together():
+        tensor = tensor.contiguous()
+        dist.broadcast(tensor, src=0)
+    return tensor
+
+
+def _rand(n: int, device: torch.device, generator: torch.Generator | None, shared: bool = True) -> Tensor:
+    """Uniform draws (n,), by default those of rank 0 in every process."""
+    draws = torch.rand(n, generator=generator, device=device if generator is None else generator.device).to(device)
+    return _broadcast(draws) if shared else draws
+
+
+def _before_mine(mine: Tensor) -> tuple[Tensor, Tensor]:
+    """How many vectors the processes before this one hold, and how many all hold."""
+    if not together():
+        return torch.zeros_like(mine), mine
+    sizes = [torch.zeros_like(mine) for _ in range(dist.get_world_size())]
+    dist.all_gather(sizes, mine)
+    return torch.stack(sizes)[: dist.get_rank()].sum(), torch.stack(sizes).sum()
+
+
+def _gather(vectors: Tensor) -> Tensor:
+    """The vectors (M, D) of all processes, M may differ, in order of rank."""
+    if not together():
+        return vectors
+    mine = torch.tensor(len(vectors), device=vectors.device)
+    sizes = [torch.zeros_like(mine) for _ in range(dist.get_world_size())]
+    dist.all_gather(sizes, mine)
+    lengths = [int(size) for size in sizes]
+    padded = vectors.new_zeros(max(lengths), vectors.shape[1])
+    padded[: len(vectors)] = vectors
+    parts = [torch.empty_like(padded) for _ in lengths]
+    dist.all_gather(parts, padded)
+    return torch.cat([part[:length] for part, length in zip(parts, lengths, strict=True)])

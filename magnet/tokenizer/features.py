@@ -1,0 +1,73 @@
+"""What tokenizers read of a scene, and the statistics of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import pose_features
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE, scene_steps
+from magnet.tokenizer.codebook import sum_over_processes
+
+
+@dataclass(frozen=True)
+class Features:
+    """Poses of a scene with their conditions, in real units."""
+
+    pose: Tensor  # (B, T, P, 135)
+    steps: Tensor  # (B, T, P, 9)
+    betas: Tensor  # (B, P, 10)
+    counts: Tensor  # (B, T, P) bool, somebody is there and the frame is good
+    tokens: Tensor  # (B, N, P) bool, all four frames count
+    valid: Tensor | None  # (B, T) bool, None: all frames are good
+
+
+def features(scene: Scene) -> Features:
+    """Read a scene, cut to a whole number of tokens."""
+    scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
+    # Mixed precision would round the products of transforms.
+    with torch.autocast(scene.device.type, enabled=False):
+        pose, steps = pose_features(scene), scene_steps(scene)
+    counts = scene.present[:, None].expand(pose.shape[:3])
+    if scene.valid is not None:
+        counts = counts & scene.valid[..., None]
+    tokens = counts.unflatten(1, (-1, STRIDE)).all(dim=2)
+    return Features(pose, steps, scene.betas, counts, tokens, scene.valid)
+
+
+def step_known(valid: Tensor) -> Tensor:
+    """A step is known where both of its frames are; the first one is by definition. (..., T) bool -> same"""
+    return valid & torch.cat([valid[..., :1], valid[..., :-1]], dim=-1)
+
+
+def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
+    """Mean and standard deviation (D,) of `pose`, `steps` and `betas` over everybody present in all processes.
+
+    Raises:
+        ValueError: nobody is present in any frame.
+    """
+    sums: dict[str, Tensor] = {}
+    for scene in scenes:
+        seen = features(scene)
+        steps_count = seen.counts if seen.valid is None else seen.counts & step_known(seen.valid)[..., None]
+        parts = {
+            "pose": seen.pose[seen.counts],
+            "steps": seen.steps[steps_count],
+            "betas": seen.betas[:, None].expand(*seen.counts.shape, -1)[seen.counts],
+        }
+        for name, rows in parts.items():
+            rows = rows.double()
+            one = torch.cat([rows.new_full((1,), len(rows)), rows.sum(0), rows.square().sum(0)])
+            sums[name] = sums[name] + one if name in sums else one
+    result = {}
+    for name, total in sums.items():
+        total = sum_over_processes(total)
+        mean, square = (total[1:] / total[0]).chunk(2)
+        result[name] = (mean.float(), (square - mean.square()).clamp(min=0).sqrt().float())
+    if not result or not all(mean.isfinite().all() for mean, _ in result.values()):
+        raise ValueError("statistics: nobody is present in the scenes given, or they hold NaN; check the data")
+    return result

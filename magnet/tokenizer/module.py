@@ -1,0 +1,366 @@
+"""`Tokenizer`: training the conditional VQ-VAE, and using it (paper 3.1)."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import lightning as L
+import torch
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from magnet.motion.frames import POSE_FEATURES, canonical_frame, posed
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE, by_token
+from magnet.seeding import derive
+from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
+from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
+from magnet.tokenizer.features import Features, features, statistics, step_known
+from magnet.tokenizer.losses import masked_mean, matrices, proper, reconstruction_losses
+from magnet.tokenizer.raw import RawPose
+from magnet.tokenizer.usage import CodeUse, by_level
+from magnet.tokenizer.vqvae import VQVAE
+
+if TYPE_CHECKING:
+    from magnet.body import Body
+
+__all__ = ["RawPose", "Tokenizer"]
+
+STATISTICS_BATCHES = 50
+GLANCE = 4
+"""Scenes of a training batch whose joint error is logged: enough for a curve, at no cost."""
+
+
+class Tokenizer(L.LightningModule):
+    """Conditional VQ-VAE of one person's pose: four frames are one code (paper 3.1, Table A.2).
+
+    Args:
+        latent: numbers in a code, paper Table A.2.
+        hidden: channels of the convolutions, paper Table A.2.
+        codes: size of the codebook, paper Table A.2.
+        levels: codebooks in a row, each coding what the ones before left over (ours); the paper has 1.
+        depth: residual blocks in each of the two stages; the paper does not say.
+        causal: no token sees later frames, so tokens of a growing clip never change (ours, for streaming).
+        decay: of the moving average that the codes follow.
+        revive_below: a code chosen less often than this a batch is moved to a vector of the batch.
+        body_weight: lambda_j of paper Eq. 4, on the mean over the joints.
+        root_rotation_weight: lambda_r of paper Eq. 4, on the rotation of Eq. 5.
+        root_translation_weight: lambda_r of paper Eq. 4, on the translation of Eq. 5.
+        commitment_weight: pulls embeddings to their codes; the paper does not say.
+        joint_weight: adds the distance of the joints in metres to the loss (ours).
+        velocity_weight: adds the error of the pose's change from frame to frame to the loss (ours).
+        std_floor: smallest standard deviation used for z-scores of poses and steps.
+        learning_rate: paper A.3.
+        weight_decay: paper A.3.
+        warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
+        compile: compile encoder and decoder for training; worth it on a GPU, not on a CPU.
+        seed: the start and the revival of codes follow from it.
+    """
+
+    def __init__(
+        self,
+        latent: int = 512,
+        hidden: int = 512,
+        codes: int = 1024,
+        levels: int = 1,
+        depth: int = 3,
+        causal: bool = False,
+        decay: float = 0.99,
+        revive_below: float = 1.0,
+        body_weight: float = 1.0,
+        root_rotation_weight: float = 0.5,
+        root_translation_weight: float = 0.5,
+        commitment_weight: float = 0.3,
+        joint_weight: float = 0.0,
+        velocity_weight: float = 0.0,
+        std_floor: float = 1e-2,
+        learning_rate: float = 2e-4,
+        weight_decay: float = 1e-4,
+        warmup_steps: int = 0,
+        compile: bool = False,
+        seed: int = 1111,
+    ) -> None:
+        fields = {name: value for name, value in locals().items() if name in _fields()}
+        super().__init__()
+        # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
+        self.save_hyperparameters(fields)
+        self.latent = latent
+        self.vqvae = VQVAE(POSE_FEATURES, latent, hidden, depth, causal, STRIDE, std_floor)
+        self.codebook = Codebook(codes, latent, levels, decay, revive_below)
+        self.body: Body | None = None
+        self.mpjpe = MeanMetric()
+        self.local_mpjpe = MeanMetric()
+        self.code_use = CodeUse(levels, codes)
+
+    # -- using it ------------------------------------------------------------------------------
+
+    def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
+        """Quantised latents, summed over levels.
+
+        Args:
+            pose: (B, T, P, 135), T a multiple of 4.
+            betas: (B, P, 10).
+            steps: (B, T, P, 9), the identity at the first frame.
+            valid: (B, T) bool, frames that may be looked at; None: all.
+
+        Returns:
+            (B, N, P, C) float32.
+        """
+        return self.codebook.nearest(self._embed(pose, betas, steps, valid))
+
+    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
+        """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
+
+        `window` tokens are decoded at a time, each with all the neighbours it can depend on: the same poses in
+        bounded memory. None decodes the whole clip at once.
+        """
+        if window is None or latent.shape[1] <= window:
+            return self._reconstruct(latent, betas, steps)
+        before, after = self.vqvae.decoder.reach
+        parts = []
+        for start in range(0, latent.shape[1], window):
+            first = max(start - before, 0)
+            near = slice(first, start + window + after)
+            frames = self._reconstruct(latent[:, near], betas, steps[:, near])
+            parts.append(frames[:, (start - first) * STRIDE : (start - first + window) * STRIDE])
+        return torch.cat(parts, dim=1)
+
+    def requantise(self, latent: Tensor) -> Tensor:
+        """The code nearest to each latent; with several levels, their sum. (..., C) -> same"""
+        return self.codebook.nearest(latent)
+
+    def encode_scene(self, scene: Scene) -> Tensor:
+        """Quantised latents of a scene, cut to whole tokens; frames that are not valid are not looked at."""
+        seen = features(scene)
+        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
+
+    def reconstruct(self, scene: Scene) -> Scene:
+        """The scene after encoding and decoding, bodies put at their true canonical frames."""
+        scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
+        seen = features(scene)
+        latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
+        return _put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
+
+    def _embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
+        """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
+        B, T, P, _ = pose.shape
+        if T % STRIDE:
+            raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the clip first")
+        known = pose.new_ones(B, T, 2, dtype=torch.bool)
+        if valid is not None:
+            known = torch.stack([valid, step_known(valid)], dim=-1)
+        known = known.repeat_interleave(P, dim=0)
+        vectors = self.vqvae.encode(_fold(pose), betas.flatten(0, 1), _fold(steps), known)
+        return _unfold(vectors, P)
+
+    def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
+        P = latent.shape[2]
+        known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
+        pose = self.vqvae.decode(_fold(latent), betas.flatten(0, 1), _fold(steps), known)
+        with torch.autocast(pose.device.type, enabled=False):
+            return proper(_unfold(pose, P))
+
+    # -- statistics and start ------------------------------------------------------------------
+
+    def set_statistics(self, scenes: Iterable[Scene]) -> None:
+        """z-scores of poses, steps and shapes from scenes; kept in the checkpoint."""
+        for name, (mean, std) in statistics(scenes).items():
+            getattr(self.vqvae, name).set(mean, std)
+
+    @torch.no_grad()
+    def prepare(self, scenes: Iterable[Scene]) -> None:
+        """Statistics, then the k-means start of the codebook, from the first training batches; once only."""
+        some = []
+        for number, scene in enumerate(scenes):
+            some.append(scene.to(self.device))
+            if number + 1 == STATISTICS_BATCHES:
+                break
+        if not self.vqvae.pose.ready:
+            self.set_statistics(some)
+        if self.codebook.started:
+            return
+        vectors: list[Tensor] = []
+        for scene in some:
+            seen = features(scene)
+            vectors.append(self._embed(seen.pose, seen.betas, seen.steps, seen.valid)[seen.tokens])
+            if sum(map(len, vectors)) >= KMEANS_VECTORS * self.codebook.size:
+                break
+        self.codebook.start(torch.cat(vectors), self._generator("start"))
+
+    def _generator(self, *what: int | str) -> torch.Generator:
+        return torch.Generator(device=self.device).manual_seed(derive(self.hparams["seed"], *what))
+
+    # -- training ------------------------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        if self.body is None:
+            from magnet.body import load_body
+
+            # A copy, because this one moves to the model's device.
+            body = getattr(getattr(self.trainer, "datamodule", None), "body", None)
+            self.body = load_body() if body is None else copy.deepcopy(body)
+
+    @property
+    def _prepared(self) -> bool:
+        return bool(self.codebook.started) and bool(self.vqvae.pose.ready)
+
+    def on_fit_start(self) -> None:
+        batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
+        if not self._prepared and batches is not None:
+            self.prepare(batches())
+        if self.hparams["compile"]:
+            self.vqvae.encoder.compile()
+            self.vqvae.decoder.compile()
+
+    def on_train_start(self) -> None:
+        if not self._prepared:
+            self.prepare(self.trainer.train_dataloader)  # type: ignore[arg-type]
+
+    def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
+        seen = features(batch)
+        losses, pose, quantised = self._losses(seen)
+        if self._trainer is not None:
+            self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
+            logged = {f"train/{name}": value.detach() for name, value in losses.items()}
+            if self.global_step % self.trainer.log_every_n_steps == 0:
+                logged |= {f"train/{name}": value for name, value in by_level(quantised.counts).items()}
+                scenes = slice(0, GLANCE)
+                error, _ = self._joint_errors(pose.detach()[scenes], batch.pick(scenes))
+                logged["train/mpjpe_cm"] = 100 * masked_mean(error, seen.counts[scenes])
+            self.log_dict(logged, batch_size=batch.scenes)
+        return losses["loss"]
+
+    def _losses(self, seen: Features) -> tuple[dict[str, Tensor], Tensor, Quantised]:
+        """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
+        h = self.hparams
+        embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
+        quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step))
+        pose = self._reconstruct(quantised.latent, seen.betas, by_token(seen.steps), seen.valid)
+        with torch.autocast(pose.device.type, enabled=False):
+            joints = self._canonical_joints(seen) if h["joint_weight"] else None
+            losses = reconstruction_losses(pose, seen.pose, seen.counts, joints)
+        losses["commitment"] = quantised.commitment
+        return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantised
+
+    def _canonical_joints(self, seen: Features):  # type: ignore[no-untyped-def]
+        body = self._require_body()
+        return lambda pose: body.forward_kinematics(*matrices(pose), seen.betas[:, None])
+
+    def _require_body(self) -> Body:
+        if self.body is None:
+            raise ValueError("joint errors need a body; set tokenizer.body = load_body(...), or train with a Trainer")
+        return self.body
+
+    def _joint_errors(self, pose: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
+        """Mean distance in metres of the 21 joints beside the pelvis, (B, T, P): in the world with the root's
+        canonical frame given, and with pelvis position and turn taken out."""
+        body = self._require_body()
+        scene = scene.cut(0, pose.shape[1])
+        decoded = _put(pose, scene)
+        world = body.joints(decoded) - body.joints(scene)
+        still = torch.eye(4, device=pose.device)
+        betas = scene.betas[:, None]
+        local = body.forward_kinematics(decoded.body_rot, still, betas)
+        local = local - body.forward_kinematics(scene.body_rot, still, betas)
+        return world[..., 1:, :].norm(dim=-1).mean(-1), local[..., 1:, :].norm(dim=-1).mean(-1)
+
+    def validation_step(self, batch: Scene, batch_idx: int) -> None:
+        self._evaluate(batch, "val")
+
+    def test_step(self, batch: Scene, batch_idx: int) -> None:
+        self._evaluate(batch, "test")
+
+    def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
+        return self.reconstruct(batch)
+
+    def _evaluate(self, batch: Scene, stage: str) -> None:
+        seen = features(batch)
+        losses, pose, quantised = self._losses(seen)
+        world, local = self._joint_errors(pose, batch)
+        weight = seen.counts.sum()
+        self.mpjpe.update(100 * masked_mean(world, seen.counts), weight)
+        self.local_mpjpe.update(100 * masked_mean(local, seen.counts), weight)
+        self.code_use.update(quantised.counts)
+        logged = {f"{stage}/{name}": value for name, value in losses.items()}
+        self.log_dict(logged, batch_size=batch.scenes, sync_dist=True)
+        self.log(f"{stage}/mpjpe_cm", self.mpjpe, batch_size=batch.scenes, prog_bar=True)
+        self.log(f"{stage}/mpjpe_local_cm", self.local_mpjpe, batch_size=batch.scenes)
+
+    def on_validation_epoch_end(self) -> None:
+        self._finish("val")
+
+    def on_test_epoch_end(self) -> None:
+        self._finish("test")
+
+    def _finish(self, stage: str) -> None:
+        self.log_dict({f"{stage}/{name}": value for name, value in self.code_use.compute().items()})
+        self.code_use.reset()
+
+    def configure_optimizers(self) -> Any:
+        h = self.hparams
+        optimizer = torch.optim.AdamW(
+            self.vqvae.parameters(),
+            lr=h["learning_rate"],
+            weight_decay=h["weight_decay"],
+            fused=self.device.type == "cuda",
+        )
+        total = self.trainer.estimated_stepping_batches
+        warmup = h["warmup_steps"]
+
+        def rate(step: int) -> float:
+            rise = min(1.0, (step + 1) / (warmup + 1))
+            done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1)))  # 0 for a run without end
+            return rise * 0.5 * (1 + math.cos(math.pi * done))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    # -- freezing and loading ------------------------------------------------------------------
+
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """Freezing the weights freezes the codes too."""
+        self.codebook.frozen = not requires_grad
+        return super().requires_grad_(requires_grad)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        check_fields(checkpoint.get("hyper_parameters", {}), self.hparams)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Tokenizer:
+        """A trained tokenizer from its checkpoint, or from that of a denoiser that holds one; weights only.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no such checkpoint, or a weight's shape does not fit its fields; says which.
+        """
+        fields, state = read_checkpoint(Path(path))
+        fields = {name: value for name, value in fields.items() if name in _fields()}
+        tokenizer = cls(**fields)
+        expected = tokenizer.state_dict()
+        check_weights(Path(path), state, expected, {name: tokenizer.hparams[name] for name in SHAPING})
+        tokenizer.load_state_dict({name: state[name] for name in expected})
+        return tokenizer.eval()
+
+
+def _fields() -> list[str]:
+    return list(inspect.signature(Tokenizer.__init__).parameters)[1:]
+
+
+def _put(pose: Tensor, scene: Scene) -> Scene:
+    with torch.autocast(pose.device.type, enabled=False):
+        return posed(pose, canonical_frame(scene.T_world_root), scene)
+
+
+def _fold(x: Tensor) -> Tensor:
+    """Every agent a sequence of its own. (B, T, P, ...) -> (B P, T, ...)"""
+    return x.transpose(1, 2).flatten(0, 1)
+
+
+def _unfold(x: Tensor, agents: int) -> Tensor:
+    """(B P, T, ...) -> (B, T, P, ...)"""
+    return x.unflatten(0, (-1, agents)).transpose(1, 2)

@@ -1,0 +1,51 @@
+"""How much of a codebook is used."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+
+def usage(counts: Tensor) -> Tensor:
+    """Share of the codes that were chosen at all. (..., codes) -> (...)"""
+    return (counts > 0).float().mean(-1)
+
+
+def perplexity(counts: Tensor) -> Tensor:
+    """How many codes, chosen equally often, would be as hard to guess. (..., codes) -> (...), from 1 to codes"""
+    share = counts.double() / counts.double().sum(-1, keepdim=True).clamp(min=1)
+    return torch.special.entr(share).sum(-1).exp().float()
+
+
+def by_level(counts: Tensor) -> dict[str, Tensor]:
+    """Usage and perplexity of each level, numbered when there are several. counts: (levels, codes)"""
+    named = {}
+    for level, count in enumerate(counts):
+        suffix = f"_{level}" if len(counts) > 1 else ""
+        named[f"usage{suffix}"] = usage(count)
+        named[f"perplexity{suffix}"] = perplexity(count)
+    return named
+
+
+class CodeUse(Metric):
+    """Usage and perplexity over an epoch, exact over processes.
+
+    Args:
+        levels: codebooks in a row.
+        codes: codes in each.
+    """
+
+    higher_is_better = True
+    full_state_update = False
+    counts: Tensor  # (levels, codes)
+
+    def __init__(self, levels: int, codes: int) -> None:
+        super().__init__()
+        self.add_state("counts", torch.zeros(levels, codes, dtype=torch.long), dist_reduce_fx="sum")
+
+    def update(self, counts: Tensor) -> None:
+        self.counts += counts.long()
+
+    def compute(self) -> dict[str, Tensor]:
+        return by_level(self.counts)

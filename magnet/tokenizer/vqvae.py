@@ -1,0 +1,184 @@
+"""The encoder and decoder of the tokenizer: 1-D convolutions over the time of one agent (paper Table A.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+STAGES = 2
+"""Each stage halves the frame rate: 2 stages are the stride of 4 frames a token."""
+
+DILATION = 3
+"""Block i of a residual stack looks 3^i steps away."""
+
+
+class Conv(nn.Module):
+    """Convolution over time of (B, T, C) whose output has T / stride steps.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        kernel: steps seen; `kernel - stride` must be even unless causal.
+        stride: steps in for one step out.
+        dilation: distance of the steps seen.
+        causal: an output sees nothing after the last of its own `stride` input steps.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int = 1, dilation: int = 1, causal: bool = False
+    ) -> None:
+        super().__init__()
+        self.conv = nn.Conv1d(inputs, outputs, kernel, stride=stride, dilation=dilation)
+        reach = dilation * (kernel - 1) + 1 - stride
+        self.pad = (reach, 0) if causal else (reach // 2, reach - reach // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(F.pad(x.transpose(1, 2), self.pad)).transpose(1, 2)
+
+
+class Block(nn.Module):
+    """Residual block, pre-norm: a dilated convolution of 3 steps, then one of 1. (B, T, C) -> same"""
+
+    def __init__(self, width: int, dilation: int, causal: bool) -> None:
+        super().__init__()
+        self.norm_1 = nn.LayerNorm(width)
+        self.look = Conv(width, width, 3, dilation=dilation, causal=causal)
+        self.norm_2 = nn.LayerNorm(width)
+        self.mix = nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.mix(F.gelu(self.norm_2(self.look(F.gelu(self.norm_1(x))))))
+
+
+def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
+    """`depth` blocks, widest reach first. (B, T, C) -> same"""
+    return nn.Sequential(*[Block(width, DILATION**i, causal) for i in reversed(range(depth))])
+
+
+class Double(nn.Module):
+    """Twice as many steps, each said twice. (B, T, C) -> (B, 2 T, C)"""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.repeat_interleave(2, dim=1)
+
+
+class Encoder(nn.Module):
+    """Frames to token embeddings, of unit spread each. (B, T, inputs) -> (B, T / 4, latent)"""
+
+    def __init__(self, inputs: int, hidden: int, latent: int, depth: int, causal: bool) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [Conv(inputs, hidden, 3, causal=causal), nn.GELU()]
+        for _ in range(STAGES):
+            layers += [Conv(hidden, hidden, 4, stride=2, causal=causal), stack(hidden, depth, causal)]
+        layers += [Conv(hidden, latent, 3, causal=causal), nn.LayerNorm(latent)]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(x)
+
+
+class Decoder(nn.Module):
+    """Token latents and conditions to frames. (B, N, inputs) -> (B, 4 N, outputs)"""
+
+    def __init__(self, inputs: int, hidden: int, outputs: int, depth: int, causal: bool) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [Conv(inputs, hidden, 3, causal=causal), nn.GELU()]
+        for _ in range(STAGES):
+            layers += [stack(hidden, depth, causal), Double(), Conv(hidden, hidden, 3, causal=causal)]
+        layers += [nn.LayerNorm(hidden), nn.GELU(), Conv(hidden, outputs, 3, causal=causal)]
+        self.layers = nn.Sequential(*layers)
+        self.depth, self.causal = depth, causal
+
+    @property
+    def reach(self) -> tuple[int, int]:
+        """Tokens before and after its own that a decoded frame can depend on."""
+        steps, rate = 1.0, 1
+        for _ in range(STAGES):
+            steps += sum(DILATION**i for i in range(self.depth)) / rate
+            rate *= 2
+            steps += 1 / rate
+        tokens = int(steps + 1 / rate) + 1
+        return (2 * tokens, 0) if self.causal else (tokens, tokens)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(x)
+
+
+class Standard(nn.Module):
+    """z-scores by stored statistics; until they are set, the identity.
+
+    Args:
+        size: numbers standardised one by one.
+        floor: smallest standard deviation, so that numbers that hardly vary do not fill the range with noise.
+    """
+
+    mean: Tensor
+    std: Tensor
+    ready: Tensor  # () bool
+
+    def __init__(self, size: int, floor: float = 1e-2) -> None:
+        super().__init__()
+        self.floor = floor
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+        self.register_buffer("ready", torch.tensor(False))
+
+    def set(self, mean: Tensor, std: Tensor) -> None:
+        self.mean.copy_(mean)
+        self.std.copy_(std.clamp(min=self.floor))
+        self.ready.fill_(True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x.float() - self.mean) / self.std
+
+    def restore(self, z: Tensor) -> Tensor:
+        return z.float() * self.std + self.mean
+
+
+class VQVAE(nn.Module):
+    """Encoder and decoder of one agent's pose, with the statistics of what goes in and out.
+
+    Conditions: shape and canonical step at every frame for the encoder; shape and the token's four steps at
+    every token for the decoder (paper 3.1).
+
+    Args:
+        pose: numbers of a pose.
+        latent: numbers of a token's latent.
+        hidden: channels of the convolutions.
+        depth: residual blocks a stage.
+        causal: no frame sees later ones.
+        stride: frames in a token.
+        std_floor: smallest standard deviation of poses and steps.
+    """
+
+    def __init__(
+        self, pose: int, latent: int, hidden: int, depth: int, causal: bool, stride: int, std_floor: float
+    ) -> None:
+        super().__init__()
+        self.stride = stride
+        self.pose = Standard(pose, std_floor)
+        self.steps = Standard(9, std_floor)
+        # Shape numbers come in units of a population's spread; few people in training must not narrow that,
+        # or a new person would lie hundreds of deviations away.
+        self.betas = Standard(10, floor=1.0)
+        self.encoder = Encoder(pose + 10 + 9, hidden, latent, depth, causal)
+        self.decoder = Decoder(latent + 10 + 9 * stride, hidden, pose, depth, causal)
+
+    def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, known: Tensor) -> Tensor:
+        """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)
+
+        What is not known enters as the mean, whatever it holds.
+        """
+        shape = self.betas(betas)[:, None].expand(-1, pose.shape[1], -1)
+        seen = torch.where(known[..., :1], self.pose(pose), 0.0)
+        moved = torch.where(known[..., 1:], self.steps(steps), 0.0)
+        return self.encoder(torch.cat([seen, moved, shape], dim=-1)).float()
+
+    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, known: Tensor | None = None) -> Tensor:
+        """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
+        shape = self.betas(betas)[:, None].expand(-1, latent.shape[1], -1)
+        moved = self.steps(steps)
+        if known is not None:
+            moved = torch.where(known[..., None], moved, 0.0)
+        return self.pose.restore(self.decoder(torch.cat([latent, moved.flatten(-2), shape], dim=-1)))

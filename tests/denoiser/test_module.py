@@ -1,0 +1,171 @@
+import lightning as L
+import pytest
+import torch
+
+from magnet.denoiser.module import Denoiser
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene, tiny_denoiser
+from tests.datamodules.fakes import FakeData, couples_and_singles
+
+SIZES = {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "level_width": 16}
+
+
+def tokenizer_file(tmp_path) -> str:
+    """A tokenizer's checkpoint, as its own training would leave it."""
+    from magnet.tokenizer.module import Tokenizer
+
+    tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
+    tokenizer.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    trainer = L.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu")
+    trainer.strategy.connect(tokenizer)
+    trainer.save_checkpoint(tmp_path / "tokenizer.ckpt")
+    return str(tmp_path / "tokenizer.ckpt")
+
+
+def data() -> FakeData:
+    clips = couples_and_singles() + couples_and_singles("val")
+    return FakeData(clips, window_frames=32, batch_size=4, max_agents=3, epoch_size=12)
+
+
+def trainer(steps: int, **options) -> L.Trainer:
+    return L.Trainer(
+        max_steps=steps, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
+        **{"enable_checkpointing": False, "limit_val_batches": 1, **options},
+    )
+
+
+def fitted(model: Denoiser, steps: int, ckpt_path: str | None = None, **options) -> L.Trainer:
+    run = trainer(steps, **options)
+    run.fit(model, datamodule=data(), ckpt_path=ckpt_path, weights_only=True)
+    return run
+
+
+def build(tmp_path, **options) -> Denoiser:
+    torch.manual_seed(3)
+    return Denoiser(tokenizer_file(tmp_path), max_agents=3, window=8, warmup_steps=1, **{**SIZES, **options})
+
+
+def same_weights(a: Denoiser, b: Denoiser) -> bool:
+    return all(torch.equal(x, b.state_dict()[name]) for name, x in a.state_dict().items())
+
+
+def test_training_leaves_the_tokenizer_bit_identical(tmp_path):
+    model = build(tmp_path)
+    before = {name: value.clone() for name, value in model.tokenizer.state_dict().items()}
+    fitted(model, 3)
+    assert all(torch.equal(value, before[name]) for name, value in model.tokenizer.state_dict().items())
+
+
+def test_interrupted_training_resumes_to_the_same_weights_bit_for_bit(tmp_path):
+    whole = build(tmp_path)
+    fitted(whole, 7)
+    first = build(tmp_path)
+    # The plan is for 7 steps in both; only the interruption differs.
+    run = trainer(7)
+    stop = StopAfter(4)
+    run.callbacks.append(stop)  # type: ignore[attr-defined]
+    run.fit(first, datamodule=data())
+    run.save_checkpoint(tmp_path / "four.ckpt")
+    second = build(tmp_path)
+    fitted(second, 7, str(tmp_path / "four.ckpt"))
+    assert not same_weights(whole, first)
+    assert same_weights(whole, second)
+
+
+class StopAfter(L.Callback):
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    def on_train_batch_end(self, trainer, *args) -> None:
+        trainer.should_stop = trainer.global_step >= self.steps
+
+
+def test_a_checkpoint_is_all_a_user_needs(tmp_path):
+    """No tokenizer file beside it: what was trained with comes along."""
+    model = build(tmp_path)
+    fitted(model, 2).save_checkpoint(tmp_path / "model.ckpt")
+    (tmp_path / "tokenizer.ckpt").unlink()
+    loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True)
+    assert same_weights(model, loaded)
+
+
+def test_without_a_tokenizer_the_error_says_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match="has no tokenizer: --model.tokenizer is 'absent.ckpt'"):
+        fitted(Denoiser("absent.ckpt", max_agents=3, window=8, **SIZES), 1)
+
+
+def test_statistics_make_training_tokens_standard(tmp_path):
+    model = build(tmp_path)
+    fitted(model, 1)
+    tokens, there = zip(*(model.tokenize(scene) for scene in data().statistics_batches()), strict=True)
+    normal = model.statistics.normalise(torch.cat(tokens))
+    _, steps, relations = model.layout.unpack(normal)
+    there = torch.cat(there)
+    _, step_std, relation_std = model.layout.unpack(model.statistics.std)
+    for values, std in ((steps[there[..., 0]], step_std), (relations[there[..., 1:]], relation_std)):
+        values, std = values.reshape(-1, 9), std.reshape(-1, 9)[0]
+        assert values.mean(0).abs().max() < 1e-3
+        floored = std <= 0.0101
+        assert (values.std(0)[~floored] - 1).abs().max() < 1e-3
+        assert (values.std(0)[floored] <= 1.001).all()
+        assert (~floored).sum() >= 3
+
+
+def test_a_few_scenes_can_be_learnt(tmp_path):
+    model = build(tmp_path, learning_rate=3e-3, width=64)
+    fitted(model, 1)
+    batch = next(iter(data().train_dataloader()))
+    generator = torch.Generator().manual_seed(0)
+    optimizer = torch.optim.AdamW(model.transformer.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(150):
+        loss = model._losses(batch, generator)["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
+
+
+@pytest.mark.parametrize(
+    "ablation",
+    [{"relations": False}, {"rope": "none"}, {"agent_embedding": False}, {"noise_levels": "per_timestep"},
+     {"noise_levels": "per_sequence"}, {"noise_levels": "mixture"}, {"relation_noise": "token"}, {"rope": "heads"}],
+    ids=str,
+)
+def test_every_ablation_trains_and_samples(tmp_path, ablation):
+    from magnet.denoiser.generation import SamplerOptions
+    from magnet.tasks.joint import JointFuture
+
+    model = build(tmp_path, **ablation)
+    fitted(model, 1)
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(0))
+    whole = model.eval().generate(scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
+    assert whole.T_world_root.isfinite().all()
+
+
+def test_without_a_vq_vae_the_poses_themselves_are_tokens(tmp_path):
+    from magnet.denoiser.generation import SamplerOptions
+    from magnet.tasks.joint import JointFuture
+
+    torch.manual_seed(0)
+    model = Denoiser("raw", max_agents=3, window=8, **SIZES)
+    assert model.layout.latent == 540
+    run = fitted(model, 1)
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(0))
+    whole = model.eval().generate(scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
+    assert whole.T_world_root.isfinite().all()
+    run.save_checkpoint(tmp_path / "raw.ckpt")
+    assert same_weights(model, Denoiser.load_from_checkpoint(tmp_path / "raw.ckpt", weights_only=True))
+
+
+def test_absent_agents_cost_nothing(generator):
+    model = tiny_denoiser()
+    scene = random_scene(2, 32, 3, generator, present=torch.tensor([[True, True, False]] * 2))
+
+    def loss(of: Scene) -> torch.Tensor:
+        return model._losses(of, torch.Generator().manual_seed(0))["loss"]
+
+    moved = scene.replace(T_world_root=scene.T_world_root.clone())
+    moved.T_world_root[:, :, 2, :3, 3] += 5.0
+    assert torch.equal(loss(scene), loss(moved))

@@ -1,0 +1,70 @@
+"""SMPL-X style files: what other tools read from them, and that nothing is lost on the way back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import Body
+from magnet.export import load_smplx, save_smplx
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.fixture
+def trio() -> Scene:
+    return random_scene(1, 20, 3, torch.Generator().manual_seed(2)).replace(names=("trio",))
+
+
+def test_joints_return_within_a_tenth_of_a_millimetre(trio: Scene, body: Body, tmp_path: Path) -> None:
+    (path,) = save_smplx(trio, tmp_path / "trio.npz", body)
+    back = load_smplx(path, body)
+    assert (back.fps, back.body, back.names) == (trio.fps, trio.body, trio.names)
+    assert (body.joints(back) - body.joints(trio)).abs().max() < 1e-4
+
+
+def test_keys_are_the_conventional_ones(trio: Scene, body: Body, tmp_path: Path) -> None:
+    """Read as another tool would: the root turns about the pelvis at rest, then transl is added."""
+    rotation = pytest.importorskip("scipy.spatial.transform", reason="scipy is not installed").Rotation
+    (path,) = save_smplx(trio, tmp_path / "trio.npz", body)
+    with np.load(path, allow_pickle=False) as file:
+        assert file["poses"].shape == (3, 20, 165)
+        assert not file["poses"][..., 66:].any()
+        assert (str(file["gender"]), float(file["mocap_frame_rate"]), str(file["body"])) == ("neutral", 30.0, trio.body)
+        rest = body.rest_joints(torch.from_numpy(file["betas"]))[:, 0].numpy()
+        pelvis = rest[:, None] + file["transl"]
+        turned = rotation.from_rotvec(file["poses"][..., :3].reshape(-1, 3)).as_matrix().reshape(3, 20, 3, 3)
+        knee = rotation.from_rotvec(file["poses"][..., 12:15].reshape(-1, 3)).as_matrix().reshape(3, 20, 3, 3)
+    T_world_root = trio.T_world_root[0].transpose(0, 1).numpy()
+    assert np.abs(pelvis - T_world_root[..., :3, 3]).max() < 1e-6
+    assert np.abs(turned - T_world_root[..., :3, :3]).max() < 1e-5
+    assert np.abs(knee - trio.body_rot[0, :, :, 3].transpose(0, 1).numpy()).max() < 1e-5
+
+
+def test_one_file_a_person_holds_that_person(trio: Scene, body: Body, tmp_path: Path) -> None:
+    gone = trio.replace(present=torch.tensor([[True, False, True]]))
+    paths = save_smplx(gone, tmp_path / "trio", body, apart=True)
+    assert [path.name for path in paths] == ["trio_0.npz", "trio_1.npz"]
+    back = load_smplx(paths[1], body)
+    assert back.agents == 1
+    assert (body.joints(back) - body.joints(trio)[:, :, 2:]).abs().max() < 1e-4
+
+
+def test_what_does_not_fit_is_named(trio: Scene, body: Body, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="got 2 scenes"):
+        save_smplx(trio.repeat(2), tmp_path / "a.npz", body)
+    with pytest.raises(ValueError, match="belongs to body 'other'"):
+        save_smplx(trio.replace(body="other"), tmp_path / "a.npz", body)
+    np.savez(tmp_path / "b.npz", poses=np.zeros((4, 165)))
+    with pytest.raises(ValueError, match="lacks betas, mocap_frame_rate, transl"):
+        load_smplx(tmp_path / "b.npz", body)
+    facts = {"transl": np.zeros((4, 3)), "betas": np.zeros(10), "mocap_frame_rate": 30.0}
+    np.savez(tmp_path / "c.npz", poses=np.zeros((4, 63)), **facts)
+    with pytest.raises(ValueError, match=r"poses \(1, 4, 63\).*66 or more"):
+        load_smplx(tmp_path / "c.npz", body)
+    np.savez(tmp_path / "d.npz", poses=np.zeros((4, 165)), body="other", **facts)
+    with pytest.raises(ValueError, match="written for body 'other'"):
+        load_smplx(tmp_path / "d.npz", body)

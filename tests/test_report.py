@@ -1,0 +1,106 @@
+"""Result tables: every number shown, the right one best, nothing lost in files."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from magnet.metrics import all_metrics
+from magnet.report import COLUMNS, Results, column, machine, print_table, three
+
+
+@pytest.fixture
+def results() -> Results:
+    rows = {
+        "magnet": {"fd": 0.2834, "div": 2.911, "mpjpe": 0.20549, "mpjpe_low": 0.19, "mpjpe_high": 0.223, "jitter": 9.1},
+        "NN": {"fd": 0.354, "div": math.nan, "mpjpe": 0.47, "jitter": 30.0},
+        "held pose": {"fd": 1.61, "div": 0.0, "mpjpe": 0.2054, "jitter": 0.0},
+        "ground truth": {"fd": 0.0, "jitter": 10.0, "fd halves": 0.37},
+    }
+    return Results(rows, {"command": "magnet test", "seed": 1, "seconds": {"magnet": 3.5}})
+
+
+def printed(results: Results, width: int = 200, **options: object) -> str:
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    print_table(results, console=console, **options)  # type: ignore[arg-type]
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_numbers_have_three_significant_digits() -> None:
+    values = [0.20549, 0.3, 12.345, 1829.48, 9.996, 0.09996, 0.0, -0.5, 1.23e-7, math.nan, math.inf, 100.0]
+    shown = ["0.205", "0.300", "12.3", "1830", "10.0", "0.100", "0", "-0.500", "1.23e-07", "-", "inf", "100"]
+    assert [three(value) for value in values] == shown
+
+
+@pytest.mark.parametrize("width", [200, 60, 30])
+def test_a_table_shows_every_number_however_narrow_the_screen(results: Results, width: int) -> None:
+    text = printed(results, width, metrics=results.metrics)
+    for method, row in results.rows.items():
+        assert method in text
+        for metric in row:
+            if metric in results.metrics:
+                assert three(row[metric]) in text
+    assert "[0.190, 0.223]" in printed(results, intervals=True)
+
+
+def test_the_best_is_marked_and_recordings_do_not_compete(results: Results) -> None:
+    assert results.best("fd") == {"magnet"}
+    assert results.best("div") == {"magnet"}
+    assert results.best("mpjpe") == {"magnet", "held pose"}, "equal as shown"
+    assert results.best("jitter") == {"magnet"}, "nearest to the recorded value"
+    assert results.best("fd halves") == set()
+    assert Results({"magnet": {"fd": 1.0}}).best("fd") == set()
+    lines = results.to_markdown(intervals=True).splitlines()
+    assert lines[0] == "| method | FD ↓ | DIV ↑ | MPJPE ↓ | jitter → |"
+    assert lines[2] == "| magnet | **0.283** | **2.91** | **0.205** [0.190, 0.223] | **9.10** |"
+    assert "FD (m²)" in results.to_markdown() and "↓ lower is better" in results.to_markdown()
+
+
+def test_json_returns_what_was_saved(results: Results, tmp_path: Path) -> None:
+    path = results.save_json(tmp_path / "deep" / "results.json")
+    assert "NaN" not in path.read_text()
+    back = Results.load_json(path)
+    assert back.meta == results.meta
+    assert str(back.rows) == str(results.rows)
+
+
+def test_csv_returns_what_was_saved(results: Results, tmp_path: Path) -> None:
+    path = results.save_csv(tmp_path / "results.csv")
+    assert str({m: dict(sorted(row.items())) for m, row in Results.load_csv(path).rows.items()}) == str(
+        {m: dict(sorted(row.items())) for m, row in results.rows.items()}
+    )
+
+
+def test_bad_files_and_metrics_are_named(results: Results, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("[]")
+    with pytest.raises(ValueError, match=r"a\.json: not a results file"):
+        Results.load_json(tmp_path / "a.json")
+    (tmp_path / "b.json").write_text(json.dumps({"format": 99, "meta": {}, "rows": {}}))
+    with pytest.raises(ValueError, match="format 99"):
+        Results.load_json(tmp_path / "b.json")
+    with pytest.raises(ValueError, match=r"no metric speed.*they have fd"):
+        results.to_markdown(["speed"])
+
+
+def test_main_metrics_of_the_project_are_known_to_the_table() -> None:
+    """A metric that is renamed would silently fall out of the table."""
+    metrics = all_metrics(30.0)
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.randn(3, 150, 2, 22, 3, generator=generator)
+    generated = truth + 0.1 * torch.randn(2, 3, 150, 2, 22, 3, generator=generator)
+    metrics.update(generated, truth, torch.ones(3, 2, dtype=torch.bool))
+    measured = {name.partition("@")[0] for name in metrics.compute()}
+    assert {name for name in COLUMNS if name != "fd halves"} <= measured
+    assert column("mpjpe@2s").title == "MPJPE 2s" and column("novel").title == "novel"
+
+
+def test_machine_facts_are_json_ready() -> None:
+    facts = machine()
+    assert facts["cores"] >= 1 and facts["torch"] == torch.__version__
+    json.dumps(facts)

@@ -1,0 +1,350 @@
+"""Laws of the tokenizer as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.core.mixins.hparams_mixin import _given_hyperparameters_context
+from torch.utils.data import DataLoader
+
+from magnet.motion.frames import pose_features
+from magnet.motion.scene import Scene, concatenate
+from magnet.motion.tokens import by_token, scene_steps
+from magnet.testing import random_scene, without_absent
+from magnet.tokenizer import RawPose, Tokenizer
+from magnet.tokenizer.features import features
+
+CLOSE = {"rtol": 0.0, "atol": 2e-5}
+"""Products of other sizes add in another order: not the same bits."""
+
+
+def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
+    torch.manual_seed(0)
+    tokenizer = Tokenizer(**{"latent": 16, "hidden": 24, "codes": 32, "depth": 2, **fields})
+    if scene is not None:
+        tokenizer.prepare([scene])
+    return tokenizer
+
+
+def conditions(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    return scene.betas, by_token(scene_steps(scene))
+
+
+class Scenes(L.LightningDataModule):
+    """Four fixed batches, in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.batches = [random_scene(3, 32, 2, torch.Generator().manual_seed(seed)) for seed in range(4)]
+
+    def statistics_batches(self) -> Iterator[Scene]:
+        yield from self.batches
+
+    def train_dataloader(self) -> DataLoader[Scene]:
+        return DataLoader(self.batches, batch_size=None)  # type: ignore[arg-type]
+
+    val_dataloader = test_dataloader = predict_dataloader = train_dataloader
+
+    def transfer_batch_to_device(self, batch: Scene, device: torch.device, dataloader_idx: int) -> Scene:
+        return batch.to(device)
+
+
+def trainer(folder: Path, **options: Any) -> L.Trainer:
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    return L.Trainer(default_root_dir=folder, **{**quiet, **options})
+
+
+# -- encoding and decoding ---------------------------------------------------------------------
+
+
+def test_encode_and_decode_keep_the_shapes(scene: Scene) -> None:
+    tokenizer = tiny(scene).eval()
+    latent = tokenizer.encode_scene(scene)
+    assert latent.shape == (2, 16, 3, 16)
+    assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene)))
+    pose = tokenizer.decode(latent, *conditions(scene))
+    assert pose.shape == (2, 64, 3, 135)
+    assert torch.equal(tokenizer.requantise(latent), latent)
+    assert tokenizer.reconstruct(scene.cut(0, 63)).frames == 60
+
+
+def test_every_latent_is_a_code(scene: Scene) -> None:
+    tokenizer = tiny(scene).eval()
+    latent = tokenizer.encode_scene(scene).flatten(0, -2)
+    assert (latent[:, None] == tokenizer.codebook.codes[0]).all(-1).any(-1).all()
+
+
+def test_a_part_of_a_token_is_refused(scene: Scene) -> None:
+    with pytest.raises(ValueError, match="63 frames"):
+        tiny().encode(pose_features(scene)[:, :63], scene.betas, scene_steps(scene)[:, :63])
+
+
+def test_agents_do_not_see_each_other(scene: Scene) -> None:
+    tokenizer = tiny(scene).eval()
+    order = torch.tensor([2, 0, 1])
+    torch.testing.assert_close(
+        tokenizer.encode_scene(scene.order(order)), tokenizer.encode_scene(scene)[:, :, order], **CLOSE
+    )
+
+
+def test_where_a_scene_lies_in_the_world_does_not_matter(scene: Scene) -> None:
+    tokenizer = tiny(scene).eval()
+    T_new_world = torch.eye(4)
+    T_new_world[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.6, 0.8, -0.8, 0.6])
+    T_new_world[:3, 3] = torch.tensor([2.0, 0.0, -1.0])
+    seen, moved = features(scene), features(scene.moved(T_new_world))
+    vectors = [tokenizer._embed(s.pose, s.betas, s.steps, None) for s in (seen, moved)]
+    torch.testing.assert_close(vectors[0], vectors[1], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("window", [1, 3, 16])
+def test_decoding_by_windows_gives_the_same_poses(window: int, causal: bool, generator: torch.Generator) -> None:
+    scene = random_scene(1, 200, 2, generator)
+    tokenizer = tiny(scene, causal=causal, depth=1).eval()
+    latent = tokenizer.encode_scene(scene)
+    whole = tokenizer.decode(latent, *conditions(scene))
+    torch.testing.assert_close(tokenizer.decode(latent, *conditions(scene), window=window), whole, **CLOSE)
+
+
+def test_causal_tokens_of_a_growing_clip_do_not_change(generator: torch.Generator) -> None:
+    scene = random_scene(2, 96, 2, generator)
+    tokenizer = tiny(scene, causal=True, depth=3).eval()
+    whole = tokenizer.encode_scene(scene)
+    frames = tokenizer.decode(whole, *conditions(scene))
+    betas, steps = conditions(scene)
+    for tokens in (1, 7, 16):
+        assert torch.equal(tokenizer.encode_scene(scene.cut(0, 4 * tokens)), whole[:, :tokens])
+        prefix = tokenizer.decode(whole[:, :tokens], betas, steps[:, :tokens])
+        torch.testing.assert_close(prefix, frames[:, : 4 * tokens], **CLOSE)
+
+
+def test_symmetric_tokens_do_look_ahead(generator: torch.Generator) -> None:
+    """Why a context must be cut out before it is encoded."""
+    scene = random_scene(1, 64, 1, generator)
+    tokenizer = tiny(scene).eval()
+    seen, cut = features(scene), features(scene.cut(0, 32))
+    whole = tokenizer._embed(seen.pose, seen.betas, seen.steps, None)[:, :8]
+    assert (whole - tokenizer._embed(cut.pose, cut.betas, cut.steps, None)).abs().max() > 1e-3
+
+
+# -- what must not count -----------------------------------------------------------------------
+
+
+def test_absent_agents_and_bad_frames_change_nothing(scene: Scene, generator: torch.Generator) -> None:
+    valid = torch.ones(2, 64, dtype=torch.bool)
+    valid[0, 10:14] = valid[1, 50:] = False
+    present = torch.tensor([[True, True, False], [True, False, True]])
+    junk = random_scene(2, 64, 3, generator)
+    keep = present[:, None] & valid[..., None]
+    results = []
+    for other in (without_absent(scene), junk):
+        mixed = scene.replace(
+            body_rot=torch.where(keep[..., None, None, None], scene.body_rot, other.body_rot),
+            T_world_root=torch.where(keep[..., None, None], scene.T_world_root, other.T_world_root),
+            betas=torch.where(present[..., None], scene.betas, other.betas),
+            present=present,
+            valid=valid,
+        )
+        tokenizer = tiny(mixed)
+        loss = tokenizer.training_step(mixed, 0)
+        loss.backward()
+        gradients = [p.grad for p in tokenizer.vqvae.parameters()]
+        results.append((loss.detach(), tokenizer.state_dict(), gradients))
+    (loss, state, gradients), (other_loss, other_state, other_gradients) = results
+    assert torch.equal(loss, other_loss)
+    assert all(torch.equal(state[name], other_state[name]) for name in state)
+    for gradient, other_gradient in zip(gradients, other_gradients, strict=True):
+        torch.testing.assert_close(gradient, other_gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_statistics_are_those_of_the_people_present(scene: Scene) -> None:
+    tokenizer = tiny()
+    tokenizer.set_statistics([scene.pick([0]), scene.pick([1])])
+    pose = pose_features(scene).flatten(0, -2).double()
+    torch.testing.assert_close(tokenizer.vqvae.pose.mean, pose.mean(0).float(), rtol=1e-4, atol=1e-5)
+    std = pose.std(0, unbiased=False).clamp(min=1e-2).float()
+    torch.testing.assert_close(tokenizer.vqvae.pose.std, std, rtol=1e-3, atol=1e-5)
+    nobody = without_absent(scene.replace(present=torch.zeros(2, 3, dtype=torch.bool)))
+    with pytest.raises(ValueError, match="nobody is present"):
+        tokenizer.set_statistics([nobody])
+    tokenizer.set_statistics([concatenate([scene, nobody])])
+    torch.testing.assert_close(tokenizer.vqvae.pose.mean, pose.mean(0).float(), rtol=1e-4, atol=1e-5)
+
+
+# -- learning ----------------------------------------------------------------------------------
+
+
+def test_a_handful_of_windows_is_learnt(generator: torch.Generator) -> None:
+    scene = random_scene(2, 32, 2, generator)
+    tokenizer = tiny(scene, latent=32, hidden=48, codes=64)
+    optimizer = torch.optim.AdamW(tokenizer.vqvae.parameters(), 3e-3)
+
+    def angle() -> float:
+        with torch.no_grad():
+            _, body = (tokenizer._losses(features(scene))[0][name] for name in ("loss", "body"))
+        return float((2 * body).sqrt().rad2deg())
+
+    tokenizer.eval()
+    before = angle()
+    tokenizer.train()
+    for _ in range(120):
+        optimizer.zero_grad()
+        tokenizer.training_step(scene, 0).backward()
+        optimizer.step()
+    tokenizer.eval()
+    assert before > 15 and angle() < 4  # degrees, root mean square
+
+
+def test_all_weights_get_gradients_through_the_codebook(scene: Scene) -> None:
+    tokenizer = tiny(scene, velocity_weight=0.1)
+    tokenizer.training_step(scene, 0).backward()
+    for name, parameter in tokenizer.vqvae.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+    assert tokenizer.vqvae.encoder.layers[0].conv.weight.grad.abs().max() > 0
+
+
+def test_mixed_precision_trains_and_its_rotations_stay_exact(scene: Scene) -> None:
+    tokenizer = tiny(scene)
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = tokenizer.training_step(scene, 0)
+        loss.backward()
+        pose = tokenizer.eval().decode(tokenizer.encode_scene(scene), *conditions(scene))
+    assert loss.isfinite() and pose.dtype == torch.float32
+    x = pose[..., :126].unflatten(-1, (21, 6))
+    torch.testing.assert_close(x[..., :3].norm(dim=-1), torch.ones(x.shape[:-1]), rtol=0, atol=1e-5)
+    torch.testing.assert_close(x[..., 3:].norm(dim=-1), torch.ones(x.shape[:-1]), rtol=0, atol=1e-5)
+
+
+def test_freezing_the_model_freezes_the_codes(scene: Scene) -> None:
+    tokenizer = tiny(scene).requires_grad_(False)
+    before = tokenizer.codebook.codes.clone()
+    tokenizer.train()
+    tokenizer.training_step(scene, 0)
+    assert torch.equal(tokenizer.codebook.codes, before)
+
+
+def test_training_reports_what_it_should(tmp_path: Path) -> None:
+    tokenizer = tiny(levels=2, joint_weight=1.0)
+    run = trainer(tmp_path, max_epochs=2, log_every_n_steps=1, enable_checkpointing=False)
+    run.fit(tokenizer, datamodule=Scenes())
+    logged = {name: float(value) for name, value in run.callback_metrics.items()}
+    for name in ("val/mpjpe_cm", "val/mpjpe_local_cm", "val/loss", "val/joint", "train/mpjpe_cm", "loss"):
+        assert logged[name] > 0, name
+    for name in ("val/perplexity_0", "val/perplexity_1", "train/perplexity_1"):
+        assert 1 <= logged[name] <= 32, name
+    assert 0 < logged["val/usage_0"] <= 1
+    # An independent look: 20 joints and the head, the pelvis left out, in the world.
+    assert tokenizer.body is not None
+    errors = []
+    for batch in Scenes().batches:
+        decoded = tokenizer.eval().reconstruct(batch)
+        joints, truth = tokenizer.body.joints(decoded), tokenizer.body.joints(batch)
+        errors.append(float((joints - truth)[..., 1:, :].norm(dim=-1).mean()))
+    assert logged["val/mpjpe_cm"] == pytest.approx(100 * sum(errors) / len(errors), rel=1e-4)
+
+
+# -- checkpoints -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tokenizer, Path]:
+    """A trained tokenizer and the folder with the checkpoint of each of its four epochs."""
+    folder = tmp_path_factory.mktemp("run")
+    tokenizer = tiny(warmup_steps=2)
+    keep = ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
+    trainer(folder, max_epochs=4, callbacks=[keep]).fit(tokenizer, datamodule=Scenes())
+    return tokenizer, folder
+
+
+def test_a_loaded_tokenizer_is_bit_identical(run: tuple[Tokenizer, Path], scene: Scene) -> None:
+    tokenizer, folder = run
+    loaded = Tokenizer.load(folder / "epoch=3.ckpt")
+    state = tokenizer.state_dict()
+    assert not loaded.training and dict(loaded.hparams) == dict(tokenizer.hparams)
+    assert all(torch.equal(state[name], value) for name, value in loaded.state_dict().items())
+    assert torch.equal(loaded.encode_scene(scene), tokenizer.eval().encode_scene(scene))
+
+
+def test_resumed_training_ends_bit_identical(
+    run: tuple[Tokenizer, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokenizer, folder = run
+    again = tiny(warmup_steps=2)
+    monkeypatch.setattr(again.codebook, "start", None)  # must not start a second time
+    resume = {"ckpt_path": folder / "epoch=1.ckpt", "weights_only": True}
+    trainer(tmp_path, max_epochs=4, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
+    state = tokenizer.state_dict()
+    assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
+
+
+def test_the_learning_rate_falls_to_zero_on_a_cosine(run: tuple[Tokenizer, Path]) -> None:
+    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
+    assert checkpoint["lr_schedulers"][0]["_last_lr"] == [pytest.approx(0.0, abs=1e-12)]
+
+
+def test_resuming_with_another_size_names_the_field(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"codes: the checkpoint's tokenizer has 32, this one 64.*--model.codes 32"):
+        trainer(tmp_path, enable_checkpointing=False).fit(
+            tiny(codes=64), datamodule=Scenes(), ckpt_path=run[1] / "epoch=1.ckpt", weights_only=True
+        )
+
+
+def test_what_is_no_tokenizer_is_refused(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such tokenizer checkpoint"):
+        Tokenizer.load(tmp_path / "missing.ckpt")
+    text = tmp_path / "text.ckpt"
+    text.write_text("not a checkpoint")
+    whole = (run[1] / "epoch=3.ckpt").read_bytes()
+    cut = tmp_path / "cut.ckpt"
+    cut.write_bytes(whole[: len(whole) // 2])
+    weights = tmp_path / "weights.ckpt"
+    torch.save({"state_dict": {}, "hyper_parameters": {}}, weights)
+    for path in (text, cut, weights):
+        with pytest.raises(ValueError, match=f"{path.name}: not a tokenizer's checkpoint"):
+            Tokenizer.load(path)
+    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
+    checkpoint["hyper_parameters"]["codes"] = 64
+    torch.save(checkpoint, tmp_path / "shape.ckpt")
+    with pytest.raises(ValueError, match=r"codebook.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'codes': 64"):
+        Tokenizer.load(tmp_path / "shape.ckpt")
+
+
+def test_a_denoisers_checkpoint_gives_its_tokenizer(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
+    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
+    state = {f"tokenizer.{name}": value for name, value in checkpoint["state_dict"].items()}
+    outer = {
+        "state_dict": state,
+        "hyper_parameters": {"width": 3},
+        "tokenizer_hyper_parameters": checkpoint["hyper_parameters"],
+    }
+    torch.save(outer, tmp_path / "denoiser.ckpt")
+    loaded = Tokenizer.load(tmp_path / "denoiser.ckpt")
+    assert all(torch.equal(state[f"tokenizer.{name}"], value) for name, value in loaded.state_dict().items())
+
+
+def test_a_tokenizer_inside_another_module_keeps_its_own_fields() -> None:
+    with _given_hyperparameters_context({"width": 99}, "anything"):
+        tokenizer = tiny()
+    assert "width" not in tokenizer.hparams and tokenizer.hparams["codes"] == 32
+
+
+# -- without a codebook ------------------------------------------------------------------------
+
+
+def test_raw_poses_return_exactly(scene: Scene) -> None:
+    raw = RawPose()
+    for _ in range(2):
+        latent = raw.encode_scene(scene)
+        assert latent.shape == (2, 16, 3, 540) and raw.latent == 540
+        assert torch.equal(raw.requantise(latent), latent)
+        torch.testing.assert_close(raw.decode(latent, *conditions(scene)), pose_features(scene), rtol=0, atol=1e-5)
+        raw.set_statistics([scene])
+    torch.testing.assert_close(latent.mean(), torch.tensor(0.0), atol=0.2, rtol=0)
+    assert not list(raw.parameters())
