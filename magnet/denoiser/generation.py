@@ -96,12 +96,15 @@ def generate(
     tokens = -(-(context + frames) // STRIDE)
     grid = Grid(tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride)
     schedule = task.schedule(grid)
-    given = scrub(scene.to(model.device).pad_agents(model.layout.agents), schedule.known)
+    scene = scene.to(model.device).pad_agents(model.layout.agents)
+    given = scrub(scene, schedule.known)
+    # The paper read literally: a known token holds its relations to everybody, also to those not known. It leaks.
+    related = scrub(scene, torch.ones_like(schedule.known)) if model.layout.relation_noise == "token" else given
     kind = model.device.type
-    precision = {"dtype": torch.get_autocast_dtype(kind), "enabled": torch.is_autocast_enabled(kind)}
+    dtype, enabled = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
 
     def denoise(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        with torch.autocast(kind, **precision):
+        with torch.autocast(kind, dtype, enabled):
             return model.denoise(noisy, levels, present).float()
 
     with torch.autocast(kind, enabled=False):  # only the network may run in half precision, never the geometry
@@ -109,7 +112,7 @@ def generate(
         packed = sample(
             denoise,
             schedule,
-            known_tokens(model, given, schedule.known).repeat_interleave(samples, dim=0),
+            known_tokens(model, given, schedule.known, related).repeat_interleave(samples, dim=0),
             canvas.given.present,
             model.layout,
             generator=generator,
@@ -137,11 +140,12 @@ def scrub(scene: Scene, known: Tensor) -> Scene:
     return scene.replace(body_rot=body_rot, T_world_root=T_world_root, valid=None)
 
 
-def known_tokens(model: Denoiser, given: Scene, known: Tensor) -> Tensor:
+def known_tokens(model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None) -> Tensor:
     """Normalised tokens of what is known; other tokens hold nothing of use. known (N, P) -> (B, N, P, D)
 
     Each agent's unbroken stretches are encoded alone: an encoder that looks ahead must not see beyond
-    them, and a step into a stretch from an unknown frame is the identity.
+    them, and a step into a stretch from an unknown frame is the identity. Pairwise transforms are those of
+    `related`, by default the same scene.
     """
     N, P = known.shape
     like = given.T_world_root
@@ -152,7 +156,7 @@ def known_tokens(model: Denoiser, given: Scene, known: Tensor) -> Tensor:
         latent[:, start:stop, agents] = model.encode(part)
         T_world_can = canonical_frame(part.T_world_root)
         steps[:, start:stop, agents] = by_token(to_9d(canonical_steps(T_world_can)))
-    relations = relations_by_token(canonical_frame(given.T_world_root))
+    relations = relations_by_token(canonical_frame((related or given).T_world_root))
     return model.statistics.normalise(model.layout.pack(latent, steps, relations))
 
 
@@ -235,8 +239,15 @@ class Canvas:
         if relations is not None:
             T_self_partner = from_9d(relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2))
         T_world_start = self._starts(T_prev_can, T_self_partner, first)
+        known = self.placed[first:stop].all(dim=0).to(new.device)
         placed = place(
-            T_prev_can, T_self_partner, T_world_start, self.options.placement, self.options.trust, self.given.present
+            T_prev_can,
+            T_self_partner,
+            T_world_start,
+            self.options.placement,
+            self.options.trust,
+            present=self.given.present & (known | new.any(dim=0)),  # of others, nothing is known here
+            fixed=known,
         )
         frames = slice(first * STRIDE, stop * STRIDE)
         keep = new.repeat_interleave(STRIDE, dim=0)[..., None, None]
@@ -272,7 +283,17 @@ class Canvas:
         latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas))
         features = self.model.tokenizer.decode(latent, self.given.betas, steps)
         decoded = posed(features, self.T_world_can, self.given)
-        return self._paste(decoded) if self.options.paste else decoded
+        if self.options.paste:
+            decoded = self._paste(decoded)
+        return self._hold_unknown(decoded)
+
+    def _hold_unknown(self, scene: Scene) -> Scene:
+        """Agents that the task neither gives nor generates from some time on stand still from there."""
+        ended = self.placed.repeat_interleave(STRIDE, dim=0).to(scene.device)
+        if bool(ended.all()):
+            return scene
+        last, agents = last_known(ended), torch.arange(ended.shape[1], device=scene.device)
+        return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
 
     def _paste(self, decoded: Scene) -> Scene:
         """Put given frames back; what they differ by at the seam fades out over the frames behind it."""

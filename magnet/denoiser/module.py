@@ -10,6 +10,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from magnet import weights
 from magnet.denoiser.generation import SamplerOptions, generate
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
@@ -107,7 +108,7 @@ class Denoiser(L.LightningModule):
 
     def build(self, tokenizer: Tokenizer | RawPose) -> None:
         """Make the parts whose sizes depend on the tokenizer."""
-        h = self.hparams
+        h: Any = self.hparams
         self.tokenizer = tokenizer.requires_grad_(False).eval()
         self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.relations, h.relation_noise)
         self.statistics = Statistics(self.layout, h.std_floor)
@@ -132,7 +133,7 @@ class Denoiser(L.LightningModule):
     def _require_tokenizer(self) -> None:
         if not self.built:
             raise ValueError(
-                f"the denoiser has no tokenizer: --model.tokenizer is {self.hparams.tokenizer!r}, which is not a file. "
+                f"the denoiser has no tokenizer: --model.tokenizer is {self.hparams['tokenizer']!r}, which is no file. "
                 "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint"
             )
 
@@ -143,8 +144,8 @@ class Denoiser(L.LightningModule):
         return self
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        raw = isinstance(self.tokenizer, RawPose)
-        checkpoint["tokenizer_hyper_parameters"] = None if raw else dict(self.tokenizer.hparams)
+        tokenizer = self.tokenizer
+        checkpoint["tokenizer_hyper_parameters"] = dict(tokenizer.hparams) if isinstance(tokenizer, Tokenizer) else None
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "tokenizer_hyper_parameters" not in checkpoint:
@@ -153,6 +154,22 @@ class Denoiser(L.LightningModule):
             stored = checkpoint["tokenizer_hyper_parameters"]
             self.build(RawPose() if stored is None else Tokenizer(**stored))
             self.to(self.device)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path | None = None) -> Denoiser:
+        """A trained model ready for use: one that comes with the package by name, or a checkpoint's path.
+
+        Raises:
+            ValueError: no such checkpoint, or not a denoiser's.
+        """
+        path = weights.resolve(name_or_path)
+        checkpoint = weights.read(path)
+        if "tokenizer_hyper_parameters" not in checkpoint:
+            raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
+        model = cls(**{**checkpoint["hyper_parameters"], "tokenizer": None})
+        model.on_load_checkpoint(checkpoint)
+        model.load_state_dict(checkpoint["state_dict"])
+        return model.eval()
 
     # -- what the model does -------------------------------------------------------------------
 
@@ -209,7 +226,7 @@ class Denoiser(L.LightningModule):
     def on_fit_start(self) -> None:
         if not self.statistics.ready:
             self._fit_statistics()
-        if self.hparams.compile:
+        if self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
 
@@ -224,7 +241,7 @@ class Denoiser(L.LightningModule):
         self.statistics.fit(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
-        generator = step_generator(self.device, self.hparams.seed, "train", self.global_step, self.global_rank)
+        generator = step_generator(self.device, self.hparams["seed"], "train", self.global_step, self.global_rank)
         losses = self._losses(batch, generator)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True)
@@ -232,14 +249,14 @@ class Denoiser(L.LightningModule):
 
     def validation_step(self, batch: Scene, batch_idx: int) -> None:
         # The same noise at every validation, so that epochs can be compared.
-        seed = derive(self.hparams.seed, "validation", batch_idx, self.global_rank)
+        seed = derive(self.hparams["seed"], "validation", batch_idx, self.global_rank)
         generator = torch.Generator(device=self.device).manual_seed(seed)
         losses = self._losses(batch, generator)
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
     def _losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
-        h = self.hparams
+        h: Any = self.hparams
         with torch.no_grad():
             tokens, there = self.tokenize(scene)
             truth = self.statistics.normalise(tokens)
@@ -259,7 +276,7 @@ class Denoiser(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         self._require_tokenizer()
-        h = self.hparams
+        h: Any = self.hparams
         fused = self.device.type == "cuda"
         optimizer = torch.optim.AdamW(
             self.transformer.parameters(), lr=h.learning_rate, weight_decay=h.weight_decay, fused=fused

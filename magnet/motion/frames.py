@@ -12,12 +12,14 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from magnet.motion.rotations import about_y, from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
 
 Placement = Literal["integrate", "anchor", "fuse"]
+
+FIXED = 1e9
+"""Weight of a step that is known: `fuse` moves such an agent by less than rounding does."""
 
 UPRIGHT = 1e-3
 """Below this horizontal length of the left axis the person lies on the side and has no yaw."""
@@ -161,6 +163,7 @@ def place(
     placement: Placement = "integrate",
     trust: float = 0.1,
     present: Tensor | None = None,
+    fixed: Tensor | None = None,
 ) -> Tensor:
     """World canonical frames of a predicted stretch of motion.
 
@@ -174,6 +177,7 @@ def place(
             the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
         trust: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
         present: (B, P) bool; relations to absent agents are not read. None: all are there.
+        fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
 
     Returns:
         T_world_can (B, T, P, 4, 4), in the dtype of `steps`; computed in float64 so that thousands of
@@ -184,8 +188,10 @@ def place(
     if placement == "fuse" and T_self_partner is not None and steps.shape[2] > 1:
         if present is None:
             present = torch.ones(steps.shape[0], steps.shape[2], dtype=torch.bool, device=steps.device)
+        weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(steps.device), FIXED, 1.0)
         pairs = to_planar(T_self_partner.double())
-        return from_planar(*_fuse(step_yaw, step_ground, *pairs, start_yaw, start_ground, trust, present)).to(steps)
+        steps_planar = (step_yaw, step_ground)
+        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, trust, present, weight)).to(steps)
     yaw = start_yaw[:, None] + step_yaw.cumsum(dim=1)
     before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
     ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
@@ -205,16 +211,17 @@ def _fuse(
     ground: Tensor,
     trust: float,
     present: Tensor,
+    own: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Frame by frame: minimise |pose - stepped pose|^2 + trust * sum |pair - predicted pair|^2.
+    """Frame by frame: minimise own * |pose - stepped pose|^2 + trust * sum |pair - predicted pair|^2.
 
     Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    I + 2 trust (graph Laplacian of the people present).
+    diag(own) + 2 trust (graph Laplacian of the people present). own (P,) is each agent's weight.
     """
     partner = partners(present.shape[1], present.device)
     together = trust * (present[:, :, None] & present[:, None]).to(step_yaw)
     together.diagonal(dim1=1, dim2=2).zero_()
-    system = torch.eye(present.shape[1]).to(step_yaw) + 2 * (torch.diag_embed(together.sum(-1)) - together)
+    system = torch.diag(own.to(step_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
     solve = torch.linalg.inv(system)
     weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
 

@@ -193,7 +193,12 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
     padded = [scene.pad_agents(agents) for scene in scenes]
     valid = None
     if any(scene.valid is not None for scene in scenes):
-        valid = torch.cat([torch.ones(s.scenes, s.frames, dtype=torch.bool, device=s.device) if s.valid is None else s.valid for s in padded])
+        valid = torch.cat(
+            [
+                torch.ones(s.scenes, s.frames, dtype=torch.bool, device=s.device) if s.valid is None else s.valid
+                for s in padded
+            ]
+        )
     named = all(scene.names for scene in scenes)
     return Scene(
         body_rot=torch.cat([s.body_rot for s in padded]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Protocol
 
 import torch
@@ -51,8 +52,8 @@ def sample(
     Returns:
         (B, N, P, D). Known tokens come back bit-identical.
     """
-    B, N, P, D = tokens.shape
-    if (N, P) != (schedule.tokens, schedule.agents):
+    N, P = tokens.shape[1:3]
+    if (schedule.tokens, schedule.agents) != (N, P):
         raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
     clean = layout.spread(layout.group_levels(initial_levels(schedule.known)) == 0).to(tokens.device)
     noise = torch.randn(tokens.shape, generator=generator, device=tokens.device, dtype=tokens.dtype)
@@ -84,7 +85,7 @@ def run_stage(
     device = tokens.device
     levels = stage.levels.to(device)
     hidden = None if stage.hidden is None else stage.hidden.to(device)
-    for now, after in zip(levels[:-1], levels[1:], strict=True):
+    for now, after in pairwise(levels):
         if hidden is None:
             clean = denoise(tokens, now.expand(len(tokens), -1, -1), present)
             tokens = _step(tokens, clean, now, after, layout)
@@ -110,21 +111,24 @@ def _step_in_views(
     present: Tensor,
     layout: TokenLayout,
 ) -> Tensor:
-    """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)"""
-    B, W, P, D = tokens.shape
-    seen_now = torch.where(hidden, LEVELS, now)  # (P views, W, P)
+    """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)
+
+    Agents that see the same share a view.
+    """
+    B, W, P, _ = tokens.shape
+    hidden, view_of = hidden.unique(dim=0, return_inverse=True)
+    V = len(hidden)
+    seen_now = torch.where(hidden, LEVELS, now)  # (V, W, P)
     seen_after = torch.where(hidden, LEVELS, after)
-    group = layout.spread(layout.group_levels(seen_now))  # (P views, W, P, D)
+    group = layout.spread(layout.group_levels(seen_now))  # (V, W, P, D)
     # A relation to somebody hidden is unknown too, although the token that carries it is not.
     unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
-    views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, P views, W, P, D)
+    views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
     clean = denoise(
         views.flatten(0, 1),
-        seen_now.expand(B, P, W, P).flatten(0, 1),
-        present[:, None].expand(B, P, P).flatten(0, 1),
-    ).unflatten(0, (B, P))
+        seen_now.expand(B, V, W, P).flatten(0, 1),
+        present[:, None].expand(B, V, P).flatten(0, 1),
+    ).unflatten(0, (B, V))
     stepped = ddim_step(tokens[:, None], clean, group, layout.spread(layout.group_levels(seen_after)))
-    own = torch.arange(P, device=tokens.device)
-    return stepped[:, own, :, own].permute(1, 2, 0, 3)
-
-
+    agent = torch.arange(P, device=tokens.device)
+    return stepped[:, view_of, :, agent].permute(1, 2, 0, 3)

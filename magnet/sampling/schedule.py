@@ -159,6 +159,72 @@ class MaskSchedule:
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
+    @staticmethod
+    def blocks(
+        known: Tensor,
+        target: Tensor,
+        grid: Grid,
+        block: int = 1,
+        unseen: Tensor | None = None,
+        delay: Tensor | None = None,
+        lookahead: bool = True,
+    ) -> MaskSchedule:
+        """Denoise the targets a few time steps at a time, agents as they are told.
+
+        Args:
+            known: (N, P) bool, given clean.
+            target: (N, P) bool, to be generated.
+            grid: sizes.
+            block: token steps finished before the window moves on.
+            unseen: (P, P) bool; unseen[p, q]: agent p does not see agent q's part of the current block.
+            delay: (P,) int, denoising steps that an agent waits at the start of each block.
+            lookahead: False: nobody sees anything, even if known, after the current block.
+
+        Raises:
+            ValueError: the block is longer than the window.
+        """
+        if not 1 <= block <= grid.window:
+            raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")
+        delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
+        plan = ddim_levels(grid.steps)
+        turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)
+        plans = plan[turns.clamp(0, grid.steps)]
+        level, stages = initial_levels(known), []
+        for first, last in _blocks(target, block):
+            past = grid.window - grid.stride
+            start = max(0, min(first - past, grid.tokens - grid.window), last - grid.window)
+            stop = min(start + grid.window, grid.tokens)
+            now = slice(first - start, last - start)
+            active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
+            active[now] = target[first:last]
+            rows = torch.where(active, plans[:, None], level[start:stop])
+            changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
+            rows = torch.cat([rows[:1], rows[1:][changes]])
+            hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
+            if unseen is not None:
+                hidden[:, now] = unseen[:, None]
+            if not lookahead:
+                hidden[:, last - start :] = True
+            hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
+            stages.append(Stage(start, rows, hidden if hidden.any() else None))
+            level[start:stop] = rows[-1]
+        return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+
+
+def _blocks(target: Tensor, block: int) -> Iterator[tuple[int, int]]:
+    """Time steps with targets, in runs of at most `block`."""
+    wanted = target.any(dim=1).tolist()
+    first = 0
+    while first < len(wanted):
+        if not wanted[first]:
+            first += 1
+            continue
+        last = first
+        while last < min(first + block, len(wanted)) and wanted[last]:
+            last += 1
+        yield first, last
+        first = last
+
 
 def initial_levels(known: Tensor) -> Tensor:
     """Known tokens are clean, all others pure noise. (N, P) bool -> (N, P) int"""

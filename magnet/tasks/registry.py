@@ -12,7 +12,7 @@ from typing import TypeVar
 
 GROUP = "magnet.tasks"
 VARIABLE = "MAGNET_TASKS"
-BUILT_IN = ("magnet.tasks.joint",)
+BUILT_IN = ("magnet.tasks.joint", "magnet.tasks.partner", "magnet.tasks.agentic")
 
 T = TypeVar("T", bound=type)
 

@@ -227,7 +227,7 @@ class Tokenizer(L.LightningModule):
         if self._trainer is not None:
             self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
-            if self.global_step % self.trainer.log_every_n_steps == 0:
+            if self.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
                 logged |= {f"train/{name}": value for name, value in by_level(quantised.counts).items()}
                 scenes = slice(0, GLANCE)
                 error, _ = self._joint_errors(pose.detach()[scenes], batch.pick(scenes))

@@ -4,6 +4,8 @@ import torch
 from magnet.denoiser.generation import SamplerOptions, scrub, seam_weights, stretches
 from magnet.motion.frames import canonical_frame, pairwise
 from magnet.motion.scene import Scene
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.testing import random_scene, tiny_denoiser, without_absent
 
@@ -15,7 +17,9 @@ def model():
     return tiny_denoiser(max_agents=3, window=8)
 
 
-def run(model, scene: Scene, context: int = 16, frames: int = 34, samples: int = 1, seed: int = 0, options=FAST, task=None):
+def run(
+    model, scene: Scene, context: int = 16, frames: int = 34, samples: int = 1, seed: int = 0, options=FAST, task=None
+):
     generator = torch.Generator().manual_seed(seed)
     return model.generate(scene, task or JointFuture(), context, frames, samples, options, generator)
 
@@ -41,6 +45,57 @@ def test_nothing_but_the_context_reaches_the_sample(model, scene, generator):
     plain = run(model, scene)
     assert same(plain, run(model, future_is_noise))
     assert same(plain, run(model, scene.cut(0, 16)))
+
+
+def unknown_replaced(scene: Scene, known: torch.Tensor, generator: torch.Generator) -> Scene:
+    """Noise wherever the schedule knows nothing. known (N, P) bool"""
+    keep = known.repeat_interleave(4, dim=0)[:, :, None, None]
+    scene = scene.cut(0, len(keep))
+    noise = random_scene(scene.scenes, scene.frames, scene.agents, generator)
+    return scene.replace(
+        body_rot=torch.where(keep[..., None], scene.body_rot, noise.body_rot),
+        T_world_root=torch.where(keep, scene.T_world_root, 30 * noise.T_world_root),
+    )
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_no_task_leaks(model, scene, generator, name):
+    """For every task: what it does not give may be anything, and the samples are bit-identical."""
+    task = registry.get(name)()
+    context = 0 if name == "generation" else 16
+    known = task.schedule(Grid(12, 3, context // 4, 3, 8, 2)).known
+    assert not known.all()
+    other = unknown_replaced(scene, known, generator)
+    a, b = (run(model, s, context=context, frames=48 - context, task=task) for s in (scene, other))
+    assert same(a, b)
+    assert a.T_world_root.isfinite().all()
+
+
+def test_the_literal_reading_leaks_where_the_unknown_partner_is(scene, generator):
+    """relation_noise="token": the same replacement changes the sample, which is why it is not the default."""
+    leaking = tiny_denoiser(max_agents=3, window=8, relation_noise="token")
+    task = registry.get("partner_inpainting")()
+    known = task.schedule(Grid(12, 3, 4, 3, 8, 2)).known
+    other = unknown_replaced(scene, known, generator)
+    a, b = (run(leaking, s, frames=32, task=task) for s in (scene, other))
+    assert not same(a, b)
+
+
+@pytest.mark.parametrize("placement", ["integrate", "fuse"])
+@pytest.mark.parametrize("name", ["partner_inpainting", "motion_control"])
+def test_given_agents_are_not_moved(model, scene, name, placement):
+    options = SamplerOptions(steps=3, stride=2, placement=placement)
+    whole = run(model, scene, frames=32, task=registry.get(name)((1,)), options=options)
+    assert torch.equal(whole.T_world_root[:, :, [0, 2]], scene.T_world_root[:, :48, [0, 2]])
+    assert torch.equal(whole.body_rot[:, :, [0, 2]], scene.body_rot[:, :48, [0, 2]])
+    assert not torch.equal(whole.body_rot[:, 16:, 1], scene.body_rot[:, 16:48, 1])
+
+
+def test_whoever_is_neither_given_nor_generated_stands_still(model, scene):
+    whole = run(model, scene, frames=32, task=registry.get("partner_prediction")((0,)))
+    still = whole.T_world_root[:, 16:, 1:]
+    assert torch.equal(still, still[:, :1].expand_as(still))
+    assert not torch.equal(whole.T_world_root[:, 20, 0], whole.T_world_root[:, 16, 0])
 
 
 def test_generation_reads_nothing_at_all(model, scene, generator):
@@ -99,18 +154,22 @@ def test_moving_the_world_moves_the_sample(model, scene):
 def test_tokens_fed_back_agree_with_the_world(model, scene):
     """After a stage, relations are what the placed agents imply."""
     from magnet.denoiser.generation import Canvas, known_tokens
-    from magnet.motion.tokens import by_frame
     from magnet.motion.frames import from_9d
+    from magnet.motion.tokens import by_frame
     from magnet.sampling.sampler import sample
-    from magnet.sampling.schedule import Grid
 
     grid = Grid(12, 3, 4, 3, 8, 2)
     schedule = JointFuture().schedule(grid)
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, FAST, 1)
     tokens = sample(
-        model.denoise, schedule, known_tokens(model, given, schedule.known), given.present, model.layout,
-        torch.Generator().manual_seed(0), canvas.settle,
+        model.denoise,
+        schedule,
+        known_tokens(model, given, schedule.known),
+        given.present,
+        model.layout,
+        torch.Generator().manual_seed(0),
+        canvas.settle,
     )
     _, _, relations = model.layout.unpack(model.statistics.restore(tokens))
     T_self_partner = from_9d(relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2))
@@ -149,7 +208,9 @@ def test_scrubbed_scenes_hold_nothing_unknown(scene):
     given = scrub(scene, known)
     assert torch.equal(given.T_world_root[:, :16, 1], scene.T_world_root[:, :16, 1])
     for agent, start in ((0, 0), (1, 16), (2, 0)):
-        assert torch.equal(given.T_world_root[:, start:, agent], torch.eye(4).expand_as(given.T_world_root[:, start:, agent]))
+        assert torch.equal(
+            given.T_world_root[:, start:, agent], torch.eye(4).expand_as(given.T_world_root[:, start:, agent])
+        )
 
 
 def test_bad_requests_are_named(model, scene):

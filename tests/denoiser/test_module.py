@@ -29,7 +29,11 @@ def data() -> FakeData:
 
 def trainer(steps: int, **options) -> L.Trainer:
     return L.Trainer(
-        max_steps=steps, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
+        max_steps=steps,
+        accelerator="cpu",
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
         **{"enable_checkpointing": False, "limit_val_batches": 1, **options},
     )
 
@@ -90,7 +94,7 @@ def test_a_checkpoint_is_all_a_user_needs(tmp_path):
 
 
 def test_without_a_tokenizer_the_error_says_what_to_do(tmp_path):
-    with pytest.raises(ValueError, match="has no tokenizer: --model.tokenizer is 'absent.ckpt'"):
+    with pytest.raises(ValueError, match=r"has no tokenizer: --model\.tokenizer is 'absent\.ckpt'"):
         fitted(Denoiser("absent.ckpt", max_agents=3, window=8, **SIZES), 1)
 
 
@@ -129,8 +133,16 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
 
 @pytest.mark.parametrize(
     "ablation",
-    [{"relations": False}, {"rope": "none"}, {"agent_embedding": False}, {"noise_levels": "per_timestep"},
-     {"noise_levels": "per_sequence"}, {"noise_levels": "mixture"}, {"relation_noise": "token"}, {"rope": "heads"}],
+    [
+        {"relations": False},
+        {"rope": "none"},
+        {"agent_embedding": False},
+        {"noise_levels": "per_timestep"},
+        {"noise_levels": "per_sequence"},
+        {"noise_levels": "mixture"},
+        {"relation_noise": "token"},
+        {"rope": "heads"},
+    ],
     ids=str,
 )
 def test_every_ablation_trains_and_samples(tmp_path, ablation):

@@ -2,6 +2,7 @@ import pytest
 import roma
 import torch
 
+from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.motion.frames import (
     canonical_frame,
     canonical_steps,
@@ -67,13 +68,15 @@ def test_eq_11_holds_exactly_on_motion(scene: Scene):
 
 
 def test_eq_11_holds_on_a_recorded_duet(cmu_root):
-    from magnet.datamodules.asf_amc import read_pair_roots
-
-    T_world_root = read_pair_roots(cmu_root / "salsa", 60, 61, 10)
-    T_world_can = canonical_frame(T_world_root.double())
+    poses = []
+    for subject in (60, 61):
+        skeleton = read_asf(cmu_root / "salsa" / f"{subject}.asf")
+        recording = read_amc(cmu_root / "salsa" / f"{subject}_10.amc", skeleton, fps=60.0)
+        poses.append(rigid(torch.from_numpy(recording.local[:, 0]), torch.from_numpy(recording.root)))
+    T_world_can = canonical_frame(torch.stack(poses, dim=1)[None])
     T_self_partner = pairwise(T_world_can)
     expected = propagated(T_self_partner, canonical_steps(T_world_can))
-    assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-10)
+    assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

@@ -14,9 +14,14 @@ def grid_for(name: str, grid: Grid) -> Grid:
     return Grid(grid.tokens, grid.agents, 0, grid.steps) if name == "generation" else grid
 
 
+TWO_AND_MORE = ("partner_inpainting", "partner_prediction", "motion_control")
+
+
 @pytest.mark.parametrize("name", registry.names())
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
 def test_columns_never_rise_and_targets_end_clean(name: str, grid: Grid):
+    if name in TWO_AND_MORE and grid.agents == 1:
+        pytest.skip("needs a partner")
     schedule = registry.get(name)().schedule(grid_for(name, grid))
     rows = torch.stack(list(schedule.rows()))
     assert (rows.diff(dim=0) <= 0).all()

@@ -1,0 +1,79 @@
+# Every target makes the virtual environment it needs and says what it does. `make help` lists them.
+PYTHON ?=
+VENV ?= .venv
+PIP_ARGS ?=
+
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow test-all check lint type format clean distclean
+
+help:  ## list what make can do
+	@echo "magnet: diffusion forcing for the motion of several people"
+	@echo
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-18s %s\n", $$1, $$2 }'
+	@echo
+	@echo "  PYTHON=python3.12 picks the interpreter, VENV=DIR the environment, PIP_ARGS='...' is handed to pip."
+
+# The first Python of a version that works; a message that says what to do when there is none.
+$(PY):
+	@chosen=; for candidate in $(or $(PYTHON),python3 python3.13 python3.12 python3.11); do \
+	  if $$candidate -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; \
+	  then chosen=$$candidate; break; fi; done; \
+	if [ -z "$$chosen" ]; then \
+	  echo "magnet needs Python 3.11, 3.12 or 3.13; $(or $(PYTHON),python3) is $$($(or $(PYTHON),python3) --version 2>&1)." >&2; \
+	  echo "Install one and name it: make setup PYTHON=python3.12" >&2; exit 1; fi; \
+	echo "setup: a virtual environment in $(VENV) with $$($$chosen --version)"; \
+	$$chosen -m venv $(VENV) || { rm -rf $(VENV); \
+	  echo "setup: no virtual environment; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+
+$(READY): pyproject.toml constraints.txt | $(PY)
+	@echo "setup: installing magnet and the pinned packages, a few minutes the first time (PIP_ARGS=-vvv shows how)"
+	@$(PY) -m pip install -qq --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+	@$(PY) -c 'import torch; print("setup: done, torch", torch.__version__)'
+	@touch $(READY)
+
+setup: $(READY)  ## make the virtual environment with the pinned packages
+	@echo "setup: ready; $(VENV)/bin/magnet --help"
+
+demo: $(READY)  ## run the main job on the embedded default: several people move together
+	@echo "demo: magnet demo"
+	@$(PY) -m magnet demo
+
+test: $(READY)  ## run the tests, without the slow ones
+	@echo "test: pytest, without the slow tests"
+	@$(PY) -m pytest -q -m 'not slow'
+
+test-slow: $(READY)  ## run the slow tests only
+	@echo "test-slow: pytest, the slow tests"
+	@$(PY) -m pytest -q -m slow
+
+test-all: $(READY)  ## run every test
+	@echo "test-all: pytest, everything"
+	@$(PY) -m pytest -q
+
+check: lint type  ## style and types
+
+lint: $(READY)  ## style: ruff
+	@echo "lint: ruff"
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+
+type: $(READY)  ## types: mypy
+	@echo "type: mypy"
+	@$(PY) -m mypy
+
+format: $(READY)  ## rewrite the code in the project's style
+	@echo "format: ruff"
+	@$(PY) -m ruff check --fix .
+	@$(PY) -m ruff format .
+
+clean:  ## remove caches and builds
+	@echo "clean: caches and builds"
+	@rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@find magnet tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean  ## clean, and the virtual environment
+	@echo "distclean: $(VENV)"
+	@rm -rf $(VENV)

@@ -1,0 +1,38 @@
+"""magnet: diffusion forcing for the motion of several people together."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magnet.body import load_body
+    from magnet.denoiser.module import Denoiser
+    from magnet.motion.scene import Scene
+    from magnet.tasks.registry import register_task
+    from magnet.tokenizer.module import Tokenizer
+
+__version__ = "0.1.0"
+
+__all__ = ["Denoiser", "Scene", "Tokenizer", "__version__", "load_body", "register_task"]
+
+# Torch takes a second to import, Lightning three: nobody pays for them before they use them.
+_EXPORTS = {
+    "Denoiser": "magnet.denoiser.module",
+    "Scene": "magnet.motion.scene",
+    "Tokenizer": "magnet.tokenizer.module",
+    "load_body": "magnet.body",
+    "register_task": "magnet.tasks.registry",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'magnet' has no attribute {name!r}; it has {', '.join(__all__)}")
+    value = getattr(import_module(_EXPORTS[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

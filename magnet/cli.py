@@ -1,0 +1,140 @@
+"""The command `magnet`. What needs no model is answered here without importing torch."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Sequence
+
+from magnet import __version__
+
+TRAINER_COMMANDS = {
+    "fit": "train a tokenizer or a denoiser",
+    "validate": "measure a checkpoint on validation windows",
+    "test": "sample a task on test scenes, measure it beside baselines",
+    "predict": "sample a task, write the scenes and a moving picture of them",
+}
+LIGHT_COMMANDS = {
+    "tasks": "list the tasks that are installed, with their options",
+    "demo": "the main job on the embedded default, from nothing to a table and pictures",
+}
+COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS
+
+USAGE = f"""\
+magnet {__version__}: several people move together, by diffusion forcing
+
+usage: magnet COMMAND [--option VALUE ...]
+
+{{commands}}
+
+  magnet COMMAND --help            every option of a command, and what it does
+  magnet COMMAND --print_config    the configuration that would run, as YAML
+  magnet --version
+
+options of every command:
+  --debug                          show the traceback of an error
+
+for example:
+  magnet demo
+  magnet test --task joint_future
+  magnet fit --config configs/synthetic_tokenizer.yaml
+"""
+
+
+class CommandError(Exception):
+    """Something the user can put right; shown as one line."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line; `sys.argv` by default. Returns the exit code: 0, or 2 where the user can put it right."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(usage(), end="")
+        return 0
+    if arguments[0] in ("-V", "--version", "version"):
+        print(f"magnet {__version__}")
+        return 0
+    try:
+        return run(arguments[0], arguments[1:])
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
+    except KeyboardInterrupt:
+        return complain("interrupted", 130)
+    except Exception as error:
+        message = explain(error)
+        if debug or message is None:
+            raise
+        return complain(message)
+
+
+def run(command: str, arguments: list[str]) -> int:
+    """Run one command.
+
+    Raises:
+        CommandError: no such command.
+    """
+    if command in TRAINER_COMMANDS:
+        from magnet.cli_run import run_trainer
+
+        return run_trainer(command, arguments)
+    if command == "tasks":
+        from magnet.cli_tasks import list_tasks
+
+        return list_tasks(arguments)
+    if command == "demo":
+        from magnet.demo import main as demo
+
+        return int(demo(arguments) or 0)
+    raise CommandError(no_such("command", command, COMMANDS, "magnet --help"))
+
+
+def usage() -> str:
+    """What `magnet --help` says."""
+    width = max(map(len, COMMANDS))
+    return USAGE.format(commands="\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()))
+
+
+def complain(message: str, code: int = 2) -> int:
+    print(f"magnet: error: {message}", file=sys.stderr)
+    return code
+
+
+def no_such(what: str, name: str, known: Sequence[str] | dict[str, str], more: str) -> str:
+    """The message for a name that nothing has."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    return f"no {what} {name}; {hint} See {more}"
+
+
+def explain(error: Exception) -> str | None:
+    """An error in one line where the user can do something about it; None where the fault is ours."""
+    text = str(error).strip()
+    if isinstance(error, CommandError):
+        return text
+    if isinstance(error, RuntimeError) and "loading state_dict" in text:
+        return misfit(text)
+    if isinstance(error, ImportError) and "pip install" in text:
+        return text
+    if isinstance(error, (ValueError, OSError)) or type(error).__name__ == "MisconfigurationException":
+        return f"{text or type(error).__name__} (--debug shows where)"
+    return None
+
+
+def misfit(text: str) -> str:
+    """Torch's list of all parameters that do not fit, as one line about the first."""
+    size = re.search(
+        r"size mismatch for (\S+): copying a param with shape torch\.Size\((\[.*?\])\) from checkpoint, "
+        r"the shape in current model is torch\.Size\((\[.*?\])\)",
+        text,
+    )
+    advice = "leave out --model options to build the model that the checkpoint was made from"
+    if size:
+        name, stored, built = size.groups()
+        return f"the checkpoint is of another shape: {name} is {stored} there and {built} in this model; {advice}"
+    keys = re.search(r"(Missing|Unexpected) key\(s\) in state_dict: \"([^\"]+)\"", text)
+    what = f"{keys[1].lower()} {keys[2]}" if keys else text.splitlines()[0]
+    return f"the checkpoint is of another model: {what}; {advice}"

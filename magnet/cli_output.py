@@ -1,0 +1,95 @@
+"""What `magnet test` and `magnet predict` show and write down."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from magnet import cli_record
+from magnet.evaluation import Evaluation
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE
+from magnet.report import machine, print_table
+from magnet.sampling.schedule import Grid
+
+PANELS = 4
+"""Samples that a moving picture shows side by side."""
+
+
+def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any]) -> None:
+    """Print the table; write it as JSON and CSV, with how it came about."""
+    results = evaluation.results
+    if results is None:
+        return
+    results.meta.update(cli_record.provenance() | {"machine": machine()} | facts)
+    print_table(
+        results, title=f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
+    )
+    results.save_json(folder / "results.json")
+    results.save_csv(folder / "results.csv")
+    print(f"written: {folder / 'results.json'} and .csv")
+
+
+def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
+    """Print and write what a module without an evaluation of its own has logged."""
+    values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
+    table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
+    for name, value in values.items():
+        table.add_row(name, f"{value:.6g}")
+    Console().print(table)
+    folder.mkdir(parents=True, exist_ok=True)
+    plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n")
+    lines = ["metric,value", *(f"{name},{value!r}" for name, value in values.items())]
+    (folder / "results.csv").write_text("\n".join(lines) + "\n")
+    print(f"written: {folder / 'results.json'} and .csv")
+
+
+def write_scenes(
+    predicted: list[Scene],
+    evaluation: Evaluation,
+    model: Any,
+    data: Any,
+    folder: Path,
+    picture: str,
+    pictures: int,
+) -> None:
+    """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames."""
+    from magnet.export.picture import contact_sheet
+    from magnet.export.video import render_video
+
+    rank = f"{model.global_rank}-" if model.trainer.world_size > 1 else ""
+    number = 0
+    for batch in predicted:
+        for first in range(0, batch.scenes, evaluation.samples):
+            scene = batch.pick(slice(first, first + evaluation.samples)).to("cpu")
+            name = f"{rank}{number:04d}{_safe(scene)}"
+            scene.save(folder / "scenes" / f"{name}.npz")
+            if picture != "none" and number < pictures and model.global_rank == 0:
+                known = _known(evaluation, model, data, scene)
+                shown = [(f"sample {i + 1}", scene.pick([i])) for i in range(min(PANELS, scene.scenes))]
+                look = {"context_frames": data.context_frames, "known": known, "body": data.body.to("cpu")}
+                print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
+                print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
+            number += 1
+    print(f"written: {number} scenes of {evaluation.samples} samples to {folder / 'scenes'}")
+
+
+def _safe(scene: Scene) -> str:
+    name = re.sub(r"[^A-Za-z0-9]+", "_", scene.names[0] if scene.names else "").strip("_")
+    return f"_{name}" if name else ""
+
+
+def _known(evaluation: Evaluation, model: Any, data: Any, scene: Scene) -> Tensor:
+    """Which frames of whom the task gives. (T, P) bool"""
+    steps = -(-scene.frames // STRIDE)
+    grid = Grid(steps, scene.agents, data.context_frames // STRIDE, 1, model.window, evaluation.options.stride)
+    return evaluation.task.schedule(grid).known.repeat_interleave(STRIDE, dim=0)[: scene.frames]

@@ -1,0 +1,126 @@
+"""The parser behind the command: help that explains every field, and errors in a line or two."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import inspect
+import re
+import sys
+from typing import Any, ClassVar, NoReturn
+
+from lightning.pytorch.cli import LightningArgumentParser
+
+USAGE = (
+    "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
+    "{more}[--ckpt_path FILE] [--trainer.FIELD VALUE]"
+)
+
+
+REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
+NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
+
+
+class Parser(LightningArgumentParser):
+    """Knows the classes that can be named under `model`, `data` and `task`, for help and for suggestions."""
+
+    root: ClassVar[Parser | None] = None
+    """The parser of the command; the parsers of classes inside it know only their own fields."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.command = ""
+        self.arguments: list[str] = []
+        self.classes: dict[str, dict[str, type]] = {}
+
+    def format_help(self, *args: Any, **kwargs: Any) -> str:
+        """Every option: first what a run has in all cases, then the fields of each class."""
+        if not self.command:
+            return super().format_help(*args, **kwargs)
+        self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
+        parts = [super().format_help(*args, **kwargs)]
+        for key, classes in self.classes.items():
+            seen: set[str] = set()
+            for name, kind in classes.items():
+                parts.append(_fields_help(key, name, kind, seen))
+        return "\n".join(parts)
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Say what is wrong, and the closest thing that would be right."""
+        told = self if self.command or Parser.root is None else Parser.root
+        print(f"magnet {told.command}: error: {told.clearer(message)}", file=sys.stderr)
+        print(f"magnet {told.command} --help explains all options", file=sys.stderr)
+        sys.exit(2)
+
+    def clearer(self, message: str) -> str:
+        """The parser's message without its internals."""
+        unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
+        refused = re.search(REFUSED, message)
+        if unknown or refused:
+            name = unknown[1].partition("=")[0] if unknown else self._written(refused[1])  # type: ignore[index]
+            return f"no option {name}{_closest(name, self._flags())}"
+        required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
+        if required and required[1] in self.classes:
+            key = required[1]
+            return f"say which {key}: --{key} {' or '.join(self.classes[key])}, or a --config that does"
+        named = re.search(r'Parser key "(\w+)"', message)
+        path = re.search(r"Expected a dot import path string: (\S+)", message)
+        if named and path and named[1] in self.classes:
+            known = ", ".join(self.classes[named[1]])
+            return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
+        message = re.sub(r"Call to compute_fn of link .* failed: ", "", message)
+        lines = [line.strip() for line in message.splitlines() if line.strip()]
+        return "\n  ".join(line for line in lines if not line.startswith(NOISE)) or message
+
+    def _written(self, field: str) -> str:
+        """A field as the user wrote it: `--model.foo` for `foo`."""
+        flags = [argument.partition("=")[0] for argument in self.arguments]
+        return next((flag for flag in flags if flag.startswith("--") and flag.endswith(f".{field}")), field)
+
+    def _flags(self) -> list[str]:
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        for key, classes in self.classes.items():
+            for kind in classes.values():
+                flags.extend(f"--{option}" for option in _options(key, kind))
+        return flags
+
+
+def _closest(name: str, known: list[str]) -> str:
+    """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
+    group, _, leaf = name.rpartition(".")
+    if group:  # --model.foo: a field of the model is meant
+        fields = [flag for flag in known if flag.startswith(f"{group}.") and not flag.endswith((".help", "+"))]
+        close = difflib.get_close_matches(name, fields, n=1)
+        there = ", ".join(dict.fromkeys(fields))
+        return f"; did you mean {close[0]}?" if close else f"; there are {there}" if there else ""
+    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(known)}
+    leaf = leaf.lstrip("-")
+    if leaf in by_leaf:
+        return f"; did you mean {by_leaf[leaf]}?"
+    close = difflib.get_close_matches(name, known, n=1)
+    close = close or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _options(key: str, kind: type) -> list[str]:
+    return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
+
+
+def _fields_help(key: str, name: str, kind: type, seen: set[str]) -> str:
+    """Fields of one class as `--key.field`, less those that a class before it has too."""
+    parser = LightningArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+    parser.add_class_arguments(kind, key, fail_untyped=False)
+    shown: list[str] = []
+    for action in parser._actions:
+        flags = action.option_strings
+        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags) or seen & set(flags):
+            action.help = argparse.SUPPRESS
+        else:
+            shown.extend(flags)
+    more = " (more fields as above)" if seen else ""
+    seen.update(shown)
+    first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
+    text = parser.format_help()
+    lines = text.splitlines()
+    start = next((i for i, line in enumerate(lines) if line.lstrip().startswith("--")), len(lines))
+    return f"--{key} {name}: {first}{more}\n" + "\n".join(lines[start:]) + "\n"

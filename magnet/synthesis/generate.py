@@ -1,0 +1,79 @@
+"""`synthesize`: a name, a group size and a generator to a scene and what couples its people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+from magnet.motion.frames import from_planar
+from magnet.motion.scene import Scene
+from magnet.synthesis.couplings import COUPLINGS
+from magnet.synthesis.people import FPS, RestBody, gather, uniform
+from magnet.synthesis.planning import PAD, Truth
+from magnet.synthesis.pose import embody
+
+FEWEST_FRAMES = 120
+"""Shorter scenes have no room for an approach, a handshake and a parting."""
+
+
+@dataclass(frozen=True)
+class CoupledScene:
+    """A scene and the closed form of its coupling; each builder says what its `truth` holds."""
+
+    scene: Scene
+    coupling: str
+    truth: Truth
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Thousands of tiny operations: waking a second thread for each is many times slower on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def synthesize(coupling: str, people: int, frames: int, generator: torch.Generator, body: RestBody) -> CoupledScene:
+    """One scene (B = 1) of people coupled in a known way, at 30 fps; the same generator state, the same scene.
+
+    Args:
+        coupling: a name in `COUPLINGS`.
+        people: P.
+        frames: T, at least 120.
+        generator: on the CPU; all that varies comes from it: bodies, manners, paths, rhythms, noise.
+        body: whose shape numbers and joints at rest are used.
+
+    Raises:
+        ValueError: no such coupling, a group or a stretch it is not for.
+    """
+    if coupling not in COUPLINGS:
+        raise ValueError(f"coupling {coupling!r}: expected one of {', '.join(COUPLINGS)}")
+    kind = COUPLINGS[coupling]
+    if not kind.fewest <= people <= kind.most:
+        raise ValueError(f"coupling {coupling!r}: got {people} people, expected {kind.fewest} to {kind.most}")
+    if frames < FEWEST_FRAMES:
+        raise ValueError(f"got {frames} frames, expected at least {FEWEST_FRAMES}; make more and cut the scene")
+    with _one_thread():
+        group = gather(people, generator, body)
+        plan, truth = kind.plan(group, frames, generator)
+        body_rot, T_world_root = embody(plan, group, generator)
+    keep = slice(PAD, PAD + frames)
+    turn = uniform(generator, -math.pi, math.pi)
+    T_world_plan = from_planar(turn, torch.zeros(2, dtype=torch.float64))
+    scene = Scene(
+        body_rot=body_rot[keep][None].float(),
+        T_world_root=(T_world_plan @ T_world_root[keep])[None].float(),
+        betas=group.betas[None],
+        present=torch.ones(1, people, dtype=torch.bool),
+        fps=FPS,
+        body=body.id,
+        names=(f"{coupling} of {people}",),
+    )
+    return CoupledScene(scene, coupling, truth)

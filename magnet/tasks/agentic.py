@@ -1,0 +1,61 @@
+"""Tasks in which every agent generates its own motion, seeing of the others only what has happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.registry import register_task
+
+
+@register_task("agentic_sync")
+@dataclass(frozen=True)
+class AgenticSync:
+    """All agents at once, each from everybody's past alone: nobody sees what the others are about to do (paper 3.3).
+
+    Args:
+        block: token steps that an agent plans at a time.
+    """
+
+    formula: ClassVar[str] = "P(A_t | A_0:t-1, B_0:t-1) P(B_t | A_0:t-1, B_0:t-1) ..."
+    block: int = 1
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        if grid.context == 0:
+            raise ValueError("agentic_sync continues a recording: give it context frames")
+        unseen = ~torch.eye(grid.agents, dtype=torch.bool)
+        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, unseen=unseen)
+
+
+@register_task("agentic_async")
+@dataclass(frozen=True)
+class AgenticAsync:
+    """Agents take turns: each starts `offset` of its denoising later than the one before, and sees it (paper 3.3).
+
+    Args:
+        offset: share of the denoising steps between two agents' starts; 1 waits until the one before is done,
+            0 starts all together (paper Table 3: 0, 0.5 and 1).
+        order: slots in the order of their turns; slots left out follow in their own order.
+        block: token steps of a turn.
+    """
+
+    formula: ClassVar[str] = "P(A_t | A_0:t-1, B_0:t-1) P(B_t | A_0:t, B_0:t-1) ..."
+    offset: float = 1.0
+    order: tuple[int, ...] = ()
+    block: int = 1
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        if grid.context == 0:
+            raise ValueError("agentic_async continues a recording: give it context frames")
+        if not 0 <= self.offset <= 1:
+            raise ValueError(f"offset: got {self.offset}, expected 0 to 1")
+        if len(set(self.order)) != len(self.order) or not set(self.order) <= set(range(grid.agents)):
+            raise ValueError(f"order {self.order}: name each of the agents 0 to {grid.agents - 1} at most once")
+        turns = [*self.order, *(p for p in range(grid.agents) if p not in self.order)]
+        turn = torch.tensor([turns.index(p) for p in range(grid.agents)])
+        unseen = turn[:, None] < turn[None, :]
+        delay = turn * round(self.offset * grid.steps)
+        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, unseen=unseen, delay=delay)

@@ -1,0 +1,84 @@
+"""Tasks that generate some agents, given something of the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.registry import register_task
+
+
+def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
+    """Which agents are generated. (P,) bool
+
+    Raises:
+        ValueError: no such agent, or nobody is left to be given.
+    """
+    mask = torch.zeros(grid.agents, dtype=torch.bool)
+    for agent in target:
+        if not 0 <= agent < grid.agents:
+            raise ValueError(f"target {agent}: the grid has agents 0 to {grid.agents - 1}")
+        mask[agent] = True
+    if not mask.any() or mask.all():
+        raise ValueError(f"target {target}: name some of the {grid.agents} agents, not none and not all")
+    return mask
+
+
+@register_task("partner_inpainting")
+@dataclass(frozen=True)
+class PartnerInpainting:
+    """The whole motion of some agents, given the whole motion of the others (paper 3.3).
+
+    Args:
+        target: slots of the agents to generate; nothing of their motion is read.
+    """
+
+    formula: ClassVar[str] = "P(A_0:L | B_0:L, ...)"
+    target: tuple[int, ...] = (0,)
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        unknown = chosen(grid, self.target).expand(grid.tokens, -1)
+        return MaskSchedule.together(~unknown, unknown, grid)
+
+
+@register_task("partner_prediction")
+@dataclass(frozen=True)
+class PartnerPrediction:
+    """The future of some agents from everybody's past; the others' future stays unknown (paper 3.3).
+
+    Args:
+        target: slots of the agents to generate.
+    """
+
+    formula: ClassVar[str] = "P(A_t:t+L | A_0:t-1, B_0:t-1, ...)"
+    target: tuple[int, ...] = (0,)
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        if grid.context == 0:
+            raise ValueError("partner_prediction continues a recording: give it context frames")
+        return MaskSchedule.together(grid.past(), chosen(grid, self.target) & ~grid.past(), grid)
+
+
+@register_task("motion_control")
+@dataclass(frozen=True)
+class MotionControl:
+    """Some agents' next motion from their past and the others' motion up to now, which may be live (paper A.9).
+
+    Args:
+        target: slots of the agents to generate.
+        block: token steps generated at a time; the others are seen up to the end of the block.
+    """
+
+    formula: ClassVar[str] = "P(A_t | A_0:t-1, B_0:t, ...)"
+    target: tuple[int, ...] = (0,)
+    block: int = 1
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        if grid.context == 0:
+            raise ValueError("motion_control continues a recording: give it context frames")
+        unknown = chosen(grid, self.target) & ~grid.past()
+        return MaskSchedule.blocks(~unknown, unknown, grid, self.block, lookahead=False)

@@ -1,0 +1,64 @@
+import pytest
+import torch
+
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.schedule import Grid
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
+from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
+
+GRID = Grid(tokens=30, agents=3, context=8, steps=10)
+
+
+def test_inpainting_knows_all_of_the_others_and_nothing_of_the_target():
+    schedule = PartnerInpainting((1,)).schedule(GRID)
+    assert schedule.known[:, [0, 2]].all() and not schedule.known[:, 1].any()
+    assert schedule.finished.all()
+
+
+def test_prediction_leaves_the_partners_future_unknown():
+    schedule = PartnerPrediction((0, 2)).schedule(GRID)
+    assert torch.equal(schedule.known, GRID.past())
+    assert (schedule.final_levels()[8:, 1] == LEVELS).all()
+    assert schedule.finished[:, [0, 2]].all()
+
+
+def test_motion_control_sees_the_others_up_to_now_and_no_further():
+    schedule = MotionControl((0,)).schedule(GRID)
+    assert len(schedule.stages) == 22
+    for number, stage in enumerate(schedule.stages):
+        now = 8 + number - stage.start
+        assert stage.hidden is not None or now == stage.levels.shape[1] - 1
+        if stage.hidden is not None:
+            shown = stage.levels[0].masked_fill(stage.hidden[0], LEVELS)
+            assert (shown[: now + 1, 1:] == 0).all()
+            assert (shown[now + 1 :] == LEVELS).all()
+
+
+def test_agents_in_step_do_not_see_each_others_current_tokens():
+    for stage in AgenticSync().schedule(GRID).stages:
+        current = (stage.levels[0] == LEVELS) & (stage.levels[-1] == 0)
+        for agent in range(3):
+            hidden = stage.hidden[agent]
+            assert torch.equal(hidden, current & (torch.arange(3) != agent))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0])
+def test_turns_start_the_offset_apart(offset):
+    grid = Grid(tokens=12, agents=3, context=8, steps=10)
+    for stage in AgenticAsync(offset, order=(2, 0)).schedule(grid).stages:
+        now = int((stage.levels[-1] == 0).all(dim=1).nonzero()[-1])
+        starts = [int((stage.levels[:, now, agent] < LEVELS).int().argmax()) for agent in (2, 0, 1)]
+        assert starts[1] - starts[0] == starts[2] - starts[1] == round(10 * offset)
+        assert not stage.hidden[1].any()
+        assert stage.hidden[2, now].tolist() == [True, True, False]
+
+
+def test_targets_must_exist_and_leave_somebody():
+    with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 2"):
+        PartnerInpainting((5,)).schedule(GRID)
+    with pytest.raises(ValueError, match="not none and not all"):
+        PartnerInpainting((0, 1, 2)).schedule(GRID)
+    with pytest.raises(ValueError, match="offset: got 2"):
+        AgenticAsync(2).schedule(GRID)
+    with pytest.raises(ValueError, match="at most once"):
+        AgenticAsync(order=(1, 1)).schedule(GRID)

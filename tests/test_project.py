@@ -1,0 +1,91 @@
+"""The project around the code: what the files at the root promise."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from magnet import __version__
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+SOURCES = sorted(
+    path
+    for pattern in (
+        "*.md",
+        "*.toml",
+        "*.cff",
+        "Makefile",
+        ".ci/*",
+        "configs/**/*",
+        "docs/**/*",
+        "scripts/**/*",
+        "magnet/**/*",
+    )
+    for path in ROOT.glob(pattern)
+    if path.suffix in (".md", ".toml", ".cff", ".yaml", ".py", "") and path.is_file()
+)
+
+
+def named(requirement: str) -> str:
+    return re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0].lower()
+
+
+def test_every_direct_dependency_is_pinned_once_and_without_a_build_tag() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pins = [named(line) for line in lines]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
+    assert len(pins) == len(set(pins))
+    extras = PROJECT["project"]["optional-dependencies"]
+    wanted = PROJECT["project"]["dependencies"] + [line for name in extras if name != "bake" for line in extras[name]]
+    assert {named(line) for line in wanted} - {"magnet-motion"} <= set(pins)
+
+
+def test_licensed_extras_are_not_needed_to_run() -> None:
+    core = {named(line) for line in PROJECT["project"]["dependencies"]}
+    assert not core & {"smplx", "wandb", "anny"}
+
+
+def test_the_extra_all_holds_every_optional_feature() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    (everything,) = extras["all"]
+    assert set(re.findall(r"\w+", everything.partition("[")[2])) == set(extras) - {"all", "dev", "bake"}
+
+
+def test_the_version_is_told_alike_everywhere() -> None:
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"## {__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_make_explains_every_target() -> None:
+    text = (ROOT / "Makefile").read_text()
+    targets = re.search(r"^\.PHONY: (.*)$", text, re.M)
+    assert targets
+    shown = subprocess.run(["make", "-C", ROOT, "help"], capture_output=True, text=True, timeout=30, check=True).stdout
+    for target in targets[1].split():
+        assert re.search(rf"make {target} +\S", shown), target
+
+
+def test_make_says_which_python_it_needs(tmp_path: Path) -> None:
+    words = ["make", "-C", str(ROOT), "setup", "PYTHON=python2.0", f"VENV={tmp_path / 'venv'}"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    assert "magnet needs Python 3.11, 3.12 or 3.13" in done.stderr
+    assert not (tmp_path / "venv").exists()
+
+
+def test_the_check_of_changes_runs_the_tests() -> None:
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    assert "make test" in script.read_text()
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_file_knows_the_machine_that_it_was_written_on(path: Path) -> None:
+    found = re.findall(r"(?<![\w.<>-])/(?:work|tmp|root|home|opt)/[\w.-]+", path.read_text(encoding="utf-8"))
+    assert not found
