@@ -99,7 +99,11 @@ def generate(
     scene = scene.to(model.device).pad_agents(model.layout.agents)
     given = scrub(scene, schedule.known)
     # The paper read literally: a known token holds its relations to everybody, also to those not known. It leaks.
-    related = scrub(scene, torch.ones_like(schedule.known)) if model.layout.relation_noise == "token" else given
+    related = given
+    if model.layout.relation_noise == "token":
+        recorded = torch.zeros_like(schedule.known)
+        recorded[: scene.frames // STRIDE] = True
+        related = scrub(scene, recorded)
     kind = model.device.type
     dtype, enabled = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
 

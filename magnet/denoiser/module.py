@@ -174,8 +174,11 @@ class Denoiser(L.LightningModule):
     # -- what the model does -------------------------------------------------------------------
 
     def encode(self, scene: Scene) -> Tensor:
-        """Quantised latents of a scene; frames that are not valid are not looked at. -> (B, N, P, C)"""
-        return self.tokenizer.encode_scene(scene)
+        """Quantised latents of those present; frames that are not valid are not looked at. -> (B, N, P, C) float32"""
+        people = self.tokenizer.encode_scene(scene.people()).float()[:, :, 0]
+        latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
+        latent[scene.present] = people
+        return latent.transpose(1, 2)
 
     def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Predict clean tokens. noisy (B, N, P, D) normalised, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
@@ -196,7 +199,7 @@ class Denoiser(L.LightningModule):
     def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
         scene = scene.pad_agents(self.layout.agents)
-        latent = self.encode(scene).float()
+        latent = self.encode(scene)
         with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)

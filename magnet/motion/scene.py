@@ -112,6 +112,19 @@ class Scene:
             present=self.present[:, agents],
         )
 
+    def people(self) -> Scene:
+        """Everybody present as a scene of their own, (M, T, 1), in the order of scenes and slots; names are dropped."""
+        there = self.present
+        return Scene(
+            body_rot=self.body_rot.transpose(1, 2)[there].unsqueeze(2),
+            T_world_root=self.T_world_root.transpose(1, 2)[there].unsqueeze(2),
+            betas=self.betas[there].unsqueeze(1),
+            present=there[there].unsqueeze(1),
+            fps=self.fps,
+            body=self.body,
+            valid=None if self.valid is None else self.valid[:, None].expand(-1, self.agents, -1)[there],
+        )
+
     def pad_agents(self, agents: int) -> Scene:
         """The same people in `agents` slots; the new slots are absent.
 

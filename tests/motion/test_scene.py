@@ -58,3 +58,14 @@ def test_absent_agents_are_not_moved(generator):
     T = torch.eye(4)
     T[0, 3] = 5.0
     assert torch.equal(scene.moved(T).T_world_root[:, :, 2], scene.T_world_root[:, :, 2])
+
+
+def test_people_are_everybody_present_alone(generator):
+    present = torch.tensor([[True, False, True], [False, True, False]])
+    scene = random_scene(2, 8, 3, generator, present=present).replace(valid=torch.rand(2, 8, generator=generator) > 0.3)
+    people = scene.people()
+    assert (people.scenes, people.agents) == (3, 1)
+    for m, (b, p) in enumerate([(0, 0), (0, 2), (1, 1)]):
+        assert torch.equal(people.body_rot[m, :, 0], scene.body_rot[b, :, p])
+        assert torch.equal(people.betas[m, 0], scene.betas[b, p])
+        assert torch.equal(people.valid[m], scene.valid[b])
