@@ -18,7 +18,6 @@ from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.report import machine, print_table
-from magnet.sampling.schedule import Grid
 
 PANELS = 4
 """Samples that a moving picture shows side by side."""
@@ -90,6 +89,5 @@ def _safe(scene: Scene) -> str:
 
 def _known(evaluation: Evaluation, model: Any, data: Any, scene: Scene) -> Tensor:
     """Which frames of whom the task gives. (T, P) bool"""
-    steps = -(-scene.frames // STRIDE)
-    grid = Grid(steps, scene.agents, data.context_frames // STRIDE, 1, model.window, evaluation.options.stride)
-    return evaluation.task.schedule(grid).known.repeat_interleave(STRIDE, dim=0)[: scene.frames]
+    schedule = evaluation.schedule(model, data.context_frames, scene.frames - data.context_frames)
+    return schedule.known.repeat_interleave(STRIDE, dim=0)[: scene.frames, : scene.agents]

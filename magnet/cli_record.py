@@ -17,6 +17,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import magnet
 from magnet.cli import CommandError
@@ -76,8 +77,10 @@ def checkpoints(folder: Path, model: LightningModule) -> list[Callback]:
     ]
 
 
-def progress_bar() -> ProgressBar:
-    """A bar on a terminal, now and then a line elsewhere."""
+def progress_bar(sampling: bool = False) -> ProgressBar:
+    """A bar on a terminal, now and then a line elsewhere; for sampling it counts denoising steps."""
+    if sampling:
+        return SamplingProgress()
     return RichProgressBar() if sys.stdout.isatty() else ProgressLines()
 
 
@@ -134,6 +137,51 @@ class ProgressLines(ProgressBar):
 
     def on_predict_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
         self._step("predict: batch", args[2] + 1, float(sum(trainer.num_predict_batches)))
+
+
+class SamplingProgress(ProgressBar):
+    """Progress of `test` and `predict` in denoising steps: one batch of scenes can take minutes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enabled = True
+        self.bar: Progress | None = None
+        self.lines = ProgressLines()
+
+    def disable(self) -> None:
+        self.enabled = False
+
+    def _begin(self, what: str, batches: float, trainer: Trainer, model: Any) -> None:
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        plan = model.evaluation.schedule(model, data.context_frames, data.horizon_frames)
+        self.what, self.done, self.total = what, 0, int(batches) * plan.evaluations
+        model.evaluation.progress = self._advance
+        self.lines._start()
+        if self.enabled and trainer.is_global_zero and sys.stdout.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self.bar = Progress(*columns)
+            self.bar.start()
+            self.task = self.bar.add_task(f"{what}: denoising steps", total=self.total)
+
+    def _advance(self, steps: int) -> None:
+        self.done += steps
+        if self.bar is not None:
+            self.bar.advance(self.task, steps)
+        elif self.enabled:
+            self.lines._step(f"{self.what}: denoising step", self.done, self.total)
+
+    def _end(self, *_: Any) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin("test", sum(trainer.num_test_batches), trainer, pl_module)
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin("predict", sum(trainer.num_predict_batches), trainer, pl_module)
+
+    on_test_end = on_predict_end = on_exception = _end
 
 
 def clock(seconds: float) -> str:

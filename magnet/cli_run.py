@@ -229,7 +229,8 @@ class MagnetCLI(LightningCLI):
             if not any(isinstance(callback, ModelCheckpoint) for callback in callbacks):
                 callbacks += cli_record.checkpoints(self.folder, self.model)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
-            callbacks.append(cli_record.progress_bar())
+            sampling = self.command in SAMPLING and hasattr(self.model, "configure_test")
+            callbacks.append(cli_record.progress_bar(sampling))
         logger = config.get("logger")
         if logger is None or logger is True:
             logger = cli_record.loggers(self.folder, self._option("wandb"), fit)

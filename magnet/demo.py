@@ -73,7 +73,7 @@ def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: 
         logger=False,
         enable_checkpointing=False,
         enable_model_summary=False,
-        callbacks=[cli_record.progress_bar()],
+        callbacks=[cli_record.progress_bar(sampling=True)],
     )
     trainer.test(model, datamodule=data, verbose=False)
     return evaluation

@@ -20,7 +20,7 @@ from magnet.motion.frames import canonical_frame, from_planar, inverse, to_plana
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.report import Results
-from magnet.sampling.schedule import Grid
+from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.seeding import derive
 from magnet.tasks.base import Task
 from magnet.tasks.joint import JointFuture
@@ -59,7 +59,7 @@ class Evaluation:
     seed: int = 1111
     baseline_stride: int = 15
     results: Results | None = field(default=None, init=False)
-    predicted: list[Scene] = field(default_factory=list, init=False)
+    progress: Callable[[int], None] | None = field(default=None, init=False)
 
     def start(self, model: Denoiser, datamodule: MotionDataModule) -> None:
         """Set up methods and metrics.
@@ -84,7 +84,7 @@ class Evaluation:
                 "NN, not aligned": self._baseline(NearestNeighbour(train, aligned=False)),
                 "RS, not aligned": self._baseline(RandomSample(train, aligned=False)),
             }
-        self.scored = scored = self.scored_agents(model, self.horizon)
+        self.scored = scored = self.scored_agents(model)
         fps = datamodule.store("test").fps
         self.metrics = {name: all_metrics(fps, scored, CONFIDENCE).to(model.device) for name in self.methods}
         self.metrics[TRUTH] = ground_truth_metrics(fps, scored, CONFIDENCE).to(model.device)
@@ -93,11 +93,16 @@ class Evaluation:
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
         self.scenes = 0
 
-    def scored_agents(self, model: Denoiser, horizon: int) -> Tensor | None:
+    def schedule(self, model: Denoiser, context: int, horizon: int) -> MaskSchedule:
+        """The task's plan for scenes of so many frames."""
+        tokens = -(-(context + horizon) // STRIDE)
+        options = self.options
+        grid = Grid(tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride)
+        return self.task.schedule(grid)
+
+    def scored_agents(self, model: Denoiser) -> Tensor | None:
         """Who is measured: agents of whom something is generated; None where that is everybody. -> (P,) bool"""
-        tokens = (self.context + horizon) // STRIDE
-        P = model.layout.agents
-        schedule = self.task.schedule(Grid(tokens, P, self.context // STRIDE, 1, model.window, self.options.stride))
+        schedule = self.schedule(model, self.context, self.horizon)
         generated = (schedule.finished & ~schedule.known).any(dim=0)
         return None if bool(generated.all()) else generated
 
@@ -106,7 +111,7 @@ class Evaluation:
     def _model(self, model: Denoiser) -> Predictor:
         def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
             whole = model.generate(
-                scene, self.task, self.context, self.horizon, samples, self.options, generator=generator
+                scene, self.task, self.context, self.horizon, samples, self.options, generator, self.progress
             )
             return whole.cut(self.context)
 
@@ -183,7 +188,8 @@ class Evaluation:
             self.horizon,
             self.samples,
             self.options,
-            generator=self._generator(model, batch_idx),
+            self._generator(model, batch_idx),
+            self.progress,
         )
 
     def _generator(self, model: Denoiser, batch_idx: int) -> torch.Generator:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 CENTIMETRE = 0.01
 NEARLY_RIGID = ((1, 2), (16, 17), (1, 16), (2, 17))
 """Distances that say something of a shape although joints between them bend a little: hips, shoulders, flanks."""
+FEET = (7, 8, 10, 11)
 TORSO, CHEST, PELVIS = (0, 1, 2, 3, 6, 9, 12, 16, 17), (9, 12, 13, 14, 16, 17), (0, 1, 2, 3, 6)
 
 
@@ -43,6 +45,7 @@ class FitSettings:
     rest: float = 0.5  # the same, to the closed-form start, for joints without one
     smooth: float = 20.0  # of squared second differences of rotations (at 30 fps)
     shape: float = 2.0  # of a squared shape number, in the refinement of shapes
+    floor: float = 2.0  # of a squared centimetre that a foot's joint is nearer to the floor than its sole allows
     shape_prior: float = 0.5  # of a squared shape number, against a square centimetre of a length's error
 
 
@@ -90,6 +93,7 @@ def fit_body(
     weights: Tensor | None = None,
     valid: Tensor | None = None,
     betas: Tensor | None = None,
+    grounded: bool = False,
     fps: float = 30.0,
     refuse_above: float = 0.04,
     settings: FitSettings | None = None,
@@ -101,11 +105,12 @@ def fit_body(
         targets: (T, P, M, 3) world positions of M of the 22 joints, metres, y up.
         joints: which ones; both hips and both shoulders must be among them.
         rotations: (T, P, 22, 3, 3) world rotations from the body's rest pose where known, NaN elsewhere.
-        weights: (M,) or (T, P, M), how much each target matters; None: equally.
+        weights: (M,) or (T, P, M), how much each target matters, 0: it is not known; None: equally.
         valid: (T, P) bool; frames that are not valid are filled but count for nothing.
         betas: (P, 10) known shapes; None: fitted, one a person.
+        grounded: everybody stands on one level floor, whose height is found; soles are kept above it.
         fps: of the targets.
-        refuse_above: largest mean distance in metres that is still a fit.
+        refuse_above: largest mean distance in metres, over targets that count, that is still a fit.
         progress: called with (steps done, steps in all).
 
     Raises:
@@ -119,18 +124,25 @@ def fit_body(
         weights = torch.ones(M, device=targets.device)
     weights = weights.to(targets).expand(T, P, M) * valid[..., None]
     hints = None if rotations is None else rotations.to(targets)
-    total = settings.steps + (settings.shape_steps if betas is None else 0)
+    fit_shape = betas is None
+    total = settings.steps + (settings.shape_steps if fit_shape or grounded else 0)
     tell = progress or (lambda done, total: None)
     if betas is None:
-        betas = shape_from_lengths(targets, joints, body, valid, settings.shape_prior)
-        # An even choice of frames is enough for ten numbers, and far cheaper than all of them.
+        betas = shape_from_lengths(targets, joints, body, weights > 0, settings.shape_prior)
+    floor = None
+    if fit_shape or grounded:
+        # An even choice of frames is enough for ten numbers and a height, and far cheaper than all of them.
         good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
         some = good[torch.linspace(0, len(good) - 1, min(settings.shape_frames, len(good))).long()]
-        problem = _Problem(
+        few = _Problem(
             body, targets[some], joints, weights[some], None if hints is None else hints[some], settings, 0.0
         )
-        betas = problem.solve(betas, settings.shape_steps, True, lambda done: tell(done, total))[2]
-    problem = _Problem(body, targets, joints, weights, hints, settings, settings.smooth * (fps / 30.0) ** 4)
+        R, t, betas = few.solve(betas, settings.shape_steps, fit_shape, lambda done: tell(done, total))
+        if grounded:
+            found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
+            floor = float(floor_height(found, body, betas).median())
+    smooth = settings.smooth * (fps / 30.0) ** 4
+    problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor)
     done_before = total - settings.steps
     R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(done_before + done, total))
     scene = Scene(
@@ -143,9 +155,10 @@ def fit_body(
         valid=valid.all(dim=1)[None],
     )
     residual = (body.joints(scene)[0][:, :, list(joints)] - targets).norm(dim=-1)
-    mean = float(residual[valid].mean())
+    counts = weights > 0
+    mean = float(residual[counts].mean())
     if not mean <= refuse_above:
-        worst = JOINT_NAMES[joints[int(residual[valid].mean(dim=0).argmax())]]
+        worst = JOINT_NAMES[joints[int((residual * counts).sum(dim=(0, 1)).argmax())]]
         raise ValueError(
             f"the body fits with a mean error of {100 * mean:.1f} cm, expected at most {100 * refuse_above:.1f} cm; "
             f"worst is {worst}: check units (metres), the up axis (y) and which target is which joint"
@@ -171,30 +184,51 @@ def _checked(targets: Tensor, joints: Sequence[int], rotations: Tensor | None, v
     return valid
 
 
-def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, valid: Tensor, prior: float) -> Tensor:
-    """Shapes whose bones are as long as the targets' are, each length its median over valid frames. -> (P, 10)"""
+def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, sure: Tensor, prior: float) -> Tensor:
+    """Shapes whose bones are as long as the targets' are, each length its median over the frames that count.
+
+    targets (T, P, M, 3), sure (T, P, M) bool -> (P, 10)
+    """
     place = {joint: i for i, joint in enumerate(joints)}
     bones = [(PARENTS[j], j) for j in joints if PARENTS[j] in place]
     pairs = [*bones, *((a, b) for a, b in NEARLY_RIGID if a in place and b in place)]
     here, there = zip(*((place[a], place[b]) for a, b in pairs), strict=True)
     a, b = zip(*pairs, strict=True)
     lengths = (targets[:, :, list(here)] - targets[:, :, list(there)]).norm(dim=-1)
+    lengths = torch.where(sure[:, :, list(here)] & sure[:, :, list(there)], lengths, torch.nan)
     shapes = []
     for p in range(targets.shape[1]):
-        want = lengths[valid[:, p], p].double().median(dim=0).values
+        want = lengths[:, p].double().nanmedian(dim=0).values
+        there_is = want.isfinite()
 
         def measure(beta: Tensor) -> Tensor:
             rest = body.rest_joints(beta)
-            return (rest[list(a)] - rest[list(b)]).norm(dim=-1)
+            return (rest[list(a)] - rest[list(b)]).norm(dim=-1)[there_is]  # noqa: B023
 
         beta = torch.zeros(10, dtype=torch.float64, device=targets.device)
         for _ in range(8):  # Gauss-Newton: lengths are all but linear in the shape
             J = torch.func.jacfwd(measure)(beta) / CENTIMETRE
-            off = (want - measure(beta)) / CENTIMETRE
+            off = (want[there_is] - measure(beta)) / CENTIMETRE
             eye = torch.eye(10, dtype=beta.dtype, device=beta.device)
             beta = torch.linalg.solve(J.T @ J + prior * eye, J.T @ (off + J @ beta))
         shapes.append(beta.float())
     return torch.stack(shapes)
+
+
+def clearance(body: Body, betas: Tensor) -> Tensor:
+    """Height of the feet's joints above the sole of a body at rest. (P, 10) -> (P, 4) metres
+
+    Ankles of a kneeling person are lower than at rest: they are let down to the balls' height.
+    """
+    low = body.v_template[:, 1] < body.v_template[:, 1].min() + 0.15
+    soles = body.v_template[low, 1] + betas @ body.shapedirs[low, 1].T  # (P, V)
+    above = body.rest_joints(betas)[:, list(FEET), 1] - soles.amin(dim=-1, keepdim=True)
+    return torch.minimum(above, above[:, [2, 3, 2, 3]])
+
+
+def floor_height(found: Tensor, body: Body, betas: Tensor) -> Tensor:
+    """Height of the lowest sole of each person and frame. found (T, P, 22, 3), betas (P, 10) -> (T, P) metres"""
+    return (found[:, :, list(FEET), 1] - clearance(body, betas)).amin(dim=-1)
 
 
 class _Problem:
@@ -209,22 +243,24 @@ class _Problem:
         hints: Tensor | None,
         settings: FitSettings,
         smooth: float,
+        floor: float | None = None,
     ) -> None:
         self.body, self.targets, self.joints, self.weights = body, targets, list(joints), weights
         self.hints, self.settings, self.smooth = hints, settings, smooth
+        self.floor = floor
 
     def solve(
         self, betas: Tensor, steps: int, shape: bool, tell: Callable[[int], None]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Local rotations with the pelvis's first (T, P, 22, 3, 3), pelvis positions (T, P, 3), shapes (P, 10)."""
-        R, t, known = start(self.targets, self.joints, self.body.rest_joints(betas), self.hints)
+        R, t, known = start(self.targets, self.joints, self.body.rest_joints(betas), self.hints, self.weights > 0)
         trust = torch.where(known, self.settings.hint, self.settings.rest)
         prior = R
         six = to_6d(R).clone().requires_grad_()
         t = t.clone().requires_grad_()
         betas = betas.clone().requires_grad_(shape)
         rate = self.settings.learning_rate
-        groups = [{"params": [six], "lr": rate}, {"params": [t], "lr": rate / 3}]
+        groups: list[dict[str, Any]] = [{"params": [six], "lr": rate}, {"params": [t], "lr": rate / 3}]
         if shape:
             groups.append({"params": [betas], "lr": 2 * rate})
         optimiser = torch.optim.Adam(groups, betas=(0.9, 0.98))
@@ -246,6 +282,10 @@ class _Problem:
         loss = (self.weights * off.square().sum(-1)).sum()
         loss = loss + (trust * (R - prior).square().sum((-1, -2))).sum()
         loss = loss + self.settings.shape * len(self.targets) * betas.square().sum()
+        if self.floor is not None:
+            height = found[:, :, list(FEET), 1] - self.floor
+            deep = (clearance(self.body, betas) - height).clamp_min(0.0) / CENTIMETRE
+            loss = loss + self.settings.floor * deep.square().sum()
         if self.smooth and len(R) > 2:
             loss = loss + self.smooth * (R[2:] - 2 * R[1:-1] + R[:-2]).square().sum()
             bend = (t[2:] - 2 * t[1:-1] + t[:-2]) / CENTIMETRE
@@ -254,11 +294,11 @@ class _Problem:
 
 
 def start(
-    targets: Tensor, joints: Sequence[int], rest: Tensor, hints: Tensor | None
+    targets: Tensor, joints: Sequence[int], rest: Tensor, hints: Tensor | None, sure: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Closed-form local rotations (T, P, 22, 3, 3), pelvis positions (T, P, 3), which rotations were known (bool).
 
-    targets (T, P, M, 3), rest (P, 22, 3), hints (T, P, 22, 3, 3) or None
+    targets (T, P, M, 3), rest (P, 22, 3), hints (T, P, 22, 3, 3) or None, sure (T, P, M) bool: the target counts
     """
     T, P = targets.shape[:2]
     place = {joint: i for i, joint in enumerate(joints)}
@@ -287,7 +327,8 @@ def start(
         if j not in TORSO[:6] and len(child) == 1 and child[0] in place and j in place:
             bone = (world[:, :, j] @ (rest[:, child[0]] - rest[:, j])[..., None])[..., 0]
             want = targets[:, :, place[child[0]]] - targets[:, :, place[j]]
-            world[:, :, j] = swing(bone, want) @ world[:, :, j]
+            both = (sure[:, :, place[j]] & sure[:, :, place[child[0]]])[..., None, None]
+            world[:, :, j] = torch.where(both, swing(bone, want) @ world[:, :, j], world[:, :, j])
     local = world.clone()
     local[:, :, 1:] = world[:, :, list(PARENTS[1:])].transpose(-1, -2) @ world[:, :, 1:]
     hips = [place[1], place[2]]

@@ -61,7 +61,9 @@ def read(path: str | Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: not a checkpoint that can be read safely ({type(error).__name__}: {error})") from error
+        raise ValueError(
+            f"{path}: not a checkpoint that can be read safely ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _read_folder(folder: Path) -> dict[str, Any]:
@@ -105,7 +107,9 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
         old.unlink()
     exact = ("statistics", "codebook", "mean", "std")
     state = {
-        name: value.half() if half and value.is_floating_point() and value.dim() > 1 and not _any(exact, name) else value
+        name: value.half()
+        if half and value.is_floating_point() and value.dim() > 1 and not _any(exact, name)
+        else value
         for name, value in checkpoint["state_dict"].items()
     }
     parts: list[dict[str, Tensor]] = [{}]

@@ -1,0 +1,195 @@
+"""The CMU data set: from a folder of files to clips."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet.datamodules import cmu
+from magnet.datamodules.asf_amc import read_amc, read_asf
+from magnet.datamodules.cmu import CMU
+from magnet.datamodules.cmu_fit import check_rate
+
+from .fake_cmu import write_amc, write_asf
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three takes of a couple and one of somebody alone, a second or so each; and the cache, filled."""
+    root = tmp_path_factory.mktemp("recordings")
+    (root / "salsa").mkdir()
+    for subject, x in ((60, 0.0), (61, 0.8)):
+        write_asf(root / f"salsa/{subject}.asf")
+        for take in (1, 3, 5):
+            write_amc(root / f"salsa/{subject}_{take:02}.amc", 121, x, seed=10 * subject + take)
+    write_asf(root / "02.asf")
+    write_amc(root / "02_01.amc", 241, seed=1, rate=120.0)
+    return root
+
+
+@pytest.fixture(scope="module")
+def filled(made: Path, tmp_path_factory: pytest.TempPathFactory) -> CMU:
+    data = CMU(str(made), str(tmp_path_factory.mktemp("cache")), max_agents=2)
+    data.prepare_data()
+    return data
+
+
+def copied(made: Path, to: Path) -> Path:
+    """A folder of one take whose files a test may damage."""
+    for name in ("60.asf", "61.asf", "60_01.amc", "61_01.amc"):
+        (to / name).write_bytes((made / "salsa" / name).read_bytes())
+    return to
+
+
+def test_clips_are_split_by_take_and_stand_on_the_floor_at_30_fps(filled: CMU) -> None:
+    names = {split: {clip.name for clip in filled.clips(split)} for split in ("train", "val", "test")}
+    assert names == {"train": {"02_01", "60_01+61_01"}, "val": {"60_03+61_03"}, "test": {"60_05+61_05"}}
+    for clip in filled.clips("train"):
+        scene = clip.scene
+        assert (scene.fps, scene.frames, scene.body) == (30.0, 61, filled.body.id)
+        assert clip.source == ("cmu-couples" if clip.agents == 2 else "cmu-singles")
+        assert scene.valid is not None and scene.valid.all()
+        feet = filled.body.joints(scene)[..., [10, 11], 1]
+        assert 0 < feet.amin(dim=-1).median() < 0.08
+
+
+def test_batches_come_out(filled: CMU) -> None:
+    batch = next(iter(filled.train_dataloader()))
+    assert batch.T_world_root.shape[1:3] == (filled.window_frames, 2)
+
+
+def test_a_filled_cache_is_read_and_not_made_again(filled: CMU, monkeypatch: pytest.MonkeyPatch) -> None:
+    again = CMU(filled.root, filled.cache, max_agents=2)
+    monkeypatch.setattr(cmu, "fit_take", None)
+    again.prepare_data()
+    for ours, theirs in zip(again.clips("train"), filled.clips("train"), strict=True):
+        assert torch.equal(ours.scene.body_rot, theirs.scene.body_rot)
+
+
+def test_the_same_files_give_the_same_scene_bit_for_bit(filled: CMU, made: Path, tmp_path: Path) -> None:
+    data = CMU(str(made), str(tmp_path), singles=False, test_takes=(), val_takes=())
+    take = next(take for take in data.takes() if take.name == "60_01+61_01")
+    data._convert([take])
+    again = data.clips("train")[0].scene
+    first = next(clip.scene for clip in filled.clips("train") if clip.name == take.name)
+    assert torch.equal(again.body_rot, first.body_rot) and torch.equal(again.T_world_root, first.T_world_root)
+
+
+def test_changed_files_body_rate_or_version_make_another_cache_entry(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def entry(**arguments: object) -> str:
+        data = CMU(str(copied(made, tmp_path)), str(tmp_path), **arguments)  # type: ignore[arg-type]
+        return data._file(data.takes()[0]).name
+
+    first = entry()
+    assert entry() == first
+    assert entry(fps={"60": 120.0}) != first
+    with monkeypatch.context() as patch:
+        patch.setattr(cmu, "FIT_VERSION", 99)
+        assert entry() != first
+    data = CMU(str(tmp_path), str(tmp_path))
+    write_amc(tmp_path / "60_01.amc", 100)
+    assert data._file(data.takes()[0]).name != first
+
+
+def test_reports_lie_beside_the_scenes_and_nothing_half_written(filled: CMU) -> None:
+    cache = Path(filled.cache or "")
+    names = sorted(path.suffix for path in cache.iterdir())
+    assert names == [".json"] * 4 + [".npz"] * 4
+    report = json.loads(next(cache.glob("60_01*.json")).read_text())
+    assert report["frames"] == 61 and report["limb error cm"] < 4 and len(report["glitches"]) == 2
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
+    def half(path: Path) -> None:
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cmu._write(tmp_path / "scene.npz", half)
+    assert not list(tmp_path.iterdir())
+
+
+# -- bad input ---------------------------------------------------------------------------------
+
+
+def test_a_damaged_take_is_reported_after_the_others_are_done(made: Path, tmp_path: Path) -> None:
+    root = copied(made, tmp_path)
+    for subject in (60, 61):
+        (root / f"{subject}_02.amc").write_bytes((root / f"{subject}_01.amc").read_bytes()[:9000])
+    data = CMU(str(root), str(tmp_path / "cache"))
+    with pytest.warns(UserWarning, match=r"1 of 2 takes are left out:\n  60_02\+61_02: .*60_02\.amc:\d+"):
+        data.prepare_data()
+    assert [clip.name for clip in data.clips("train")] == ["60_01+61_01"]
+
+
+def test_all_takes_damaged_is_an_error(made: Path, tmp_path: Path) -> None:
+    root = copied(made, tmp_path)
+    (root / "61_01.amc").write_text("")
+    with pytest.raises(ValueError, match=r"no take could be used:\n  60_01\+61_01: .*holds no frames"):
+        CMU(str(root), str(tmp_path / "cache")).prepare_data()
+
+
+def test_a_missing_partner_is_named(made: Path, tmp_path: Path) -> None:
+    root = copied(made, tmp_path)
+    (root / "61_01.amc").unlink()
+    with pytest.raises(ValueError, match=r"61_01\.amc is missing: take 60_01\+61_01 needs both"):
+        CMU(str(root), str(tmp_path / "cache")).prepare_data()
+
+
+def test_unequal_partners_are_refused_unless_trimmed(made: Path, tmp_path: Path) -> None:
+    root = copied(made, tmp_path)
+    write_amc(root / "61_01.amc", 110, 0.8)
+    with pytest.raises(ValueError, match="trim=True"):
+        CMU(str(root), str(tmp_path / "cache")).prepare_data()
+    (clip,) = CMU(str(root), str(tmp_path / "cache"), trim=True).clips("train")
+    assert clip.frames == 55
+
+
+def test_an_empty_folder_no_folder_and_none_say_where_recordings_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MAGNET_CMU", raising=False)
+    for root in (str(tmp_path), str(tmp_path / "nowhere"), None):
+        with pytest.raises(FileNotFoundError, match=r"mocap\.cs\.cmu\.edu.*NSF EIA-0196217"):
+            CMU(root, str(tmp_path / "cache")).prepare_data()
+
+
+def test_a_take_in_two_splits_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"takes \[5\] are in both val and test"):
+        CMU(val_takes=(3, 5))
+
+
+def test_speeds_that_nobody_reaches_are_refused(tmp_path: Path) -> None:
+    skeleton = read_asf(write_asf(tmp_path / "60.asf"))
+    lively = read_amc(write_amc(tmp_path / "60_01.amc", 600), skeleton, 60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_rate(lively)
+    with pytest.raises(ValueError, match=r"60_01\.amc: at 480 fps .* nobody does; give the frame rate .* `fps`"):
+        check_rate(replace(lively, fps=480.0))
+    with pytest.raises(ValueError, match="nobody does"):
+        check_rate(replace(lively, local=lively.local[[0] * 600], root=lively.root[[0] * 600]))
+
+
+def test_a_real_jump_at_twice_its_rate_is_warned_of(cmu_root: Path) -> None:
+    recording = read_amc(cmu_root / "singles/143_35.amc", read_asf(cmu_root / "singles/143.asf"), 60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_rate(recording)
+    with pytest.warns(UserWarning, match="unlikely; check the frame rate"):
+        check_rate(replace(recording, fps=120.0))
+
+
+def test_takes_of_the_real_recordings(cmu_root: Path) -> None:
+    data = CMU(str(cmu_root))
+    split = {take.name: data.split_of(take) for take in data.takes() if take.couple}
+    assert [name for name, part in split.items() if part == "test"] == ["60_05+61_05", "60_10+61_10", "60_15+61_15"]
+    assert [name for name, part in split.items() if part == "val"] == ["60_03+61_03"]
+    assert len(split) == 11 and sum(not take.couple for take in data.takes()) == 38
