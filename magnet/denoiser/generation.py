@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import roma
@@ -26,6 +26,7 @@ from magnet.motion.frames import (
 )
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_frame, by_token
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid, MaskSchedule
 
@@ -47,6 +48,7 @@ class SamplerOptions:
         requantise: snap generated latents to the nearest code before decoding, as the reference does.
         paste: put the given frames back in place of their lossy reconstruction, with the seam blended.
         blend: frames over which the seam fades out behind given frames.
+        guidance: motion history guidance (paper A.7), off by default.
     """
 
     steps: int = 30
@@ -56,6 +58,7 @@ class SamplerOptions:
     requantise: bool = True
     paste: bool = True
     blend: int = 10
+    guidance: Guidance = field(default_factory=Guidance)
 
 
 def generate(
@@ -122,6 +125,7 @@ def generate(
             generator=generator,
             settle=canvas.settle,
             progress=progress,
+            guidance=options.guidance,
         )
         return canvas.scene(packed).cut(0, context + frames)
 

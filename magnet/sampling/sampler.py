@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS, ddim_step
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 
@@ -35,6 +36,7 @@ def sample(
     generator: torch.Generator | None = None,
     settle: Settle | None = None,
     progress: Callable[[int], None] | None = None,
+    guidance: Guidance | None = None,
 ) -> Tensor:
     """Fill in what a schedule leaves open.
 
@@ -48,6 +50,7 @@ def sample(
         generator: source of all noise, on the tokens' device.
         settle: see `Settle`.
         progress: told 1 after each denoising step.
+        guidance: what the prediction is pushed toward.
 
     Returns:
         (B, N, P, D). Known tokens come back bit-identical.
@@ -63,7 +66,7 @@ def sample(
     for stage in schedule.stages:
         window = slice(stage.start, stage.stop)
         canvas[:, window] = run_stage(
-            denoise, stage, canvas[:, window], veil[:, window], present, layout, progress=progress
+            denoise, stage, canvas[:, window], veil[:, window], present, layout, progress, guidance or Guidance()
         )
         if settle is not None:
             finished = torch.zeros(N, P, dtype=torch.bool)
@@ -79,7 +82,8 @@ def run_stage(
     veil: Tensor,
     present: Tensor,
     layout: TokenLayout,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | None,
+    guidance: Guidance,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)"""
     device = tokens.device
@@ -87,10 +91,10 @@ def run_stage(
     hidden = None if stage.hidden is None else stage.hidden.to(device)
     for now, after in pairwise(levels):
         if hidden is None:
-            clean = denoise(tokens, now.expand(len(tokens), -1, -1), present)
+            clean = guidance.apply(denoise, tokens, now.expand(len(tokens), -1, -1), present, veil, layout)
             tokens = _step(tokens, clean, now, after, layout)
         else:
-            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout)
+            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance)
         if progress is not None:
             progress(1)
     return tokens
@@ -110,6 +114,7 @@ def _step_in_views(
     hidden: Tensor,
     present: Tensor,
     layout: TokenLayout,
+    guidance: Guidance,
 ) -> Tensor:
     """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
@@ -124,10 +129,13 @@ def _step_in_views(
     # A relation to somebody hidden is unknown too, although the token that carries it is not.
     unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
     views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
-    clean = denoise(
+    clean = guidance.apply(
+        denoise,
         views.flatten(0, 1),
         seen_now.expand(B, V, W, P).flatten(0, 1),
         present[:, None].expand(B, V, P).flatten(0, 1),
+        veil[:, None].expand_as(views).flatten(0, 1),
+        layout,
     ).unflatten(0, (B, V))
     stepped = ddim_step(tokens[:, None], clean, group, layout.spread(layout.group_levels(seen_after)))
     agent = torch.arange(P, device=tokens.device)

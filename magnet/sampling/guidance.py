@@ -1,0 +1,88 @@
+"""Motion history guidance: push a prediction toward what the past says (paper A.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling.noise import LEVELS
+
+if TYPE_CHECKING:
+    from magnet.sampling.sampler import DenoiseFn
+
+Kind = Literal["none", "history", "self", "partner"]
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """Which part of the history is emphasised, and how much.
+
+    Args:
+        kind: `none`; `history` (HG): with against without any history; `self` (SHG): one's own history
+            against none; `partner` (PHG): the others' history against none.
+        weight: w of paper A.7, which uses 1.
+        literal: average `self` and `partner` over all branches as A.7 is printed, which makes the two
+            the same for two people. By default each agent's output is read from the branch with its own
+            (`self`) or the others' (`partner`) history, so that they differ.
+    """
+
+    kind: Kind = "none"
+    weight: float = 1.0
+    literal: bool = False
+
+    def branches(self, agents: int) -> Tensor:
+        """Whose history each branch sees, the unguided one first. -> (K, P) bool, no two alike"""
+        everybody = torch.ones(1, agents, dtype=torch.bool)
+        if self.kind == "none":
+            return everybody
+        eye = torch.eye(agents, dtype=torch.bool)
+        special = {"history": everybody[:0], "self": eye, "partner": ~eye}[self.kind]
+        kept: list[Tensor] = []
+        for row in torch.cat([everybody, ~everybody, special]):
+            if not any(torch.equal(row, other) for other in kept):
+                kept.append(row)
+        return torch.stack(kept)
+
+    def apply(
+        self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
+    ) -> Tensor:
+        """Guided prediction; all branches run as one batch.
+
+        Clean tokens are history. A branch that must not see someone's history has it at level K, as noise.
+        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
+        """
+        B, _, P, _ = tokens.shape
+        sees = self.branches(P).to(tokens.device)  # (K, P)
+        if len(sees) == 1:
+            return denoise(tokens, levels, present)
+        forgotten = (levels == 0)[:, None] & ~sees[None, :, None]  # (B, K, W, P)
+        shown = torch.where(forgotten, LEVELS, levels[:, None])
+        was = layout.spread(layout.group_levels(levels))[:, None]
+        unknown = (layout.spread(layout.group_levels(shown)) == LEVELS) & (was < LEVELS)
+        views = torch.where(unknown, veil[:, None], tokens[:, None])
+        K = len(sees)
+        clean = denoise(
+            views.flatten(0, 1), shown.flatten(0, 1), present[:, None].expand(B, K, P).flatten(0, 1)
+        ).unflatten(0, (B, K))
+
+        def branch(row: Tensor) -> Tensor:
+            return clean[:, int((sees == row.to(sees.device)).all(dim=1).nonzero()[0, 0])]
+
+        everybody = torch.ones(P, dtype=torch.bool)
+        cond, uncond = branch(everybody), branch(~everybody)
+        if self.kind == "history":
+            special = cond
+        else:
+            eye = torch.eye(P, dtype=torch.bool)
+            rows = eye if self.kind == "self" else ~eye
+            each = torch.stack([branch(row) for row in rows])  # (P branches, B, W, P, D)
+            if self.literal:
+                special = each.mean(dim=0)
+            else:
+                agent = torch.arange(P, device=tokens.device)
+                special = each[agent, :, :, agent].permute(1, 2, 0, 3)
+        return cond + self.weight * (special - uncond)
