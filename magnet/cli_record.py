@@ -72,9 +72,17 @@ def checkpoints(folder: Path, model: LightningModule) -> list[Callback]:
     monitor = getattr(model, "monitor", MONITOR)
     mode = getattr(model, "monitor_mode", "min")
     return [
-        ModelCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False),
+        LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False),
         ModelCheckpoint(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False),
     ]
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """Also saves when training ends between two validations, which Lightning's does not."""
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
 
 
 def progress_bar(sampling: bool = False) -> ProgressBar:

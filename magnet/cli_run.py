@@ -16,7 +16,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from magnet import cli_output, cli_record, cli_stored
+from magnet import cli_output, cli_record, cli_stored, weights
 from magnet.cli import CommandError
 from magnet.cli_parser import Parser
 from magnet.cli_stored import Arguments
@@ -24,7 +24,6 @@ from magnet.cli_tasks import NamedTask, alias_path, aliases, task_of
 from magnet.denoiser.generation import SamplerOptions
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
-from magnet.weights import CheckpointIO
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
 DATA = {
@@ -240,7 +239,7 @@ class MagnetCLI(LightningCLI):
             config["enable_checkpointing"] = False
         callbacks.append(self._record())
         plugins = config.get("plugins") or []
-        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), CheckpointIO()]
+        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), weights.CheckpointIO()]
         changes = {
             "callbacks": callbacks,
             "logger": logger or False,
@@ -288,6 +287,11 @@ class MagnetCLI(LightningCLI):
             raise CommandError(f"--samples is {options['samples']}, expected at least 1")
         self.evaluation = Evaluation(task=task_of(config["task"]), options=config["sampler"], **options)
         self.model.configure_test(self.evaluation)
+
+    def before_fit(self) -> None:
+        """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
+        if self.checkpoint is not None and not getattr(self.model, "built", True):
+            self.model.on_load_checkpoint(weights.read(self.checkpoint))
 
     before_test = _evaluate
     before_predict = _evaluate

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
 
 MODEL, TRUTH = "magnet", "ground truth"
+TRAINING, HALVES = "training windows", "test halves"
+"""Rows of real motion against real: training against test, and half of the test recordings against the other half."""
+
 CONFIDENCE = 0.95
 BASELINE_COMPOSED = 500
 """Composed training stretches that baselines choose from where test scenes are composed too."""
@@ -64,6 +67,8 @@ class Evaluation:
     def start(self, model: Denoiser, datamodule: MotionDataModule) -> None:
         """Set up methods and metrics.
 
+        Baselines continue what everybody did before: they are left out where the task does not give that.
+
         Raises:
             ValueError: the context is not a whole number of tokens.
         """
@@ -71,12 +76,16 @@ class Evaluation:
         if self.context % STRIDE:
             raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")
         self.body: Body = datamodule.body.to(model.device)
+        known = self.schedule(model, self.context, self.horizon).known
+        self.past_is_given = bool(known[: self.context // STRIDE].all())
+        self.nothing_is_given = not bool(known.any())
         self.methods: dict[str, Predictor] = {MODEL: self._model(model)}
         train = None
         if self.baselines:
             composed = BASELINE_COMPOSED if datamodule.composed_test else 0
             frames = self.context + self.horizon
             train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(model.device)
+        if train is not None and self.past_is_given:
             self.methods |= {
                 "NN": self._baseline(NearestNeighbour(train)),
                 "RS": self._baseline(RandomSample(train)),
@@ -89,7 +98,8 @@ class Evaluation:
         self.metrics = {name: all_metrics(fps, scored, CONFIDENCE).to(model.device) for name in self.methods}
         self.metrics[TRUTH] = ground_truth_metrics(fps, scored, CONFIDENCE).to(model.device)
         self.train_features = self._train_features(train, scored)
-        self.halves = FrechetDistance(fps=fps, agents=scored).to(model.device)
+        self.halves = [FrechetDistance(fps=fps, agents=scored).to(model.device) for _ in range(2)]
+        self.half_of: dict[str, int] = {}
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
         self.scenes = 0
 
@@ -113,6 +123,8 @@ class Evaluation:
             whole = model.generate(
                 scene, self.task, self.context, self.horizon, samples, self.options, generator, self.progress
             )
+            if self.nothing_is_given:  # such a scene stands anywhere: put it where the recorded ones are put
+                whole = aligned(whole, self.context - 1)
             return whole.cut(self.context)
 
         return predict
@@ -137,24 +149,37 @@ class Evaluation:
     # -- the run -------------------------------------------------------------------------------
 
     def step(self, model: Denoiser, batch: Scene, batch_idx: int) -> None:
-        """Measure every method on one batch of test scenes."""
-        batch = aligned(batch, self.context - 1)
-        future = self.body.joints(batch.cut(self.context))
+        """Measure every method on one batch of test scenes.
+
+        Methods see scenes as they were recorded; only what they answer is moved into the world that all test
+        scenes share, so that nothing of an unknown agent can come in through the choice of that world.
+        """
+        T_shared_world = shared_world(batch, self.context - 1)
+        future = self.body.joints(batch.cut(self.context).moved(T_shared_world))
         for name, method in self.methods.items():
             generator = self._generator(model, batch_idx)
             began = time.perf_counter()
             predicted = method(batch, self.samples, generator)
             self.seconds[name] += time.perf_counter() - began
+            if not self.nothing_is_given:
+                predicted = predicted.moved(T_shared_world.repeat_interleave(self.samples, dim=0))
             joints = self.body.joints(predicted).unflatten(0, (batch.scenes, self.samples)).transpose(0, 1)
             if self.scored is not None:  # the others are as recorded: what is measured is how well one fits in
                 joints = torch.where(self.scored.to(joints.device)[:, None, None], joints, future)
             self.metrics[name].update(joints, future, batch.present)
         self.metrics[TRUTH].update(future[None], future, batch.present)
-        even, odd = future[0::2], future[1::2]
-        n = min(len(even), len(odd))
-        if n:
-            self.halves.update(even[None, :n], odd[:n], batch.present[0::2][:n] & batch.present[1::2][:n])
+        self._into_halves(batch, future)
         self.scenes += batch.scenes
+
+    def _into_halves(self, batch: Scene, future: Tensor) -> None:
+        """Pool recorded futures by halves of the test set; a recording's scenes all go to the same half."""
+        names = batch.names or tuple(str(self.scenes + b) for b in range(batch.scenes))
+        recordings = [name.partition(" [")[0] for name in names]
+        half = torch.tensor([self.half_of.setdefault(r, len(self.half_of) % 2) for r in recordings])
+        for which, metric in enumerate(self.halves):
+            mine = (half == which).to(future.device)
+            if bool(mine.any()):
+                metric.update(future[mine][None], future[mine], batch.present[mine])
 
     def finish(self, model: Denoiser) -> dict[str, Tensor]:
         """Close the run; the table is in `results`. Returns what to log, the model's metrics first."""
@@ -162,8 +187,11 @@ class Evaluation:
         if self.train_features is not None:
             tested = self.metrics[MODEL]["FD"]
             assert isinstance(tested, FrechetDistance)
-            rows["training windows"] = {"fd": _distance(self.train_features, tested)}
-        rows[TRUTH]["fd halves"] = float(self.halves.compute().get("fd", torch.tensor(torch.nan)))
+            rows[TRAINING] = {"fd": _distance(self.train_features, tested)}
+        if all(float(half.count[1]) > 1 for half in self.halves):
+            rows[HALVES] = {"fd": _distance(*self.halves)}
+        if self.nothing_is_given:  # a scene of its own has no recording to be compared with
+            rows[MODEL] = {name: value for name, value in rows[MODEL].items() if not name.startswith("mpj")}
         meta = {
             "task": type(self.task).__name__,
             "task options": repr(self.task),
@@ -182,7 +210,7 @@ class Evaluation:
         """Context and samples of one batch of scenes, for writing."""
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
         return model.generate(
-            aligned(batch, self.context - 1),
+            batch,
             self.task,
             self.context,
             self.horizon,
@@ -198,7 +226,12 @@ class Evaluation:
 
 
 def aligned(scene: Scene, frame: int) -> Scene:
-    """The same motion in a world that all test scenes share: origin between the people, facing with agent 0.
+    """The same motion in a world that all test scenes share: see `shared_world`."""
+    return scene.moved(shared_world(scene, frame))
+
+
+def shared_world(scene: Scene, frame: int) -> Tensor:
+    """T_shared_world, with the origin between the people and facing as agent 0 does. -> (B, 1, 1, 4, 4)
 
     Both are taken at one frame, the last known one, so that positions of different scenes can be compared.
     """
@@ -207,7 +240,7 @@ def aligned(scene: Scene, frame: int) -> Scene:
     middle = (ground * there).sum(dim=1) / there.sum(dim=1).clamp_min(1)
     first = scene.present.int().argmax(dim=1)
     facing = yaw.gather(1, first[:, None])[:, 0]
-    return scene.moved(inverse(from_planar(facing, middle))[:, None, None])
+    return inverse(from_planar(facing, middle))[:, None, None]
 
 
 def _distance(a: FrechetDistance, b: FrechetDistance) -> float:

@@ -21,7 +21,7 @@ from rich.text import Text
 LOW, HIGH = "_low", "_high"
 """Endings under which a row holds the ends of a metric's interval."""
 
-REFERENCES = ("ground truth", "training windows")
+REFERENCES = ("ground truth", "training windows", "test halves")
 """Rows of recorded motion: something to compare with, not something that can be best."""
 
 RESULTS_FORMAT = 1
@@ -42,7 +42,6 @@ class Column(NamedTuple):
 COLUMNS: dict[str, Column] = {
     "fd": Column("FD", "m²", "low", "distance between the distributions of generated and recorded poses"),
     "fd_pair": Column("FD pair", "m²", "low", "the same of two people in one's frame"),
-    "fd halves": Column("FD halves", "m²", "low", "between two halves of the recordings"),
     "div": Column("DIV", "m²", "high", "variance over the samples of a scene"),
     "mi": Column("MI", "", "low", "error of the correlation between people"),
     "fs": Column("FS", "m/s", "low", "speed of standing toes that slide"),

@@ -243,7 +243,7 @@ class MotionDataModule(LightningDataModule):
             )
         if composed:
             draw = Draw.concatenate([draw, composed_draws(store, draw, composed, self.augmentation.apart, self.seed)])
-        return store.gather(draw, frames)
+        return store.gather(draw, frames, self.compose_clearance)
 
     # -- Lightning -----------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
+from magnet.optim import adamw_cosine
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tasks.base import Task
@@ -148,10 +149,12 @@ class Denoiser(L.LightningModule):
         checkpoint["tokenizer_hyper_parameters"] = dict(tokenizer.hparams) if isinstance(tokenizer, Tokenizer) else None
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
         if "tokenizer_hyper_parameters" not in checkpoint:
             raise ValueError("this is not a denoiser's checkpoint: it carries no tokenizer")
-        if not self.built:
-            stored = checkpoint["tokenizer_hyper_parameters"]
+        stored = checkpoint["tokenizer_hyper_parameters"]
+        given = dict(self.tokenizer.hparams) if self.built and isinstance(self.tokenizer, Tokenizer) else None
+        if not self.built or stored != given:
             self.build(RawPose() if stored is None else Tokenizer(**stored))
             self.to(self.device)
 
@@ -174,8 +177,12 @@ class Denoiser(L.LightningModule):
     # -- what the model does -------------------------------------------------------------------
 
     def encode(self, scene: Scene) -> Tensor:
-        """Quantised latents of those present; frames that are not valid are not looked at. -> (B, N, P, C) float32"""
-        people = self.tokenizer.encode_scene(scene.people()).float()[:, :, 0]
+        """Quantised latents of those present; frames that are not valid are not looked at. -> (B, N, P, C) float32
+
+        The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
+        convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
+        """
+        people = self.tokenizer.encode_scene(scene.people().held(STRIDE)).float()[:, 1:-1, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -244,7 +251,9 @@ class Denoiser(L.LightningModule):
         self.statistics.fit(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
-        generator = step_generator(self.device, self.hparams["seed"], "train", self.global_step, self.global_rank)
+        generator = step_generator(
+            self.device, self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank
+        )
         losses = self._losses(batch, generator)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True)
@@ -280,16 +289,7 @@ class Denoiser(L.LightningModule):
     def configure_optimizers(self) -> Any:
         self._require_tokenizer()
         h: Any = self.hparams
-        fused = self.device.type == "cuda"
-        optimizer = torch.optim.AdamW(
-            self.transformer.parameters(), lr=h.learning_rate, weight_decay=h.weight_decay, fused=fused
-        )
-        total = max(int(self.trainer.estimated_stepping_batches), 1)
-        warmup = min(h.warmup_steps, total // 2)
-        ramp = torch.optim.lr_scheduler.LinearLR(optimizer, 1e-3, 1.0, max(warmup, 1))
-        fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(total - warmup, 1))
-        schedule = torch.optim.lr_scheduler.SequentialLR(optimizer, [ramp, fall], [max(warmup, 1)])
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return adamw_cosine(self, self.transformer.parameters(), h.learning_rate, h.weight_decay, h.warmup_steps)
 
     # -- testing and predicting ----------------------------------------------------------------
 

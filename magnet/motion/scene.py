@@ -125,6 +125,16 @@ class Scene:
             valid=None if self.valid is None else self.valid[:, None].expand(-1, self.agents, -1)[there],
         )
 
+    def held(self, frames: int) -> Scene:
+        """The scene with its first and its last frame held for so many frames more, in front and behind."""
+        T = self.frames
+        frame = torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1)
+        return self.replace(
+            body_rot=self.body_rot[:, frame],
+            T_world_root=self.T_world_root[:, frame],
+            valid=None if self.valid is None else self.valid[:, frame],
+        )
+
     def pad_agents(self, agents: int) -> Scene:
         """The same people in `agents` slots; the new slots are absent.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -17,6 +16,7 @@ from torchmetrics import MeanMetric
 from magnet.motion.frames import POSE_FEATURES, canonical_frame, posed
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
+from magnet.optim import adamw_cosine
 from magnet.seeding import derive
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
 from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
@@ -53,7 +53,7 @@ class Tokenizer(L.LightningModule):
         root_translation_weight: lambda_r of paper Eq. 4, on the translation of Eq. 5.
         commitment_weight: pulls embeddings to their codes; the paper does not say.
         joint_weight: adds the distance of the joints in metres to the loss (ours).
-        velocity_weight: adds the error of the pose's change from frame to frame to the loss (ours).
+        velocity_weight: adds the error of the joints' velocities in m/s to the loss, against flicker (ours).
         std_floor: smallest standard deviation used for z-scores of poses and steps.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -223,7 +223,7 @@ class Tokenizer(L.LightningModule):
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         seen = features(batch)
-        losses, pose, quantised = self._losses(seen)
+        losses, pose, quantised = self._losses(seen, batch_idx)
         if self._trainer is not None:
             self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
@@ -235,14 +235,14 @@ class Tokenizer(L.LightningModule):
             self.log_dict(logged, batch_size=batch.scenes)
         return losses["loss"]
 
-    def _losses(self, seen: Features) -> tuple[dict[str, Tensor], Tensor, Quantised]:
+    def _losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantised]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
         h = self.hparams
         embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
-        quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step))
+        quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         pose = self._reconstruct(quantised.latent, seen.betas, by_token(seen.steps), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
-            joints = self._canonical_joints(seen) if h["joint_weight"] else None
+            joints = self._canonical_joints(seen) if h["joint_weight"] or h["velocity_weight"] else None
             losses = reconstruction_losses(pose, seen.pose, seen.counts, joints)
         losses["commitment"] = quantised.commitment
         return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantised
@@ -303,22 +303,8 @@ class Tokenizer(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         h = self.hparams
-        optimizer = torch.optim.AdamW(
-            self.vqvae.parameters(),
-            lr=h["learning_rate"],
-            weight_decay=h["weight_decay"],
-            fused=self.device.type == "cuda",
-        )
-        total = self.trainer.estimated_stepping_batches
-        warmup = h["warmup_steps"]
-
-        def rate(step: int) -> float:
-            rise = min(1.0, (step + 1) / (warmup + 1))
-            done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1)))  # 0 for a run without end
-            return rise * 0.5 * (1 + math.cos(math.pi * done))
-
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        rates = (h["learning_rate"], h["weight_decay"], h["warmup_steps"])
+        return adamw_cosine(self, self.vqvae.parameters(), *rates)
 
     # -- freezing and loading ------------------------------------------------------------------
 

@@ -3,7 +3,9 @@ import torch
 from magnet import weights
 from magnet.denoiser.averaging import WeightEMA
 from magnet.denoiser.module import Denoiser
-from tests.denoiser.test_module import build, data, trainer
+from magnet.testing import random_scene
+from magnet.tokenizer.module import Tokenizer
+from tests.denoiser.test_module import build, data, save, trainer
 
 
 class Watch(WeightEMA):
@@ -45,3 +47,19 @@ def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):
     folder = weights.write(weights.read(tmp_path / "model.ckpt"), tmp_path / "release", half=False)
     loaded, released = Denoiser.load(tmp_path / "model.ckpt"), Denoiser.load(folder)
     assert all(torch.equal(x, released.state_dict()[name]) for name, x in loaded.state_dict().items())
+
+
+def test_a_denoiser_never_runs_with_another_tokenizer_than_its_own(tmp_path):
+    """A file of another tokenizer now lies where the checkpoint's was: the checkpoint's own is brought back."""
+    model = build(tmp_path)
+    run = trainer(1)
+    run.fit(model, datamodule=data())
+    run.save_checkpoint(tmp_path / "model.ckpt")
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(1))
+    expected = model.eval().encode(scene)
+    other = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=True)
+    other.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    save(other, tmp_path / "tokenizer.ckpt")
+    loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True).eval()
+    assert not loaded.tokenizer.hparams["causal"]
+    assert torch.equal(loaded.encode(scene), expected)

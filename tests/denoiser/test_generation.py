@@ -8,6 +8,7 @@ from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.testing import random_scene, tiny_denoiser, without_absent
+from magnet.tokenizer.features import features
 
 FAST = SamplerOptions(steps=3, stride=2)
 
@@ -96,6 +97,23 @@ def test_whoever_is_neither_given_nor_generated_stands_still(model, scene):
     still = whole.T_world_root[:, 16:, 1:]
     assert torch.equal(still, still[:, :1].expand_as(still))
     assert not torch.equal(whole.T_world_root[:, 20, 0], whole.T_world_root[:, 16, 0])
+
+
+def test_holding_the_last_pose_keeps_the_last_known_token_nearer_to_what_it_would_be(generator):
+    """The most important token must not get a code of its own for standing at the edge of what is known."""
+    model = tiny_denoiser(max_agents=2)
+    scene = random_scene(8, 64, 2, generator)
+
+    def embedded(scene: Scene, hold: int) -> torch.Tensor:
+        """Before quantisation, which would hide how near two vectors are."""
+        part = features(scene.people().held(4 * hold))
+        vectors = model.tokenizer._embed(part.pose, part.betas, part.steps, part.valid)[:, :, 0]
+        return vectors[:, hold : vectors.shape[1] - hold]
+
+    away = [(embedded(scene, hold)[:, 7] - embedded(scene.cut(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]
+    assert away[1] < 0.8 * away[0]
+    held = embedded(scene.cut(0, 32), 1).unflatten(0, (8, 2)).transpose(1, 2)
+    assert torch.equal(model.encode(scene.cut(0, 32)), model.tokenizer.requantise(held))
 
 
 def test_generation_reads_nothing_at_all(model, scene, generator):

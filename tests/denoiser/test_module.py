@@ -16,10 +16,15 @@ def tokenizer_file(tmp_path) -> str:
 
     tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
     tokenizer.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    return save(tokenizer, tmp_path / "tokenizer.ckpt")
+
+
+def save(module: L.LightningModule, path) -> str:
+    """A checkpoint as a Trainer writes it."""
     trainer = L.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu")
-    trainer.strategy.connect(tokenizer)
-    trainer.save_checkpoint(tmp_path / "tokenizer.ckpt")
-    return str(tmp_path / "tokenizer.ckpt")
+    trainer.strategy.connect(module)
+    trainer.save_checkpoint(path)
+    return str(path)
 
 
 def data() -> FakeData:

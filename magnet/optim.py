@@ -1,0 +1,36 @@
+"""The optimiser that both networks use (paper A.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import nn
+
+
+def adamw_cosine(
+    module: LightningModule,
+    parameters: Iterable[nn.Parameter],
+    learning_rate: float,
+    weight_decay: float,
+    warmup_steps: int,
+) -> dict[str, Any]:
+    """AdamW whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
+
+    In a run without an end the rate stays where the warm-up has brought it.
+    """
+    optimizer = torch.optim.AdamW(
+        parameters, lr=learning_rate, weight_decay=weight_decay, fused=module.device.type == "cuda"
+    )
+    total = module.trainer.estimated_stepping_batches
+
+    def rate(step: int) -> float:
+        rise = min(1.0, (step + 1) / (warmup_steps + 1))
+        done = min(1.0, max(0.0, (step - warmup_steps) / max(total - warmup_steps, 1)))
+        return rise * 0.5 * (1 + math.cos(math.pi * done))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
