@@ -106,7 +106,7 @@ def complain(message: str, code: int = 2) -> int:
 def no_such(what: str, name: str, known: Sequence[str] | dict[str, str], more: str) -> str:
     """The message for a name that nothing has."""
     close = difflib.get_close_matches(name, list(known), n=1)
-    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}."
     return f"no {what} {name}; {hint} See {more}"
 
 

@@ -7,8 +7,11 @@ import difflib
 import inspect
 import re
 import sys
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
+import yaml
 from lightning.pytorch.cli import LightningArgumentParser
 
 USAGE = (
@@ -80,9 +83,24 @@ class Parser(LightningArgumentParser):
     def _flags(self) -> list[str]:
         flags = [flag for action in self._actions for flag in action.option_strings]
         for key, classes in self.classes.items():
-            for kind in classes.values():
-                flags.extend(f"--{option}" for option in _options(key, kind))
+            chosen = self._chosen(key)
+            for name, kind in classes.items():
+                if chosen in (None, name):
+                    flags.extend(f"--{option}" for option in _options(key, kind))
         return flags
+
+    def _chosen(self, key: str) -> str | None:
+        """The class that the command line or a configuration file names for `model`, `data` or `task`."""
+        chosen = None
+        for flag, value in pairwise([*self.arguments, ""]):
+            name, _, joined = flag.partition("=")
+            value = joined or value
+            if name == f"--{key}":
+                chosen = value
+            elif name == "--config" and Path(value).is_file():
+                part = (yaml.safe_load(Path(value).read_text()) or {}).get(key)
+                chosen = part.get("class_path", chosen) if isinstance(part, dict) else chosen
+        return chosen and chosen.rpartition(".")[2]
 
 
 def _closest(name: str, known: list[str]) -> str:

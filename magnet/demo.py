@@ -36,9 +36,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     model = Denoiser.load(options.ckpt_path)
     size = sum(p.numel() for p in model.transformer.parameters()) / 1e6
     console.print(
-        f"The model that comes with this package ({size:.1f} million weights) sees {CONTEXT} frames of scenes that "
-        f"nobody trained it on, and says how the next {HORIZON / 30:.0f} seconds go for everybody in them. All "
-        "numbers below are computed now."
+        f"{options.ckpt_path or 'The model that comes with this package'} ({size:.1f} million weights) sees "
+        f"{CONTEXT} frames of synthetic scenes that are not among its training scenes, and says how the next "
+        f"{HORIZON / 30:.0f} seconds go for everybody in them. All numbers below are computed now."
     )
     data = Synthetic(
         test_clips=options.scenes, test_limit=options.scenes, train_clips=60, test_batch_size=options.scenes

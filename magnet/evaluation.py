@@ -13,6 +13,7 @@ from torchmetrics import MetricCollection
 
 from magnet.baselines import HoldPose, NearestNeighbour, RandomSample
 from magnet.body import Body
+from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions
 from magnet.metrics import FrechetDistance, all_metrics, frechet_distance, ground_truth_metrics
 from magnet.metrics.frechet import moments
@@ -100,6 +101,7 @@ class Evaluation:
         self.train_features = self._train_features(train, scored)
         self.halves = [FrechetDistance(fps=fps, agents=scored).to(model.device) for _ in range(2)]
         self.half_of: dict[str, int] = {}
+        self.health = Health()
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
         self.scenes = 0
 
@@ -120,8 +122,9 @@ class Evaluation:
 
     def _model(self, model: Denoiser) -> Predictor:
         def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
+            horizon, options = self.horizon, self.options
             whole = model.generate(
-                scene, self.task, self.context, self.horizon, samples, self.options, generator, self.progress
+                scene, self.task, self.context, horizon, samples, options, generator, self.progress, self.health
             )
             if self.nothing_is_given:  # such a scene stands anywhere: put it where the recorded ones are put
                 whole = aligned(whole, self.context - 1)
@@ -202,6 +205,7 @@ class Evaluation:
             "horizon frames": self.horizon,
             "seconds": {name: round(value, 2) for name, value in self.seconds.items()},
             "device": str(model.device),
+            "health": {name: round(value, 4) for name, value in self.health.means().items()},
         }
         self.results = Results(rows=rows, meta=meta)
         return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}

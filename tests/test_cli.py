@@ -96,7 +96,7 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
         (["fti"], "did you mean fit?"),
         (["xyzzy"], "there are fit, validate"),
         (["test", "--task", "joint_futur"], "did you mean joint_future?"),
-        (["test", "--task=nothing_like_it"], "There are: "),
+        (["test", "--task=nothing_like_it"], "There are "),
         (["fit"], "say which model: --model ToyModel"),
         (["fit", "--model", "Nosuch"], "no model Nosuch; there are ToyModel"),
         (["fit", "--model", "ToyModel", "--lr", "1"], "no option --lr; did you mean --model.lr?"),

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.motion.frames import partners
-from magnet.motion.tokens import TokenLayout, by_frame
+from magnet.motion.tokens import TokenLayout, by_frame, relations_by_frame
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     P = layout.agents
     _, steps, relations = layout.unpack(tokens)
     turn, shift = _planar(by_frame(steps))  # (B, T, P, 2) each
-    pair_turn, pair_shift = _planar(_slots_by_frame(relations))  # (B, T, P, P - 1, 2)
+    pair_turn, pair_shift = _planar(relations_by_frame(relations))  # (B, T, P, P - 1, 2)
     partner = partners(P, tokens.device)
     own_turn, own_shift = turn[:, 1:, :, None], shift[:, 1:, :, None]
     other_turn, other_shift = turn[:, 1:, partner], shift[:, 1:, partner]
@@ -59,11 +59,6 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     frames = there[..., 1:].repeat_interleave(steps.shape[-2], dim=1)
     both = frames[:, 1:] & frames[:, :-1]
     return masked_mean(rotation, both), masked_mean(translation, both)
-
-
-def _slots_by_frame(relations: Tensor) -> Tensor:
-    """(B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 9)"""
-    return relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)
 
 
 def _planar(nine: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet import weights
+from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions, generate
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
@@ -225,11 +226,12 @@ class Denoiser(L.LightningModule):
         options: SamplerOptions | None = None,
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
+        health: Health | None = None,
     ) -> Scene:
         """Sample a task: see `magnet.denoiser.generation.generate`."""
         self._require_tokenizer()
         with torch.no_grad():
-            return generate(self, scene, task, context, frames, samples, options, generator, progress)
+            return generate(self, scene, task, context, frames, samples, options, generator, progress, health)
 
     # -- training ------------------------------------------------------------------------------
 

@@ -105,8 +105,14 @@ def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
 
 def transforms(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
     """Steps and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
-    P = T_world_can.shape[2]
-    steps = by_token(to_9d(canonical_steps(T_world_can)))
-    pairs = to_9d(pairwise(T_world_can))  # (B, T, P, P - 1, 9)
-    relations = by_token(pairs.flatten(-2)).unflatten(-1, (P - 1, 9)).transpose(-3, -2)
-    return steps, relations
+    return by_token(to_9d(canonical_steps(T_world_can))), relations_by_token(to_9d(pairwise(T_world_can)))
+
+
+def relations_by_token(pairs: Tensor) -> Tensor:
+    """Group pairwise numbers of frames into tokens. (B, T, P, P - 1, 9) -> (B, N, P, P - 1, 4, 9)"""
+    return by_token(pairs.flatten(-2)).unflatten(-1, pairs.shape[-2:]).transpose(-3, -2)
+
+
+def relations_by_frame(relations: Tensor) -> Tensor:
+    """Inverse of `relations_by_token`. (B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 9)"""
+    return relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)

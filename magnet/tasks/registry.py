@@ -116,8 +116,8 @@ def get(name: str) -> type:
     if name in _failures:
         raise ValueError(f"task {name} failed to load: {_failures[name]!r}") from _failures[name]
     close = difflib.get_close_matches(name, _tasks, n=1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    raise ValueError(f"no task named {name}{hint} There are: {', '.join(sorted(_tasks))}")
+    hint = f"; did you mean {close[0]}?" if close else "."
+    raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(_tasks))}.")
 
 
 def failures() -> dict[str, Exception]:

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from magnet.denoiser.generation import SamplerOptions, scrub, seam_weights, stretches
+from magnet.denoiser.canvas import Health, seam_weights
+from magnet.denoiser.generation import SamplerOptions, scrub, stretches
 from magnet.motion.frames import canonical_frame, pairwise
 from magnet.motion.scene import Scene
 from magnet.sampling.schedule import Grid
@@ -171,9 +172,10 @@ def test_moving_the_world_moves_the_sample(model, scene):
 
 def test_tokens_fed_back_agree_with_the_world(model, scene):
     """After a stage, relations are what the placed agents imply."""
-    from magnet.denoiser.generation import Canvas, known_tokens
+    from magnet.denoiser.canvas import Canvas
+    from magnet.denoiser.generation import known_tokens
     from magnet.motion.frames import from_9d
-    from magnet.motion.tokens import by_frame
+    from magnet.motion.tokens import by_frame, relations_by_frame
     from magnet.sampling.sampler import sample
 
     grid = Grid(12, 3, 4, 3, 8, 2)
@@ -190,12 +192,24 @@ def test_tokens_fed_back_agree_with_the_world(model, scene):
         canvas.settle,
     )
     _, _, relations = model.layout.unpack(model.statistics.restore(tokens))
-    T_self_partner = from_9d(relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2))
+    T_self_partner = from_9d(relations_by_frame(relations))
     assert torch.allclose(T_self_partner, pairwise(canvas.T_world_can), atol=1e-3)
     assert torch.allclose(canvas.T_world_can[:, :16], canonical_frame(scene.T_world_root)[:, :16])
     steps = from_9d(by_frame(model.layout.unpack(model.statistics.restore(tokens))[1]))
     placed = canvas.T_world_can[:, :-1] @ steps[:, 1:]
     assert torch.allclose(placed, canvas.T_world_can[:, 1:], atol=1e-3)
+
+
+def test_health_tells_how_far_latents_are_from_codes_and_relations_from_the_world(model, scene):
+    health = Health()
+    model.generate(scene, JointFuture(), 16, 34, 1, FAST, torch.Generator().manual_seed(0), health=health)
+    assert (health.snaps, health.drifts) == (2 * 9 * 3, 2 * 9 * 3 * 2)
+    assert health.means()["snap"] > 0 and health.means()["drift"] > 0
+    anchored = Health()
+    two = scene.cut(0, 64).order(torch.tensor([0, 1]))
+    options = SamplerOptions(steps=3, stride=2, placement="anchor")
+    model.generate(two, JointFuture(), 16, 34, 1, options, torch.Generator().manual_seed(0), health=anchored)
+    assert anchored.drifts == 2 * 9 * 2
 
 
 def test_pasted_frames_meet_the_generated_ones_without_a_pop(model, scene):

@@ -20,7 +20,7 @@ from magnet.motion.frames import (
     to_planar,
 )
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import by_frame, scene_transforms
+from magnet.motion.tokens import by_frame, relations_by_frame, scene_transforms
 from magnet.testing import random_scene
 
 PLACEMENTS = ["integrate", "anchor", "fuse"]
@@ -28,11 +28,6 @@ PLACEMENTS = ["integrate", "anchor", "fuse"]
 
 def world_move(yaw: float, x: float, z: float) -> torch.Tensor:
     return from_planar(torch.tensor(yaw), torch.tensor([x, z]))
-
-
-def pairs_by_frame(relations: torch.Tensor) -> torch.Tensor:
-    """(B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 4, 4)"""
-    return from_9d(relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2))
 
 
 def test_inverse_is_the_matrix_inverse(scene: Scene):
@@ -84,7 +79,7 @@ def test_a_thousand_frames_come_back_within_a_tenth_of_a_millimetre(placement, g
     scene = random_scene(2, 1000, 3, generator)
     T_world_can = canonical_frame(scene.T_world_root)
     steps, relations = scene_transforms(scene)
-    T_prev_can, T_self_partner = from_9d(by_frame(steps)), pairs_by_frame(relations)
+    T_prev_can, T_self_partner = from_9d(by_frame(steps)), from_9d(relations_by_frame(relations))
     placed = place(T_prev_can[:, 1:], T_self_partner[:, 1:], T_world_can[:, 0], placement)
     assert (placed - T_world_can[:, 1:])[..., :3, 3].norm(dim=-1).max() < 1e-4
 
