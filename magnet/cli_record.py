@@ -178,7 +178,7 @@ class SamplingProgress(ProgressBar):
         elif self.enabled:
             self.lines._step(f"{self.what}: denoising step", self.done, self.total)
 
-    def _end(self, *_: Any) -> None:
+    def _end(self) -> None:
         if self.bar is not None:
             self.bar.stop()
             self.bar = None
@@ -189,7 +189,14 @@ class SamplingProgress(ProgressBar):
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begin("predict", sum(trainer.num_predict_batches), trainer, pl_module)
 
-    on_test_end = on_predict_end = on_exception = _end
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._end()
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._end()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._end()
 
 
 def clock(seconds: float) -> str:

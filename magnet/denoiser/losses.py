@@ -11,9 +11,9 @@ from magnet.motion.tokens import TokenLayout, by_frame, relations_by_frame
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean over the elements that count; 0 where none does. mask broadcasts to values."""
-    mask = mask.to(values.dtype).expand_as(values)
-    return (values * mask).sum() / mask.sum().clamp_min(1.0)
+    """Mean over the elements that count, whatever the others hold; 0 where none does. mask broadcasts to values."""
+    mask = mask.expand_as(values)
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 
 def token_losses(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor) -> dict[str, Tensor]:
