@@ -17,7 +17,7 @@ TRAINER_COMMANDS = {
     "predict": "sample a task, write the scenes and a moving picture of them",
 }
 LIGHT_COMMANDS = {
-    "tasks": "list the tasks that are installed, with their options",
+    "tasks": "list the tasks that are installed, with their options; `tasks show NAME` draws one",
     "demo": "the main job on the embedded default, from nothing to a table and pictures",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS

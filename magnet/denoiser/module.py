@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -170,7 +171,9 @@ class Denoiser(L.LightningModule):
         checkpoint = weights.read(path)
         if "tokenizer_hyper_parameters" not in checkpoint:
             raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
-        model = cls(**{**checkpoint["hyper_parameters"], "tokenizer": None})
+        fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these
+        stored = {name: value for name, value in checkpoint["hyper_parameters"].items() if name in fields}
+        model = cls(**{**stored, "tokenizer": None})
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
         return model.eval()

@@ -100,12 +100,12 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
         checkpoint: as Lightning saved it.
         folder: made if missing; older parts in it are removed.
         about: for config.json: what the model was trained on, and how.
-        half: keep two-dimensional and larger weights in float16; statistics and codebooks stay as they are.
+        half: keep two-dimensional and larger weights in float16; statistics stay as they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.safetensors"):
         old.unlink()
-    exact = ("statistics", "codebook", "mean", "std")
+    exact = ("statistics", "mean", "std")
     state = {
         name: value.half()
         if half and value.is_floating_point() and value.dim() > 1 and not _any(exact, name)

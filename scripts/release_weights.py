@@ -1,0 +1,47 @@
+"""Turn a denoiser's checkpoint into a model that comes with the package.
+
+    python scripts/release_weights.py runs/duet_denoiser/latest/checkpoints/last.ckpt duet
+
+writes magnet/weights/duet: tensors in float16 safetensors, and config.json with how to build the model, what it was
+trained on, and a hash of every part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from magnet import weights
+
+ABOUT = {
+    "trained on": {
+        "CMU motion capture, subjects 60 and 61 (salsa)": "takes 01 02 06 07 08 09 11; takes 05 10 15 held out, 03 validation",
+        "CMU motion capture, single people": "subjects 02 05 17 18 55 90 143, without 02_03 and 05_12",
+        "synthetic scenes": "magnet.datamodules.synthetic, training seeds",
+    },
+    "acknowledgement": (
+        "The data used in this project was obtained from mocap.cs.cmu.edu. "
+        "The database was created with funding from NSF EIA-0196217."
+    ),
+    "licence": "Apache-2.0",
+    "body": "open-1",
+}
+
+
+def main() -> None:
+    """Read, write, say how large it is."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("checkpoint", type=Path)
+    options.add_argument("name")
+    given = options.parse_args()
+    run = given.checkpoint.parents[1] / "run.json"
+    about = ABOUT | ({"run": json.loads(run.read_text())} if run.exists() else {})
+    folder = weights.write(weights.read(given.checkpoint), weights.FOLDER / given.name, about)
+    parts = sorted(folder.glob("*.safetensors"))
+    size = sum(part.stat().st_size for part in parts) / 1e6
+    print(f"{folder}: {len(parts)} parts, {size:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""`magnet tasks` and `magnet tasks show`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+from PIL import Image
+
+from magnet import __version__, cli
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks import registry
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Somebody else's task.
+
+    Args:
+        keep: how many more tokens are given.
+    """
+
+    formula: ClassVar[str] = "P(everything | [a little])"
+    keep: int = 1
+    who: tuple[int, ...] = field(default_factory=lambda: (0, 1))
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        known = grid.past()
+        known[: grid.context + self.keep] = True
+        return MaskSchedule.together(known, ~known, grid)
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
+    registry.discover()
+    entry = registry.Registered("foreign", Foreign, "strange-tasks 3.1")
+    monkeypatch.setitem(registry._tasks, "foreign", entry)
+    monkeypatch.setitem(registry._failures, "broken", ImportError("no module named [nowhere]"))
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert cli.main(["tasks", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert cli.main(["tasks", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_the_list_names_formula_origin_version_and_fields(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys)
+    for entry in registry.entries():
+        assert entry.name in text
+        assert entry.task.formula in text
+    assert f"joint_future  magnet {__version__}" in text
+    assert "foreign  strange-tasks 3.1" in text
+    assert "--task.keep 1  --task.who [0,1]" in text
+    assert "--task.offset 1.0" in text
+
+
+def test_failures_stand_at_the_end_with_their_errors(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys)
+    assert text.index("broken  failed to load") > text.index("partner_prediction")
+    assert "ImportError: no module named [nowhere]" in text
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_show_prints_the_formula_and_how_to_get_a_picture(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    text = printed(capsys, "show", name, "--moments", "5")
+    assert registry.get(name).formula in text
+    assert f"--out {name}.png" in text
+    assert " 9 " in text
+
+
+def test_show_writes_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "new" / "plan.png"
+    text = printed(capsys, "show", "agentic_async", "--out", str(out), "--people", "3", "--task.offset", "0.5")
+    assert text.strip() == str(out)
+    with Image.open(out) as image:
+        assert min(image.size) > 400
+        assert len(image.convert("RGB").getcolors(100_000)) > 20
+
+
+def test_fields_change_the_plan(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    first = printed(capsys, "show", "agentic_async", "--task.order=[1]")
+    assert first != printed(capsys, "show", "agentic_async")
+    assert "o o o o o o 9" in printed(capsys, "show", "foreign", "--task.keep", "2")
+
+
+def test_show_help_explains_sizes_and_fields(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys, "show", "foreign", "--help")
+    assert "how many more tokens are given" in text
+    assert "--people" in text
+    assert "--out" in printed(capsys, "show", "--help")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["shwo"], "magnet tasks show NAME"),
+        (["show"], "there are agentic_async"),
+        (["show", "joint_futur"], "did you mean joint_future?"),
+        (["show", "agentic_async", "--task.ofset", "1"], "no option --task.ofset; did you mean --task.offset?"),
+        (["show", "agentic_async", "--poeple", "3"], "no option --poeple; did you mean --people?"),
+        (["show", "agentic_async", "--task.offset", "half"], "Got value: half"),
+        (["show", "agentic_async", "--task.offset", "2"], "expected 0 to 1"),
+        (["show", "partner_inpainting", "--people", "1"], "name some of the 1 agents"),
+        (["show", "joint_future", "--context", "0"], "give it context frames"),
+        (["show", "joint_future", "--tokens", "0"], "no such grid"),
+        (["show", "joint_future", "--moments", "1"], "4 or more"),
+        (["show", "joint_future", "--out", "plan.svg"], "written as .png"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_would_be_right(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert message in complaint(capsys, *arguments)
+
+
+def test_show_imports_no_lightning() -> None:
+    code = (
+        "import sys; from magnet.cli import main; main(['tasks', 'show', 'joint_future']); "
+        "print('\\n#', *(m for m in ('lightning', 'magnet.denoiser.module', 'matplotlib') if m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "#"

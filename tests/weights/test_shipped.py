@@ -1,0 +1,76 @@
+"""The model that comes with the package."""
+
+import json
+
+import pytest
+import torch
+
+from magnet import weights
+from magnet.datamodules.synthetic import Synthetic
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
+from magnet.motion.scene import Scene
+from magnet.synthesis import coupling_error
+from magnet.tasks.joint import Generation, JointFuture
+
+
+@pytest.fixture(scope="module")
+def model() -> Denoiser:
+    return Denoiser.load()
+
+
+def test_it_is_complete_and_small():
+    folder = weights.resolve()
+    parts = list(folder.glob("*.safetensors"))
+    assert all(part.stat().st_size <= 16_500_000 for part in parts)
+    assert sum(part.stat().st_size for part in parts) < 80e6
+    assert weights.read(folder)["state_dict"]
+
+
+def test_it_says_what_it_was_trained_on_and_names_no_machine():
+    text = (weights.resolve() / "config.json").read_text()
+    config = json.loads(text)
+    assert "mocap.cs.cmu.edu" in config["about"]["acknowledgement"]
+    assert "/work" not in text and "/home" not in text and "/tmp" not in text
+
+
+@pytest.mark.parametrize("people", [1, 2, 3, 4])
+def test_it_generates_groups_of_one_to_four(model, people):
+    scene = Synthetic(people=[max(people, 2)], test_clips=1).clips("test")[0].scene.cut(0, 32)
+    scene = scene.order(torch.arange(people))
+    options = SamplerOptions(steps=4)
+    whole = model.generate(scene, JointFuture(), 32, 32, 1, options, torch.Generator().manual_seed(0))
+    assert whole.present.sum() == people
+    assert_upright(whole, people)
+
+
+def test_it_makes_scenes_from_nothing(model):
+    scene = Synthetic(people=[2], test_clips=1).clips("test")[0].scene
+    options = SamplerOptions(steps=10)
+    whole = model.generate(scene, Generation(), 0, 60, 1, options, torch.Generator().manual_seed(0))
+    assert_upright(whole, 2)
+
+
+def assert_upright(scene: Scene, people: int) -> None:
+    """Heads up, pelvis at a standing height, nobody far away."""
+    height = scene.T_world_root[:, :, :people, 1, 3]
+    assert 0.5 < height.min() and height.max() < 1.3
+    assert (scene.T_world_root[:, :, :people, 1, 1] > 0.5).all()
+
+
+@pytest.mark.slow
+def test_it_has_learnt_the_coupling_of_a_circle_dance(model):
+    """The radius and speed of a circle are told by the context; its continuation must keep to the circle."""
+    data = Synthetic(couplings=["circle"], people=[3], test_clips=4)
+    errors = []
+    for i in range(4):
+        made = data.scene("test", i)
+        context = made.scene.cut(0, 32)
+        options = SamplerOptions(steps=20)
+        whole = model.generate(context, JointFuture(), 32, 90, 1, options, torch.Generator().manual_seed(i))
+        joints = data.body.joints(whole.cut(32))[0][:, :3]
+        still = data.body.joints(context.cut(31).cut(0, 1))[0].expand(90, -1, -1, -1)
+        mine, held = (coupling_error("circle", j, made.truth, start=32 / 30) for j in (joints, still))
+        errors.append((abs(mine["omega"]), abs(held["omega"])))
+    model_error, held_error = (sum(e) / len(errors) for e in zip(*errors, strict=True))
+    assert model_error < 0.5 * held_error
