@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import roma
@@ -10,9 +11,14 @@ from torch import Tensor
 
 from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.sampler import sample
+from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
 
 
 def random_scene(
@@ -72,3 +78,153 @@ def tiny_denoiser(max_agents: int = 3, window: int = 8, seed: int = 0, **options
         model.build(tokenizer)
         model.statistics.fit(*model.tokenize(random_scene(4, 32, max_agents, generator)))
     return model.eval()
+
+
+# -- laws for tasks ----------------------------------------------------------------------------
+
+TASK_GRIDS = (
+    Grid(46, 2, 8, steps=6),
+    Grid(20, 3, 4, steps=5, window=8, stride=3),
+    Grid(16, 4, 8, steps=3),
+    Grid(24, 1, 1, steps=2),
+    Grid(12, 2, 0, steps=3, window=8, stride=2),
+    Grid(9, 3, 0, steps=1),
+)
+"""Long and short scenes of one to four agents, with a past and without."""
+
+
+def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = False) -> list[Grid]:
+    """Check a task against the laws that every task obeys; for the tests of those who write tasks.
+
+    The laws: a task is a frozen dataclass with a docstring and a formula; it plans the same twice; levels never
+    rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
+    clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
+    cannot influence the sample, nor can relations to it; the same seed gives the same sample.
+
+    Args:
+        task: the task with its options.
+        grids: what to plan on; each must be accepted. None: `TASK_GRIDS`, of which a task may refuse with a
+            ValueError those that make no sense to it, but not all.
+        nameless: check too that agents who know the same are treated alike, whichever slots they are in.
+
+    Returns:
+        The grids that were checked.
+
+    Raises:
+        AssertionError: a law is broken; says which, on which grid, and where.
+        ValueError: the task refuses one of the grids it was to be checked on, or all of `TASK_GRIDS`.
+    """
+    _check_record(task)
+    checked, refused = [], []
+    for grid in TASK_GRIDS if grids is None else grids:
+        try:
+            schedule = task.schedule(grid)
+        except ValueError as error:
+            if _raised_by_schedule(error):
+                raise AssertionError(f"{_place(task, grid)}: {error}") from error
+            if grids is not None:
+                raise
+            refused.append(str(error))
+            continue
+        _check_plan(task, grid, schedule, nameless)
+        _check_samples(task, grid, schedule)
+        checked.append(grid)
+    if not checked:
+        raise ValueError(f"{type(task).__name__} refuses every grid: {'; '.join(dict.fromkeys(refused))}")
+    return checked
+
+
+def _place(task: Task, grid: Grid) -> str:
+    return f"{task} on {grid}"
+
+
+def _require(holds: object, message: str) -> None:
+    """An assertion that python -O does not remove."""
+    if not holds:
+        raise AssertionError(message)
+
+
+def _raised_by_schedule(error: BaseException) -> bool:
+    """Whether a plan was built and broke a law, rather than the task having refused the grid."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and trace.tb_frame.f_code is MaskSchedule.__post_init__.__code__
+
+
+def _check_record(task: Task) -> None:
+    name = type(task).__name__
+    record = getattr(type(task), "__dataclass_params__", None)
+    _require(
+        record is not None and record.frozen,
+        f"{name}: not an instance of a @dataclass(frozen=True); its options must not change",
+    )
+    _require((type(task).__doc__ or "").strip(), f"{name}: has no docstring, which is its help on the command line")
+    formula = getattr(task, "formula", None)
+    _require(
+        isinstance(formula, str) and formula.startswith("P("),
+        f"{name}: formula {formula!r} does not say what is sampled; write it like P(A_t:t+L | A_0:t-1)",
+    )
+
+
+def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule, nameless: bool) -> None:
+    place, known = _place(task, grid), schedule.known
+    size = (schedule.tokens, schedule.agents)
+    _require(size == (grid.tokens, grid.agents), f"{place}: planned {size[0]} tokens of {size[1]} agents")
+    _require(known.dtype == torch.bool, f"{place}: known is {known.dtype}, expected bool")
+    rows = torch.stack(list(schedule.rows()))
+    rises = (rows.diff(dim=0) > 0).nonzero().tolist()
+    _require(not rises, f"{place}: (step, token, agent) {rises[:1]} rises in level")
+    _require((rows[:, known] == 0).all(), f"{place}: a known token is not clean throughout")
+    _require((rows[0][~known] == LEVELS).all(), f"{place}: an unknown token does not begin at pure noise")
+    left = ((rows[-1] != 0) & (rows[-1] != LEVELS)).nonzero().tolist()
+    _require(not left, f"{place}: (token, agent) {left[:1]} is left half denoised: end at 0 or stay at {LEVELS}")
+    _require((schedule.finished & ~known).any(), f"{place}: nothing is generated")
+    for number, stage in enumerate(schedule.stages):
+        width = stage.levels.shape[1]
+        _require(width <= grid.window, f"{place}: stage {number} is {width} tokens wide, the window {grid.window}")
+        shape = (grid.agents, width, grid.agents)
+        fits = stage.hidden is None or tuple(stage.hidden.shape) == shape
+        _require(fits, f"{place}: stage {number}: hidden is not of shape {shape}")
+    again = task.schedule(grid)
+    same = torch.equal(again.known, known) and len(again.stages) == len(schedule.stages)
+    same = same and all(_same_stage(a, b) for a, b in zip(again.stages, schedule.stages, strict=True))
+    _require(same, f"{place}: planned twice, the plans differ; a task must not draw random numbers")
+    if nameless:
+        order = torch.arange(grid.agents).roll(1)
+        for number, stage in enumerate(schedule.stages):
+            hidden = None if stage.hidden is None else stage.hidden[order][:, :, order]
+            alike = _same_stage(stage, Stage(stage.start, stage.levels[:, :, order], hidden))
+            _require(alike, f"{place}: stage {number} treats agents differently for the slots they are in")
+
+
+def _same_stage(a: Stage, b: Stage) -> bool:
+    if (a.hidden is None) != (b.hidden is None) or a.start != b.start:
+        return False
+    hidden = a.hidden is None or b.hidden is None or torch.equal(a.hidden, b.hidden)
+    return hidden and torch.equal(a.levels, b.levels)
+
+
+def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
+    place = _place(task, grid)
+    layout = TokenLayout(latent=4, agents=grid.agents)
+    generator = torch.Generator().manual_seed(1)
+    tokens, other = (torch.randn(2, grid.tokens, grid.agents, layout.width, generator=generator) for _ in range(2))
+    given = layout.spread(layout.group_levels(torch.where(schedule.known, 0, LEVELS)) == 0)
+    present = torch.ones(2, grid.agents, dtype=torch.bool)
+
+    def run(tokens: Tensor) -> Tensor:
+        return sample(mixing, schedule, tokens, present, layout, torch.Generator().manual_seed(2))
+
+    plain = run(tokens)
+    _require(torch.equal(plain[:, given], tokens[:, given]), f"{place}: known tokens do not come back bit-identical")
+    _require(torch.equal(plain, run(tokens)), f"{place}: the same seed gives different samples")
+    replaced = run(torch.where(given, tokens, 100 * other))
+    _require(torch.equal(plain, replaced), f"{place}: tokens that are not known influence the sample")
+    _require(plain.isfinite().all(), f"{place}: samples are not finite")
+
+
+def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+    """A toy denoiser in which every token depends on all others and on their levels. -> as noisy"""
+    pooled = (noisy * (1 + levels[..., None] / LEVELS)).mean(dim=(1, 2), keepdim=True)
+    return torch.tanh(noisy.roll(1, dims=1) + noisy.roll(1, dims=2) + pooled)

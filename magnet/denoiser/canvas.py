@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import roma
 import torch
 from torch import Tensor
 
+from magnet.denoiser.seams import arrive, fade_rotation, last_known, next_known, seam_weights, step_between
 from magnet.motion.frames import (
     canonical_frame,
     canonical_steps,
@@ -88,37 +89,62 @@ class Canvas:
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
 
     def settle(self, canvas: Tensor, finished: Tensor) -> Tensor:
-        """Make the tokens that a stage finished self-consistent. canvas (B, N, P, D), finished (N, P) bool"""
+        """Make the tokens that a stage finished self-consistent. canvas (B, N, P, D), finished (N, P) bool
+
+        Of known tokens nothing changes but the step that leads into them, once it is known where from.
+        """
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
             return canvas
         layout, statistics = self.model.layout, self.model.statistics
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        new = finished[first:stop].to(canvas.device)  # (n, P)
         latent, steps, relations = layout.unpack(statistics.restore(canvas[:, first:stop]))
         if self.options.requantise:
+            new = finished[first:stop].to(canvas.device)
             code = self.model.tokenizer.requantise(latent)
             self.health.add_snap(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
-        before = self._ready(first, stop)
-        self._place(steps, relations if layout.slots else None, first, stop, new)
-        self.placed[first:stop] |= finished[first:stop]
-        # One frame more in front, so that the first step leads in from where each agent stood.
-        lead = min(1, first)
-        T_world_can = self.T_world_can[:, first * STRIDE - lead : stop * STRIDE]
-        true_steps = by_token(to_9d(canonical_steps(T_world_can))[:, lead:])
-        if lead:
-            entered = self.placed[first - 1].to(canvas.device)[None, :, None]
-            true_steps[:, 0, :, 0] = torch.where(entered, true_steps[:, 0, :, 0], to_9d(torch.eye(4)).to(canvas))
-        implied = relations_by_token(to_9d(pairwise(T_world_can[:, lead:])))
+        moved = self._place_all(steps, relations if layout.slots else None, finished, first, stop)
+        begin = int(moved.any(dim=1).nonzero()[0, 0])
+        if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
+            earlier = layout.unpack(statistics.restore(canvas[:, begin:first]))[0]
+            latent = torch.cat([earlier, latent], dim=1)
+        true_steps = self._steps(begin, stop)
+        implied = relations_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
         settled = layout.pack(latent, true_steps, implied)
-        changed_groups = (self._ready(first, stop) & ~before).to(canvas.device)
+        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
         if layout.slots:
             together = layout.group_present(self.given.present)[:, None] & changed_groups
-            self.health.add_drift(relations, implied, together[..., 1:])
+            self.health.add_drift(relations, implied[:, first - begin :], together[:, first - begin :, :, 1:])
         changed = layout.spread(changed_groups)
         canvas = canvas.clone()
-        canvas[:, first:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, first:stop])
+        canvas[:, begin:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, begin:stop])
+        return self._enter(canvas, begin, stop)
+
+    def _steps(self, first: int, stop: int) -> Tensor:
+        """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
+        # One frame more in front, so that the first step leads in from where each agent stood.
+        lead = min(1, first)
+        steps = canonical_steps(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
+        steps = by_token(to_9d(steps))
+        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(steps.device)
+        steps[:, :, :, 0] = torch.where(before[..., None], steps[:, :, :, 0], to_9d(torch.eye(4)).to(steps))
+        return steps
+
+    def _enter(self, canvas: Tensor, first: int, stop: int) -> Tensor:
+        """Write the true step into known tokens that a gap has just been closed in front of."""
+        until = min(stop + 1, len(self.known))
+        before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
+        entered = (self.known[first:until] & ~before).to(canvas.device)
+        entered[0] = False  # nothing in front of these rows has moved
+        if not bool(entered.any()):
+            return canvas
+        layout, statistics = self.model.layout, self.model.statistics
+        latent, _, relations = layout.unpack(canvas[:, first:until])
+        true = statistics.normalise(layout.pack(latent, self._steps(first, until), relations))
+        number = torch.arange(layout.width, device=canvas.device)
+        step = (number >= layout.latent) & (number < layout.latent + 9)
+        canvas[:, first:until] = torch.where(entered[..., None] & step, true, canvas[:, first:until])
         return canvas
 
     def _ready(self, first: int, stop: int) -> Tensor:
@@ -129,32 +155,51 @@ class Canvas:
         partner = partners(own.shape[1])
         return torch.cat([own, own & self.placed[first:stop][:, partner]], dim=-1)
 
+    def _touched(self, moved: Tensor) -> Tensor:
+        """Which groups of tokens speak of somebody who moved. moved (n, P) -> (n, P, 1 + slots) bool"""
+        own = moved[..., None]
+        if not self.model.layout.slots:
+            return own
+        return torch.cat([own, own | moved[:, partners(moved.shape[1])]], dim=-1)
+
+    def _place_all(self, steps: Tensor, relations: Tensor | None, finished: Tensor, first: int, stop: int) -> Tensor:
+        """Put the new tokens of a stage into the world, from known token to known token. -> (N, P) bool, who moved"""
+        moved = finished.clone()
+        for start, end in spans(finished, self.placed, first, stop):
+            part = slice(start - first, end - first)
+            new = finished[start]
+            self._place(steps[:, part], None if relations is None else relations[:, part], start, end, new)
+            self.placed[start:end] |= new
+            moved |= self._arrive(end, new)
+        return moved
+
     def _place(self, steps: Tensor, relations: Tensor | None, first: int, stop: int, new: Tensor) -> None:
-        """Put newly generated agents into the world from their predicted steps and relations."""
-        T_prev_can = project_se2(from_9d(by_frame(steps)))
+        """Put newly generated agents into the world from their predicted steps and relations. new (P,) bool"""
+        new = new.to(steps.device)
+        known = self.placed[first].to(steps.device)
+        true_steps = from_9d(by_frame(self._steps(first, stop)))
+        T_prev_can = torch.where(known[:, None, None], true_steps, project_se2(from_9d(by_frame(steps))))
         T_self_partner = None
         if relations is not None:
             T_self_partner = from_9d(relations_by_frame(relations))
-        T_world_start = self._starts(T_prev_can, T_self_partner, first)
-        known = self.placed[first:stop].all(dim=0).to(new.device)
         placed = place(
             T_prev_can,
             T_self_partner,
-            T_world_start,
+            self._starts(T_prev_can, T_self_partner, first),
             self.options.placement,
             self.options.trust,
-            present=self.given.present & (known | new.any(dim=0)),  # of others, nothing is known here
+            present=self.given.present & (known | new),  # of others, nothing is known here
             fixed=known,
         )
         frames = slice(first * STRIDE, stop * STRIDE)
-        keep = new.repeat_interleave(STRIDE, dim=0)[..., None, None]
-        self.T_world_can[:, frames] = torch.where(keep, placed, self.T_world_can[:, frames])
+        self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int) -> Tensor:
         """Canonical frames just before token `first`, such that the first step leads to the right place.
 
-        Whoever was there before goes on from there. A newcomer's first frame hangs off somebody known at
-        that frame by the pairwise transform, or off agent 0, who then starts at the origin.
+        Whoever was there before goes on from there. A newcomer's first frame hangs by the pairwise transform
+        off somebody known at that frame, or off somebody who was there before, or off agent 0, who then starts
+        at the origin.
         """
         P = self.T_world_can.shape[2]
         there = self.placed[first - 1] if first else torch.zeros(P, dtype=torch.bool)
@@ -162,17 +207,51 @@ class Canvas:
         if bool(there.all()):
             return starts
         known_now = self.placed[first].nonzero()[:, 0].tolist()
-        anchor = known_now[0] if known_now else 0
+        anchor = (known_now or there.nonzero()[:, 0].tolist() or [0])[0]
         T_world_anchor = self.T_world_can[:, first * STRIDE, anchor]
         if not known_now:
             T_world_anchor = torch.eye(4, device=starts.device).expand_as(T_world_anchor)
+            if bool(there[anchor]):
+                T_world_anchor = starts[:, anchor] @ T_prev_can[:, 0, anchor]
         for agent in (~there).nonzero()[:, 0].tolist():
             T_world_first = T_world_anchor
-            if agent != anchor and T_self_partner is not None:
+            if agent in known_now:
+                T_world_first = self.T_world_can[:, first * STRIDE, agent]
+            elif agent != anchor and T_self_partner is not None:
                 slot = agent - (agent > anchor)
                 T_world_first = T_world_anchor @ project_se2(T_self_partner[:, 0, anchor, slot])
             starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
         return starts
+
+    def _arrive(self, row: int, new: Tensor) -> Tensor:
+        """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
+
+        Each agent's misfit is spread over its whole gap. Where nothing was known before, the world's origin
+        was arbitrary, and all who are there move along with the first who arrives.
+        """
+        moved = torch.zeros_like(self.placed)
+        arriving = (self.known[row] & new).nonzero()[:, 0].tolist() if row < len(self.known) else []
+        key = row * STRIDE
+        for agent in arriving:
+            T_world_key = self.T_world_can[:, key, agent]
+            key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
+            if not bool(self.known[:row].any()) and agent == arriving[0]:
+                expected = self.T_world_can[:, key - 1, agent] @ step_between(
+                    self.T_world_can[:, :key, agent], key_step
+                )
+                shift = (T_world_key @ inverse(expected))[:, None, None]
+                there = self.placed[:row].repeat_interleave(STRIDE, dim=0).to(shift.device)[..., None, None]
+                now = self.T_world_can[:, :key]
+                self.T_world_can[:, :key] = torch.where(there, project_se2(shift @ now), now)
+                moved[:row] |= self.placed[:row]
+            gap = (self.placed & ~self.known)[:row, agent]
+            outside = (~gap).nonzero()[:, 0]
+            start = int(outside[-1]) + 1 if len(outside) else 0
+            left = int(start > 0 and bool(self.placed[start - 1, agent]))
+            path = self.T_world_can[:, start * STRIDE - left : key, agent]
+            self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
+            moved[start:row, agent] = True
+        return moved
 
     def scene(self, canvas: Tensor) -> Scene:
         """The finished canvas as bodies in the world."""
@@ -193,48 +272,32 @@ class Canvas:
         return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
 
     def _paste(self, decoded: Scene) -> Scene:
-        """Put given frames back; what they differ by at the seam fades out over the frames behind it."""
+        """Put given frames back; what they differ by at a seam fades out over the frames on its other side."""
         keep = self.known.repeat_interleave(STRIDE, dim=0).to(decoded.device)  # (T, P)
-        fade = seam_weights(keep, self.options.blend)  # (T, P)
-        last = last_known(keep)  # (T, P) frame of the seam in front
         body_rot, T_world_root = decoded.body_rot, decoded.T_world_root
-        T_can_root = inverse(self.T_world_can) @ T_world_root
+        decoded_can_root = inverse(self.T_world_can) @ T_world_root
         given_can_root = inverse(canonical_frame(self.given.T_world_root)) @ self.given.T_world_root
+        tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
         agents = torch.arange(keep.shape[1], device=keep.device)
-        given_at, decoded_at = self.given.body_rot[:, last, agents], body_rot[:, last, agents]
-        body_rot = fade_rotation(body_rot, given_at, decoded_at, fade[..., None])
-        tilt = fade_rotation(
-            T_can_root[..., :3, :3],
-            given_can_root[:, last, agents, :3, :3],
-            T_can_root[:, last, agents, :3, :3],
-            fade,
-        )
-        lift = (given_can_root - T_can_root)[:, last, agents, :3, 3]
-        T_can_root = rigid(tilt, T_can_root[..., :3, 3] + fade[..., None] * lift)
+        behind = (last_known(keep), seam_weights(keep, self.options.blend))
+        ahead = (next_known(keep), seam_weights(keep.flip(0), self.options.blend).flip(0))
+        for seam, fade in (behind, ahead):  # (T, P) each
+            given_at, decoded_at = given_can_root[:, seam, agents], decoded_can_root[:, seam, agents]
+            body_given, body_decoded = self.given.body_rot[:, seam, agents], decoded.body_rot[:, seam, agents]
+            body_rot = fade_rotation(body_rot, body_given, body_decoded, fade[..., None])
+            tilt = fade_rotation(tilt, given_at[..., :3, :3], decoded_at[..., :3, :3], fade)
+            lift = lift + fade[..., None] * (given_at - decoded_at)[..., :3, 3]
         there = decoded.present[:, None, :, None, None]
-        blended = torch.where(there, self.T_world_can @ T_can_root, T_world_root)
+        blended = torch.where(there, self.T_world_can @ rigid(tilt, lift), T_world_root)
         return decoded.replace(
             body_rot=torch.where(keep[..., None, None, None], self.given.body_rot, body_rot),
             T_world_root=torch.where(keep[..., None, None], self.given.T_world_root, blended),
         )
 
 
-def last_known(keep: Tensor) -> Tensor:
-    """For every frame the latest known frame at or before it; 0 where there is none. (T, P) bool -> (T, P) int"""
-    frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
-    return torch.where(keep, frame, 0).cummax(dim=0).values
-
-
-def seam_weights(keep: Tensor, blend: int) -> Tensor:
-    """How much of the seam's difference is still added: 1 at the last known frame, 0 `blend` frames on. -> (T, P)"""
-    frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
-    since = (frame - last_known(keep)).float() / max(blend, 1)
-    after = keep.int().cummax(dim=0).values.bool()
-    ramp = (1 - since).clamp(0, 1)
-    return torch.where(after, ramp * ramp * (3 - 2 * ramp), 0.0)
-
-
-def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tensor) -> Tensor:
-    """Add the turn that leads from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
-    difference = roma.rotmat_to_rotvec(given @ decoded.transpose(-1, -2))
-    return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation
+def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:
+    """Runs of token steps in which the same agents are new and the same are placed. finished, placed (N, P) bool"""
+    pattern = torch.cat([finished, placed], dim=1)[first:stop]
+    change = (pattern[1:] != pattern[:-1]).any(dim=1).nonzero()[:, 0] + first + 1
+    edges = [first, *change.tolist(), stop]
+    return [(start, end) for start, end in itertools.pairwise(edges) if bool(finished[start].any())]

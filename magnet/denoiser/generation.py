@@ -31,17 +31,18 @@ class SamplerOptions:
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
         placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        trust: weight of a pairwise transform against a step in `fuse`.
+        trust: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
+            (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
         requantise: snap generated latents to the nearest code before decoding, as the reference does.
-        paste: put the given frames back in place of their lossy reconstruction, with the seam blended.
-        blend: frames over which the seam fades out behind given frames.
+        paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
+        blend: frames over which a seam fades out behind given frames, and in before them.
         guidance: motion history guidance (paper A.7), off by default.
     """
 
     steps: int = 30
     stride: int = 4
     placement: Placement = "fuse"
-    trust: float = 0.1
+    trust: float = 0.003
     requantise: bool = True
     paste: bool = True
     blend: int = 10

@@ -161,7 +161,7 @@ def place(
     T_self_partner: Tensor | None,
     T_world_start: Tensor,
     placement: Placement = "integrate",
-    trust: float = 0.1,
+    trust: float = 0.003,
     present: Tensor | None = None,
     fixed: Tensor | None = None,
 ) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass
 from importlib.metadata import entry_points
@@ -12,7 +13,7 @@ from typing import TypeVar
 
 GROUP = "magnet.tasks"
 VARIABLE = "MAGNET_TASKS"
-BUILT_IN = ("magnet.tasks.joint", "magnet.tasks.partner", "magnet.tasks.agentic")
+BUILT_IN = ("magnet.tasks.joint", "magnet.tasks.partner", "magnet.tasks.agentic", "magnet.tasks.inbetweening")
 
 T = TypeVar("T", bound=type)
 
@@ -73,21 +74,38 @@ def discover(again: bool = False) -> None:
 
 
 def _load_variable(value: str) -> None:
-    def load() -> type:
-        module, _, name = value.partition(":")
-        return getattr(importlib.import_module(module), name or "Task")
+    """`package.module:Class`, or `package.module`, whose tasks have registered themselves."""
+    module, _, name = value.partition(":")
+    origin = f"{VARIABLE}={value}"
+    if name:
+        _load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)
+        return
+    before = set(_tasks)
+    try:
+        importlib.import_module(module)
+        own = [entry.name for entry in _tasks.values() if entry.task.__module__.startswith(module)]
+        if not own:
+            raise ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
+    except Exception as error:  # a stranger's import may raise anything
+        _failures[module] = error
+        return
+    for name in {*own, *(set(_tasks) - before)}:
+        _tasks[name] = Registered(name, _tasks[name].task, origin)
 
-    name = value.partition(":")[2] or value
-    snake = "".join("_" + c.lower() if c.isupper() and i else c.lower() for i, c in enumerate(name))
-    _load(snake, load, f"{VARIABLE}={value}")
+
+def snake_case(name: str) -> str:
+    """A class's name as a task's: PushHands -> push_hands, VRPartner -> vr_partner."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
 def _load(name: str, load: Callable[[], type], origin: str) -> None:
     try:
         task = load()
-        if any(entry.task is task for entry in _tasks.values()):
-            return  # it has registered itself with the decorator
-        _add(name, task, origin)
+        own = [entry.name for entry in _tasks.values() if entry.task is task]
+        for known in own:  # it has registered itself with the decorator, which does not know where from
+            _tasks[known] = Registered(known, task, origin)
+        if not own:
+            _add(name, task, origin)
     except Exception as error:  # a stranger's import may raise anything
         _failures[name] = error
 

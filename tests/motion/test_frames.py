@@ -168,7 +168,7 @@ def test_fuse_bounds_the_drift_between_agents(generator):
     noisy = from_planar(yaw, ground + 0.01 * torch.randn(ground.shape, generator=generator))
     apart = {}
     for placement in PLACEMENTS:
-        placed = place(noisy[:, 1:], pairwise(T_world_can)[:, 1:], T_world_can[:, 0], placement)
+        placed = place(noisy[:, 1:], pairwise(T_world_can)[:, 1:], T_world_can[:, 0], placement, trust=0.1)
         off = pairwise(placed)[..., :3, 3] - pairwise(T_world_can[:, 1:])[..., :3, 3]
         apart[placement] = off.norm(dim=-1).mean().item()
     assert apart["anchor"] < 1e-4

@@ -75,3 +75,27 @@ def test_a_taken_name_is_refused(clean_registry):
 def test_what_is_no_task_is_refused(clean_registry):
     with pytest.raises(TypeError, match="is not a dataclass"):
         registry.register_task("no")(type("No", (), {"schedule": 1, "formula": ""}))
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [("Duel", "duel"), ("PushHands", "push_hands"), ("VRPartner", "vr_partner"), ("Follow2Leaders", "follow2_leaders")],
+)
+def test_a_class_name_becomes_a_task_name(name, task):
+    assert registry.snake_case(name) == task
+
+
+def test_a_variable_may_name_a_module_whose_tasks_register_themselves(clean_registry, monkeypatch, tmp_path):
+    (tmp_path / "stray_tasks.py").write_text(
+        "from magnet.tasks import register_task\n"
+        "from magnet.tasks.joint import JointFuture\n"
+        "@register_task('stray')\n"
+        "class Stray(JointFuture):\n"
+        "    '''A stray task.'''\n"
+    )
+    (tmp_path / "no_tasks.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(registry.VARIABLE, "stray_tasks,no_tasks")
+    registry.discover(again=True)
+    assert {entry.name: entry.origin for entry in registry.entries()}["stray"] == "MAGNET_TASKS=stray_tasks"
+    assert "registers no task" in str(registry.failures()["no_tasks"])

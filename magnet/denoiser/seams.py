@@ -1,0 +1,79 @@
+"""Where given frames meet generated ones: paths that arrive, and poses that fade into each other."""
+
+from __future__ import annotations
+
+import roma
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import from_planar, inverse, to_planar, turn
+
+
+def smoothstep(ramp: Tensor) -> Tensor:
+    """0 to 1 with no speed at either end. ramp in 0..1"""
+    return ramp * ramp * (3 - 2 * ramp)
+
+
+def step_between(T_world_can: Tensor, key_step: Tensor) -> Tensor:
+    """The step into a known frame, which nothing tells: midway between the last step before and the first after.
+
+    T_world_can (B, F, 4, 4) up to the frame before, key_step (B, 4, 4) -> (B, 4, 4)
+    """
+    yaw, ground = to_planar(inverse(T_world_can[:, -2]) @ T_world_can[:, -1])
+    key_yaw, key_ground = to_planar(key_step)
+    return from_planar((yaw + key_yaw) / 2, (ground + key_ground) / 2)
+
+
+def arrive(T_world_can: Tensor, T_world_key: Tensor, key_step: Tensor) -> Tensor:
+    """Bend a path so that it leads to a known frame: first the turns, then, with steps as long as before, the way.
+
+    Args:
+        T_world_can: (B, F, 4, 4) canonical frames up to the one before the known one; the first stays.
+        T_world_key: (B, 4, 4) the known frame.
+        key_step: (B, 4, 4) the step from there.
+
+    Returns:
+        (B, F, 4, 4). What is added grows as a smoothstep, so that it adds no speed at either end.
+    """
+    path, T_world_key = T_world_can.double(), T_world_key.double()
+    yaw, ground = to_planar(path)
+    _, step = to_planar(inverse(path[:, :-1]) @ path[:, 1:])
+    last_yaw, last_step = to_planar(step_between(path, key_step.double()))
+    key_yaw, key_ground = to_planar(T_world_key)
+    frames = path.shape[1]
+    ramp = smoothstep(torch.arange(frames, device=path.device, dtype=path.dtype) / frames)
+    off = key_yaw - yaw[:, -1] - last_yaw
+    yaw = yaw + ramp * torch.atan2(off.sin(), off.cos())[:, None]
+    ground = torch.cat([ground[:, :1], ground[:, :1] + turn(yaw[:, :-1], step).cumsum(dim=1)], dim=1)
+    away = key_ground - ground[:, -1] - turn(yaw[:, -1], last_step)
+    return from_planar(yaw, ground + ramp[:, None] * away[:, None]).to(T_world_can)
+
+
+def last_known(keep: Tensor) -> Tensor:
+    """For every frame the latest known frame at or before it; 0 where there is none. (T, P) bool -> (T, P) int"""
+    frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
+    return torch.where(keep, frame, 0).cummax(dim=0).values
+
+
+def next_known(keep: Tensor) -> Tensor:
+    """For every frame the first known frame at or after it; T - 1 where there is none. (T, P) bool -> (T, P) int"""
+    return keep.shape[0] - 1 - last_known(keep.flip(0)).flip(0)
+
+
+def seam_weights(keep: Tensor, blend: int) -> Tensor:
+    """How much of a seam's difference is still added behind it: 1 at the last known frame, 0 `blend` frames on.
+
+    In a gap shorter than that, 0 at the next known frame. (T, P) bool -> (T, P)
+    """
+    frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
+    after = keep.int().cummax(dim=0).values.bool()
+    closed = keep.flip(0).int().cummax(dim=0).values.bool().flip(0)
+    gap = torch.where(closed, next_known(keep) - last_known(keep), blend)
+    since = (frame - last_known(keep)).float() / gap.clamp(1, max(blend, 1))
+    return torch.where(after, smoothstep((1 - since).clamp(0, 1)), 0.0)
+
+
+def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tensor) -> Tensor:
+    """Add the turn that leads from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
+    difference = roma.rotmat_to_rotvec(given @ decoded.transpose(-1, -2))
+    return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation

@@ -1,0 +1,117 @@
+"""Motion between keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from magnet.sampling.noise import ddim_levels
+from magnet.sampling.schedule import Grid, MaskSchedule, Stage, initial_levels
+from magnet.tasks.registry import register_task
+
+
+@register_task("inbetweening")
+@dataclass(frozen=True)
+class Inbetweening:
+    """The motion between keyframes, from the past and all keyframes within sight (paper A.9).
+
+    A keyframe is a token: 4 frames. Without `keys` and `pairs` there is one every `every` token steps, and the
+    last token step is one.
+
+    Args:
+        every: token steps from one keyframe to the next; 8 are about a second.
+        keys: token steps that are keyframes; negative ones count from the end.
+        agents: slots that have keyframes; none named: everybody. The others are generated throughout.
+        pairs: single keyframes as (slot, token step), beside those of `keys`.
+    """
+
+    formula: ClassVar[str] = "P(A_G, B_G, ... | A_T, B_T, ...), T the keyframes, G all other frames"
+    every: int = 8
+    keys: tuple[int, ...] = ()
+    agents: tuple[int, ...] = ()
+    pairs: tuple[tuple[int, int], ...] = ()
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        known = grid.past()
+        for agent, step in self._keyframes(grid):
+            known[step, agent] = True
+        return toward_keys(known, grid)
+
+    def _keyframes(self, grid: Grid) -> Iterator[tuple[int, int]]:
+        """All keyframes as (agent, token step).
+
+        Raises:
+            ValueError: no such agent or token step, or nothing is left to generate.
+        """
+        if self.every < 1:
+            raise ValueError(f"every: got {self.every}, expected at least 1 token step")
+        steps = self.keys
+        if not self.keys and not self.pairs:
+            steps = (*range(max(grid.context - 1, 0), grid.tokens, self.every), grid.tokens - 1)
+        wanted = {(agent, step) for agent in self.agents or range(grid.agents) for step in steps} | set(self.pairs)
+        for agent, step in sorted(wanted):
+            if not 0 <= agent < grid.agents:
+                raise ValueError(f"keyframe of agent {agent}: the grid has agents 0 to {grid.agents - 1}")
+            if not -grid.tokens <= step < grid.tokens:
+                raise ValueError(f"keyframe at token step {step}: the grid has steps 0 to {grid.tokens - 1}")
+            yield agent, step % grid.tokens
+
+
+def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
+    """Generate all that is not known, window by window, each token in sight of the next keyframe where it can be.
+
+    known (N, P) bool. `MaskSchedule.together` would have the last of each window's tokens see nothing ahead.
+
+    Raises:
+        ValueError: everything is known.
+    """
+    if bool(known.all()):
+        raise ValueError("every token is a keyframe: there is nothing to generate between them")
+    stages, level, plan = [], initial_levels(known), ddim_levels(grid.steps)
+    for start, first, last in key_positions(known, grid):
+        stop = min(start + grid.window, grid.tokens)
+        active = ~known[start:stop]
+        active[: first - start] = False
+        active[last - start :] = False
+        rows = torch.where(active, plan[:, None, None], level[start:stop])
+        stages.append(Stage(start, rows))
+        level[start:stop] = rows[-1]
+    return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+
+
+def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
+    """Where the window stands: (start, first token step to generate, one past the last), until all is done.
+
+    A gap shorter than the window is generated at once, with the keyframe behind it in view. Of a longer one
+    the beginning is generated as any future is, and the rest once its end comes into view.
+    """
+    N, W = len(known), grid.window
+    coming = next_keys(known)
+    done = 0
+    while not bool(known[done:].all()):
+        first = done + int((~known[done:]).any(dim=1).int().argmax())
+        sight = W - min(first, grid.stride, W // 2)  # token steps ahead, so that some past stays in view
+        ahead = coming[first][~known[first]]
+        reached = ahead[(ahead < N) & (ahead - first < sight)]
+        stop = int(reached.max()) + 1 if len(reached) else first + min(grid.stride, sight)
+        start = max(0, min(stop - W, N - W))
+        stop = min(start + W, N)
+        # Whoever will see the next keyframe from a later window waits, and the others with them.
+        step = torch.arange(first, stop)[:, None]
+        waits = ~known[first:stop] & (coming[first:stop] >= stop) & (coming[first:stop] < N)
+        waits &= coming[first:stop] - step < W - min(grid.stride, W // 2)
+        waiting = waits.any(dim=1)
+        waiting[0] = False
+        done = first + int(waiting.int().argmax()) if bool(waiting.any()) else stop
+        yield start, first, done
+
+
+def next_keys(known: Tensor) -> Tensor:
+    """Each agent's first known token step from every step on; N where there is none. (N, P) bool -> (N, P) int"""
+    N = len(known)
+    step = torch.arange(N)[:, None]
+    return torch.where(known, step, N).flip(0).cummin(dim=0).values.flip(0)

@@ -1,0 +1,225 @@
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.denoiser.canvas import Canvas
+from magnet.denoiser.generation import SamplerOptions, known_tokens, scrub
+from magnet.denoiser.seams import arrive, next_known, seam_weights
+from magnet.motion.frames import canonical_frame, from_9d, from_planar, inverse, pairwise, to_planar
+from magnet.motion.tokens import by_frame, relations_by_frame
+from magnet.sampling.sampler import sample
+from magnet.sampling.schedule import Grid
+from magnet.tasks.inbetweening import Inbetweening
+from magnet.tasks.partner import PartnerInpainting
+from magnet.testing import random_scene, tiny_denoiser
+
+FAST = {placement: SamplerOptions(steps=3, stride=2, placement=placement) for placement in ("integrate", "fuse")}
+
+
+@pytest.fixture(params=FAST)
+def options(request) -> SamplerOptions:
+    return FAST[request.param]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_denoiser(max_agents=4, window=8)
+
+
+def settled(model, scene, task, options, tokens: int, context: int = 2):
+    """The finished canvas of a task, its tokens, and the tokens it was given."""
+    schedule = task.schedule(Grid(tokens, 4, context, 3, 8, 2))
+    given = scrub(scene.pad_agents(4), schedule.known)
+    canvas = Canvas(model, given, schedule, options, 1)
+    start = known_tokens(model, given, schedule.known)
+    generator = torch.Generator().manual_seed(0)
+    out = sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.settle)
+    return canvas, out, start, schedule.known
+
+
+# -- the plan ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "keys"),
+    [
+        (Inbetweening(every=4), {0: {5, 9, 13, 15}, 1: {5, 9, 13, 15}}),
+        (Inbetweening(keys=(7, -1)), {0: {7, 15}, 1: {7, 15}}),
+        (Inbetweening(keys=(7,), agents=(1,)), {0: set(), 1: {7}}),
+        (Inbetweening(pairs=((0, 4), (1, 9))), {0: {4}, 1: {9}}),
+        (Inbetweening(keys=(7,), agents=(0,), pairs=((1, 9),)), {0: {7}, 1: {9}}),
+    ],
+)
+def test_keyframes_are_where_they_were_asked_for(task, keys):
+    schedule = task.schedule(Grid(16, 2, 2, 3))
+    for agent, steps in keys.items():
+        assert set(schedule.known[:, agent].nonzero()[:, 0].tolist()) == {0, 1} | steps
+    assert schedule.finished.all()
+
+
+@pytest.mark.parametrize("window", [4, 8, 16])
+@pytest.mark.parametrize("task", [Inbetweening(every=6), Inbetweening(keys=(20, -1)), Inbetweening(pairs=((0, 19),))])
+def test_whatever_can_be_is_generated_in_sight_of_the_next_keyframe(task, window):
+    stride = 2
+    schedule = task.schedule(Grid(32, 2, 4, 3, window, stride))
+    assert schedule.finished.all()
+    for stage in schedule.stages:
+        for token, agent in ((stage.levels[0] > 0) & (stage.levels[-1] == 0)).nonzero().tolist():
+            step = stage.start + token
+            coming = schedule.known[step:, agent].nonzero()
+            if len(coming) and int(coming[0]) < window - stride:
+                assert step + int(coming[0]) < stage.stop
+        first = int(((stage.levels[0] > 0) & (stage.levels[-1] == 0)).any(dim=1).int().argmax())
+        assert first >= min(stride, window // 2)  # some past is in view
+
+
+def test_bad_keyframes_are_named():
+    grid = Grid(16, 2, 2)
+    for task, message in [
+        (Inbetweening(keys=(16,)), "token step 16: the grid has steps 0 to 15"),
+        (Inbetweening(keys=(3,), agents=(2,)), "agent 2: the grid has agents 0 to 1"),
+        (Inbetweening(every=0), "at least 1"),
+        (Inbetweening(every=1), "nothing to generate"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            task.schedule(grid)
+
+
+# -- the world ---------------------------------------------------------------------------------
+
+TASKS = {
+    "regular": Inbetweening(every=5),
+    "at the very end": Inbetweening(keys=(-1,)),
+    "adjacent": Inbetweening(keys=(5, 6, 7)),
+    "one agent's": Inbetweening(keys=(4, 9), agents=(0,)),
+}
+
+
+@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, options, generator, people, task):
+    scene = random_scene(2, 48, people, generator)
+    whole = model.generate(scene, task, 8, 40, 1, options, torch.Generator().manual_seed(0))
+    known = task.schedule(Grid(12, 4, 2, 3, 8, 2)).known[:, :people].repeat_interleave(4, dim=0)
+    there = whole.order(torch.arange(people))
+    assert torch.equal(there.T_world_root[known.expand(2, -1, -1)], scene.T_world_root[known.expand(2, -1, -1)])
+    assert torch.equal(there.body_rot[known.expand(2, -1, -1)], scene.body_rot[known.expand(2, -1, -1)])
+    assert there.T_world_root.isfinite().all()
+    root = (there.T_world_root[:, 1:] - there.T_world_root[:, :-1]).flatten(-2).norm(dim=-1)
+    body = (there.body_rot[:, 1:] - there.body_rot[:, :-1]).flatten(-3).norm(dim=-1)
+    seam = known[1:] != known[:-1]
+    inside = ~known[1:] & ~known[:-1]
+    for change in (root, body):
+        for agent in range(people):
+            assert change[:, seam[:, agent], agent].max() < 1.2 * change[:, inside[:, agent], agent].max()
+
+
+@pytest.mark.parametrize("task", [*TASKS.values(), Inbetweening(keys=(-1,), agents=(1,))], ids=[*TASKS, "other's"])
+@pytest.mark.parametrize("tokens", [12, 26])
+def test_tokens_agree_with_the_world_everywhere(model, options, generator, task, tokens):
+    """Gaps shorter and longer than the window of 8; steps into keyframes too."""
+    scene = random_scene(2, tokens * 4, 3, generator)
+    canvas, out, _, _ = settled(model, scene, task, options, tokens)
+    _, steps, relations = model.layout.unpack(model.statistics.restore(out))
+    T_world_can = canvas.T_world_can
+    assert canvas.placed[:, :3].all()
+    assert torch.allclose(T_world_can[:, :-1] @ from_9d(by_frame(steps))[:, 1:], T_world_can[:, 1:], atol=2e-3)
+    assert torch.allclose(from_9d(relations_by_frame(relations)), pairwise(T_world_can), atol=2e-3)
+
+
+def test_of_known_tokens_only_the_step_into_them_changes(model, options, scene):
+    _, out, start, known = settled(model, scene, Inbetweening(keys=(6, 7)), options, 12)
+    own = model.layout.latent + 36
+    first = torch.zeros(own, dtype=torch.bool)
+    first[model.layout.latent : model.layout.latent + 9] = True
+    assert torch.equal(out[:, known][..., :own][..., ~first], start[:, known][..., :own][..., ~first])
+    changed = (out[..., :own][..., first] != start[..., :own][..., first]).any(dim=-1).any(dim=0)
+    entered = torch.zeros_like(known)
+    entered[6] = True
+    assert torch.equal(changed & known, entered)
+
+
+def test_keyframes_without_a_past_place_the_scene(model, options, generator):
+    """Nothing is known before: whoever arrives first takes the others along, and distances stay as generated."""
+    scene = random_scene(2, 48, 2, generator)
+    task = Inbetweening(keys=(6,), agents=(0,))
+    whole = model.generate(scene, task, 0, 48, 1, options, torch.Generator().manual_seed(0))
+    whole = whole.order(torch.arange(2))
+    assert torch.equal(whole.T_world_root[:, 24:28, 0], scene.T_world_root[:, 24:28, 0])
+    step = (whole.T_world_root[:, 1:, :, :3, 3] - whole.T_world_root[:, :-1, :, :3, 3]).norm(dim=-1)
+    assert step[:, 23].max() < 0.5 and step.isfinite().all()
+
+
+def test_moving_the_world_moves_what_is_between(model, options, scene):
+    T = from_planar(torch.tensor(0.9), torch.tensor([4.0, -2.0]))
+    a, b = (
+        model.generate(s, Inbetweening(every=5), 8, 40, 1, options, torch.Generator().manual_seed(0))
+        for s in (scene, scene.moved(T))
+    )
+    assert torch.allclose(a.moved(T).T_world_root[:, :, :3], b.T_world_root[:, :, :3], atol=2e-3)
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene, task):
+    """Placement alone: what is left is the guess of the one step into each keyframe, spread over its gap."""
+    scene = scene.cut(0, 48).pad_agents(4)
+    schedule = task.schedule(Grid(12, 4, 2, 3, 8, 2))
+    given = scrub(scene, schedule.known)
+    canvas = Canvas(model, given, schedule, options, 1)
+    truth = known_tokens(model, scene, torch.ones_like(schedule.known))
+    position = iter([stage for stage in schedule.stages for _ in range(len(stage.levels) - 1)])
+
+    def oracle(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        stage = next(position)
+        return truth[:, stage.start : stage.stop]
+
+    start = known_tokens(model, given, schedule.known)
+    out = sample(oracle, schedule, start, scene.present, model.layout, settle=canvas.settle)
+    true = canonical_frame(scene.T_world_root)
+    yaw, ground = to_planar(inverse(true) @ canvas.T_world_can)
+    assert yaw[:, :, :3].abs().max() < 0.02 and ground[:, :, :3].abs().max() < 0.02
+    steps, true_steps = (model.layout.unpack(model.statistics.restore(x))[1] for x in (out, truth))
+    assert torch.allclose(steps[:, 1:, :3], true_steps[:, 1:, :3], atol=0.02)
+
+
+def test_given_partners_beside_keyframes_are_not_moved(model, options, scene):
+    whole = model.generate(scene, PartnerInpainting((1,)), 8, 40, 1, options, torch.Generator().manual_seed(0))
+    assert torch.equal(whole.T_world_root[:, :, [0, 2]], scene.T_world_root[:, :48, [0, 2]])
+
+
+# -- the parts ---------------------------------------------------------------------------------
+
+
+def path(generator: torch.Generator, frames: int = 40) -> Tensor:
+    return canonical_frame(random_scene(3, frames, 1, generator).T_world_root)[:, :, 0]
+
+
+def test_a_path_that_arrives_is_hardly_bent(generator):
+    """Real paths meet their own continuation; the guess of one step is all that is spread."""
+    whole = path(generator)
+    bent = arrive(whole[:, :30], whole[:, 30], inverse(whole[:, 30]) @ whole[:, 31])
+    assert torch.allclose(bent, whole[:, :30], atol=1e-2)
+
+
+def test_a_path_that_misses_is_bent_and_adds_no_speed_at_its_ends(generator):
+    whole = path(generator)
+    off = from_planar(torch.tensor(0.6), torch.tensor([0.5, -0.8]))
+    key = whole[:, 30] @ off
+    step = inverse(whole[:, 30]) @ whole[:, 31]
+    bent = torch.cat([arrive(whole[:, :30], key, step), key[:, None]], dim=1)
+    assert torch.allclose(bent[:, 0], whole[:, 0])
+    yaw_steps = (
+        to_planar(inverse(bent[:, :-1]) @ bent[:, 1:])[0] - to_planar(inverse(whole[:, :30]) @ whole[:, 1:31])[0]
+    )
+    assert yaw_steps[:, [0, -1]].abs().max() < 0.2 * yaw_steps.abs().max()
+    way = to_planar(inverse(bent[:, :-1]) @ bent[:, 1:])[1].norm(dim=-1)
+    assert (way[:, -1] < 1.05 * way.max(dim=1).values).all()
+
+
+def test_seams_fade_on_both_sides_and_share_a_short_gap():
+    keep = torch.tensor([1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 1], dtype=torch.bool)[:, None]
+    behind, ahead = seam_weights(keep, 4)[:, 0], seam_weights(keep.flip(0), 4).flip(0)[:, 0]
+    assert torch.allclose(behind[1:4] + ahead[1:4], torch.ones(3))
+    assert (behind[1:4].diff() < 0).all() and (ahead[1:4].diff() > 0).all()
+    assert behind[9] == 0 and ahead[8] == 0 and ahead[11] > ahead[10] > 0
+    assert next_known(keep)[:, 0].tolist() == [0, 4, 4, 4, 4, 5, *[12] * 7]
