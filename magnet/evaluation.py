@@ -127,14 +127,16 @@ class Evaluation:
                 scene, self.task, self.context, horizon, samples, options, generator, self.progress, self.health
             )
             if self.nothing_is_given:  # such a scene stands anywhere: put it where the recorded ones are put
-                whole = aligned(whole, self.context - 1)
+                with torch.autocast(scene.device.type, enabled=False):
+                    whole = aligned(whole, self.context - 1)
             return whole.cut(self.context)
 
         return predict
 
     def _baseline(self, method: Callable[..., Scene]) -> Predictor:
         def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
-            return method(scene.cut(0, self.context), self.horizon, samples, generator)
+            with torch.autocast(scene.device.type, enabled=False):
+                return method(scene.cut(0, self.context), self.horizon, samples, generator)
 
         return predict
 
@@ -157,13 +159,19 @@ class Evaluation:
         Methods see scenes as they were recorded; only what they answer is moved into the world that all test
         scenes share, so that nothing of an unknown agent can come in through the choice of that world.
         """
-        T_shared_world = shared_world(batch, self.context - 1)
-        future = self.body.joints(batch.cut(self.context).moved(T_shared_world))
+        answers = {}
         for name, method in self.methods.items():
             generator = self._generator(model, batch_idx)
             began = time.perf_counter()
-            predicted = method(batch, self.samples, generator)
+            answers[name] = method(batch, self.samples, generator)
             self.seconds[name] += time.perf_counter() - began
+        with torch.autocast(batch.device.type, enabled=False):  # half precision is for the network alone
+            self._measure(batch, answers)
+
+    def _measure(self, batch: Scene, answers: dict[str, Scene]) -> None:
+        T_shared_world = shared_world(batch, self.context - 1)
+        future = self.body.joints(batch.cut(self.context).moved(T_shared_world))
+        for name, predicted in answers.items():
             if not self.nothing_is_given:
                 predicted = predicted.moved(T_shared_world.repeat_interleave(self.samples, dim=0))
             joints = self.body.joints(predicted).unflatten(0, (batch.scenes, self.samples)).transpose(0, 1)

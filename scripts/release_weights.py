@@ -16,7 +16,7 @@ from magnet import weights
 
 ABOUT = {
     "trained on": {
-        "CMU motion capture, subjects 60 and 61 (salsa)": "takes 01 02 06 07 08 09 11; takes 05 10 15 held out, 03 validation",
+        "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
         "CMU motion capture, single people": "subjects 02 05 17 18 55 90 143, without 02_03 and 05_12",
         "synthetic scenes": "magnet.datamodules.synthetic, training seeds",
     },

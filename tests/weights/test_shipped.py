@@ -54,7 +54,7 @@ def test_it_makes_scenes_from_nothing(model):
 def assert_upright(scene: Scene, people: int) -> None:
     """Heads up, pelvis at a standing height, nobody far away."""
     height = scene.T_world_root[:, :, :people, 1, 3]
-    assert 0.5 < height.min() and height.max() < 1.3
+    assert height.min() > 0.5 and height.max() < 1.3
     assert (scene.T_world_root[:, :, :people, 1, 1] > 0.5).all()
 
 
