@@ -23,6 +23,8 @@ from magnet.motion.scene import Scene
 from magnet.tasks.joint import Generation, JointFuture
 
 CONTEXT, HORIZON = 32, 150
+SHOWN = (("handshake", 2), ("circle", 3), ("follow", 4))
+"""Coupling and number of people of the scenes that are drawn."""
 
 
 def main(arguments: Sequence[str] = ()) -> int:
@@ -84,18 +86,18 @@ def draw(model: Denoiser, data: Synthetic, sampler: SamplerOptions, out: Path) -
     written = []
     generator = torch.Generator().manual_seed(data.seed)
     body = data.body.to("cpu")
-    for people in (2, 3, 4):
-        truth = test_scene(data, people)
+    for coupling, people in SHOWN:
+        truth = test_scene(data, coupling, people)
         sampled = model.generate(truth, JointFuture(), CONTEXT, HORIZON, 2, sampler, generator)
-        rows = [("recorded", truth), ("magnet, sample 1", sampled.pick([0])), ("magnet, sample 2", sampled.pick([1]))]
+        rows = [("truth", truth), ("magnet, sample 1", sampled.pick([0])), ("magnet, sample 2", sampled.pick([1]))]
         name = f"joint_future_{people}_people"
         moments = [0, 16, 31, 46, 76, 106, 136, 166, 181]
         look = {"context_frames": CONTEXT, "body": body}
         written.append(contact_sheet(rows, out / f"{name}.png", frames=moments, **look))  # type: ignore[arg-type]
         written.append(render_video(rows, out / f"{name}.gif", size=(320, 240), fps=15, progress=True, **look))  # type: ignore[arg-type]
         sampled.save(out / f"{name}.npz")
-    pair = test_scene(data, 2)
-    free = model.generate(pair, Generation(), 0, HORIZON, 1, sampler, generator)
+    pair = test_scene(data, *SHOWN[0])
+    free = {"from nothing": model.generate(pair, Generation(), 0, HORIZON, 1, sampler, generator)}
     written.append(contact_sheet(free, out / "generation.png", context_frames=0, body=body))
     written.append(
         render_video(free, out / "generation.gif", size=(480, 360), fps=15, context_frames=0, body=body, progress=True)
@@ -103,10 +105,7 @@ def draw(model: Denoiser, data: Synthetic, sampler: SamplerOptions, out: Path) -
     return written
 
 
-def test_scene(data: Synthetic, people: int) -> Scene:
-    """The first test scene with so many people."""
-    for batch in data.test_dataloader():
-        found = (batch.present.sum(dim=1) == people).nonzero()
-        if len(found):
-            return aligned(batch.pick(found[:1, 0]), CONTEXT - 1)
-    raise ValueError(f"the test scenes have no group of {people}; ask for more of them with --scenes")
+def test_scene(data: Synthetic, coupling: str, people: int) -> Scene:
+    """Context and future of a test scene of that kind."""
+    kind = data.kinds.index((coupling, people))
+    return aligned(data.scene("test", kind).scene.pad_agents(data.max_agents).cut(0, CONTEXT + HORIZON), CONTEXT - 1)
