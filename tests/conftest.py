@@ -9,6 +9,9 @@ import torch
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
+# Everything here is tiny: a second thread only waits for the first, and badly so on a busy machine.
+torch.set_num_threads(1)
+
 
 @pytest.fixture
 def generator() -> torch.Generator:
