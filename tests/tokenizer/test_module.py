@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.core.mixins.hparams_mixin import _given_hyperparameters_context
 from torch.utils.data import DataLoader
 
+from magnet.body import load_body
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import by_token, scene_steps
@@ -203,7 +204,8 @@ def test_a_handful_of_windows_is_learnt(generator: torch.Generator) -> None:
 
 
 def test_all_weights_get_gradients_through_the_codebook(scene: Scene) -> None:
-    tokenizer = tiny(scene, velocity_weight=0.1)
+    tokenizer = tiny(scene, velocity_weight=0.1, joint_weight=0.1)
+    tokenizer.body = load_body()
     tokenizer.training_step(scene, 0).backward()
     for name, parameter in tokenizer.vqvae.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name

@@ -126,3 +126,21 @@ def test_proper_poses_are_rotations_above_the_canonical_frame(scene: Scene, gene
     torch.testing.assert_close(proper(pose), pose)
     truth = pose_features(scene)
     torch.testing.assert_close(proper(truth), truth, rtol=0, atol=1e-5)
+
+
+def test_the_velocity_term_is_the_error_of_the_joints_velocities_in_metres_a_second() -> None:
+    truth = torch.zeros(1, 5, 1, 135)
+    truth[..., 0::6][..., :22] = 1.0  # proper rotations: x columns
+    truth[..., 4::6][..., :22] = 1.0
+    decoded = truth.clone()
+    decoded[:, ::2, ..., -2] += 0.01  # the pelvis flickers by a centimetre
+    mask = torch.ones(1, 5, 1, dtype=torch.bool)
+
+    def joints(pose: torch.Tensor) -> torch.Tensor:
+        return pose[..., None, -3:].expand(*pose.shape[:-1], 22, 3)
+
+    losses = reconstruction_losses(decoded, truth, mask, joints)
+    assert losses["velocity"].item() == pytest.approx(0.3, rel=1e-3)
+    assert losses["joint"].item() == pytest.approx(0.006, rel=0.02)
+    still = reconstruction_losses(truth + 0.0, truth, mask, joints)
+    assert still["velocity"] < 0.01
