@@ -1,6 +1,7 @@
 """The model that comes with the package."""
 
 import json
+import re
 
 import pytest
 import torch
@@ -31,7 +32,7 @@ def test_it_says_what_it_was_trained_on_and_names_no_machine():
     text = (weights.resolve() / "config.json").read_text()
     config = json.loads(text)
     assert "mocap.cs.cmu.edu" in config["about"]["acknowledgement"]
-    assert "/work" not in text and "/home" not in text and "/tmp" not in text
+    assert not re.search(r"[\" =]/\w", text), "an absolute path"
 
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
