@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -138,18 +138,21 @@ class MaskSchedule:
                 yield level.clone()
 
     @staticmethod
-    def together(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
+    def together(
+        known: Tensor, target: Tensor, grid: Grid, positions: Iterable[tuple[int, int, int]] | None = None
+    ) -> MaskSchedule:
         """Denoise all targets at one level, window by window (paper 3.3, causal autoregression).
 
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
             grid: sizes; the first window is filled whole, then it moves on by `grid.stride`.
+            positions: other places for the window, as `window_positions` gives them.
         """
         stages = []
         level = initial_levels(known)
         plan = ddim_levels(grid.steps)
-        for start, first, last in window_positions(target, grid):
+        for start, first, last in positions or window_positions(target, grid):
             stop = min(start + grid.window, grid.tokens)
             active = target[start:stop].clone()
             active[: first - start] = False

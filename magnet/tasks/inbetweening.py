@@ -9,8 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from magnet.sampling.noise import ddim_levels
-from magnet.sampling.schedule import Grid, MaskSchedule, Stage, initial_levels
+from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
 
@@ -71,16 +70,7 @@ def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
     """
     if bool(known.all()):
         raise ValueError("every token is a keyframe: there is nothing to generate between them")
-    stages, level, plan = [], initial_levels(known), ddim_levels(grid.steps)
-    for start, first, last in key_positions(known, grid):
-        stop = min(start + grid.window, grid.tokens)
-        active = ~known[start:stop]
-        active[: first - start] = False
-        active[last - start :] = False
-        rows = torch.where(active, plan[:, None, None], level[start:stop])
-        stages.append(Stage(start, rows))
-        level[start:stop] = rows[-1]
-    return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+    return MaskSchedule.together(known, ~known, grid, key_positions(known, grid))
 
 
 def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:

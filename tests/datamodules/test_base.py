@@ -1,7 +1,6 @@
 """Laws of the common data room: what a batch shows, that it can be repeated, resumed and shared."""
 
 import re
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -432,11 +431,6 @@ def test_a_weight_for_no_source_is_refused() -> None:
         FakeData(couples_and_singles(), weights={"salsa": 1.0}).train_dataloader()
 
 
-def test_batches_come_fast(capsys: pytest.CaptureFixture[str]) -> None:
-    data = FakeData([random_clip(f"c{k}", 2000) for k in range(5)], max_agents=4, batch_size=256, epoch_size=2048)
-    loader = data.train_dataloader()
-    next(iter(loader))
-    begin = time.perf_counter()
-    windows = sum(batch.scenes for batch in loader)
-    with capsys.disabled():
-        print(f"\n{windows / (time.perf_counter() - begin):.0f} windows of 64 frames, 4 slots, a second on this CPU")
+def test_an_epoch_has_as_many_windows_as_asked_for() -> None:
+    data = FakeData([random_clip(f"c{k}", 200) for k in range(5)], max_agents=4, batch_size=64, epoch_size=512)
+    assert sum(batch.scenes for batch in data.train_dataloader()) == 512
