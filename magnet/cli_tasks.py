@@ -133,6 +133,7 @@ class Shown:
         steps: denoising steps of a token; the sampler's default is 30.
         window: token steps that the model sees at once.
         stride: token steps finished before the window moves on.
+        rolling: denoising steps between a token and the next; 0: the tokens of a stride go together.
         moments: rows of the picture at most; denoising steps between them are left out.
     """
 
@@ -143,6 +144,7 @@ class Shown:
     steps: int = 6
     window: int = 16
     stride: int = 4
+    rolling: int = 0
     moments: int = 16
 
 
@@ -171,7 +173,8 @@ def show_task(arguments: list[str]) -> int:
     except ValueError as error:
         raise CommandError(str(error)) from error
     task, shown = parse_shown(name, kind, rest)
-    grid = Grid(shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride)
+    sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.rolling)
+    grid = Grid(*sizes)
     schedule = task.schedule(grid)
     formula = str(getattr(task, "formula", ""))
     if shown.out is not None:

@@ -109,7 +109,9 @@ class Evaluation:
         """The task's plan for scenes of so many frames."""
         tokens = -(-(context + horizon) // STRIDE)
         options = self.options
-        grid = Grid(tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride)
+        grid = Grid(
+            tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride, options.rolling
+        )
         return self.task.schedule(grid)
 
     def scored_agents(self, model: Denoiser) -> Tensor | None:

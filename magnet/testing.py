@@ -9,11 +9,11 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import rigid
+from magnet.motion.frames import partners, rigid
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
-from magnet.sampling.sampler import sample
+from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 
 if TYPE_CHECKING:
@@ -89,8 +89,9 @@ TASK_GRIDS = (
     Grid(24, 1, 1, steps=2),
     Grid(12, 2, 0, steps=3, window=8, stride=2),
     Grid(9, 3, 0, steps=1),
+    Grid(20, 2, 4, steps=6, window=8, rolling=2),
 )
-"""Long and short scenes of one to four agents, with a past and without."""
+"""Long and short scenes of one to four agents, with a past and without, in strides and rolling."""
 
 
 def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = False) -> list[Grid]:
@@ -99,13 +100,15 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
     The laws: a task is a frozen dataclass with a docstring and a formula; it plans the same twice; levels never
     rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
     clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
-    cannot influence the sample, nor can relations to it; the same seed gives the same sample.
+    cannot influence the sample, nor can relations to it; the same seed gives the same sample; and several scenes
+    in a batch are sampled as each would be alone.
 
     Args:
         task: the task with its options.
         grids: what to plan on; each must be accepted. None: `TASK_GRIDS`, of which a task may refuse with a
             ValueError those that make no sense to it, but not all.
-        nameless: check too that agents who know the same are treated alike, whichever slots they are in.
+        nameless: check too that agents who know the same are treated alike, whichever slots they are in: in the
+            plan, and in the samples of a model that does not know their slots either.
 
     Returns:
         The grids that were checked.
@@ -128,6 +131,8 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
             continue
         _check_plan(task, grid, schedule, nameless)
         _check_samples(task, grid, schedule)
+        if nameless:
+            _check_nameless(task, grid, schedule)
         checked.append(grid)
     if not checked:
         raise ValueError(f"{type(task).__name__} refuses every grid: {'; '.join(dict.fromkeys(refused))}")
@@ -222,6 +227,50 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     replaced = run(torch.where(given, tokens, 100 * other))
     _require(torch.equal(plain, replaced), f"{place}: tokens that are not known influence the sample")
     _require(plain.isfinite().all(), f"{place}: samples are not finite")
+    each = [[torch.Generator().manual_seed(seed) for seed in (3, 4)] for _ in range(2)]
+    both = sample(mixing, schedule, tokens, present, layout, each[0])
+    alone = [sample(mixing, schedule, tokens[b : b + 1], present[:1], layout, each[1][b : b + 1]) for b in (0, 1)]
+    same = torch.allclose(both, torch.cat(alone), atol=1e-5)
+    _require(same, f"{place}: scenes in a batch are sampled otherwise than alone")
+
+
+def _check_nameless(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
+    layout = TokenLayout(latent=4, agents=grid.agents)
+    shape = (1, grid.tokens, grid.agents, layout.width)
+    generator = torch.Generator().manual_seed(1)
+    tokens, noise, veil = (torch.randn(shape, generator=generator) for _ in range(3))
+    present = torch.ones(1, grid.agents, dtype=torch.bool)
+    order = torch.arange(grid.agents).roll(1)
+
+    def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """Tokens of an agent from its own, its relations and everybody's, all slots alike."""
+        latent, steps, relations = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
+        own = torch.cat([latent, steps.flatten(-2)], dim=-1)
+        heard = own.mean(dim=(1, 2), keepdim=True) + relations.flatten(3).sum(dim=-1, keepdim=True)
+        own = torch.tanh(own.roll(1, dims=1) + heard)
+        latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
+        return layout.pack(latent, steps, torch.tanh(relations + steps.mean(dim=(-1, -2))[..., None, None, None]))
+
+    def run(tokens: Tensor, noise: Tensor, veil: Tensor) -> Tensor:
+        canvas = begin(tokens, noise, schedule.known, layout)
+        return run_stages(blind, schedule.stages, canvas, veil, present, layout)
+
+    plain = reordered(run(tokens, noise, veil), order, layout)
+    other = run(*(reordered(each, order, layout) for each in (tokens, noise, veil)))
+    alike = torch.allclose(plain, other, atol=1e-5)
+    _require(alike, f"{_place(task, grid)}: with the agents in other slots, they are sampled differently")
+
+
+def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:
+    """Tokens of the same people in other slots: agent p becomes what agent order[p] was. (B, N, P, D) -> same"""
+    latent, steps, relations = layout.unpack(tokens)
+    P = layout.agents
+    whole = relations.new_zeros(*relations.shape[:2], P, P, *relations.shape[4:])
+    rows, columns = torch.arange(P)[:, None], partners(P)
+    if layout.slots:
+        whole[:, :, rows, columns] = relations
+        relations = whole[:, :, order][:, :, :, order][:, :, rows, columns]
+    return layout.pack(latent[:, :, order], steps[:, :, order], relations)
 
 
 def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Motion history guidance: push a prediction toward what the past says (paper A.7)."""
+"""Guidance: push a prediction toward what the past says (paper A.7), or toward smooth motion (paper A.8)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.noise import LEVELS, add_noise
 
 if TYPE_CHECKING:
     from magnet.sampling.sampler import DenoiseFn
@@ -28,11 +28,21 @@ class Guidance:
         literal: average `self` and `partner` over all branches as A.7 is printed, which makes the two
             the same for two people. By default each agent's output is read from the branch with its own
             (`self`) or the others' (`partner`) history, so that they differ.
+        smooth: lambda of smoothing guidance (paper A.8, Eq. 14, which gives no value); each denoising step then
+            also runs the model backward. Known tokens are never moved.
+        context_level: noise level at which the model is shown what is finished, for long scenes: small errors
+            then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
     """
 
     kind: Kind = "none"
     weight: float = 1.0
     literal: bool = False
+    smooth: float = 0.0
+    context_level: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.context_level < LEVELS:
+            raise ValueError(f"context_level: got {self.context_level}, expected 0 to {LEVELS - 1}")
 
     def branches(self, agents: int) -> Tensor:
         """Whose history each branch sees, the unguided one first. -> (K, P) bool, no two alike"""
@@ -49,6 +59,24 @@ class Guidance:
 
     def apply(
         self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
+    ) -> tuple[Tensor, Tensor]:
+        """The noisy tokens that the next step starts from, which smoothing moves, and the guided prediction.
+
+        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D) twice
+        """
+        if not self.smooth:
+            return tokens, self.predict(denoise, tokens, levels, present, veil, layout)
+        # Lightning tests in inference mode, whose tensors no gradient may pass.
+        with torch.inference_mode(False), torch.enable_grad():
+            noisy = tokens.clone().requires_grad_()
+            still = levels.clone(), present.clone(), veil.clone()
+            clean = self.predict(denoise, noisy, *still, layout)
+            (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
+        noised = layout.spread(layout.group_levels(levels)) > 0
+        return torch.where(noised, tokens - self.smooth * slope, tokens), clean.detach()
+
+    def predict(
+        self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
     ) -> Tensor:
         """Guided prediction; all branches run as one batch.
 
@@ -57,9 +85,15 @@ class Guidance:
         """
         B, _, P, _ = tokens.shape
         sees = self.branches(P).to(tokens.device)  # (K, P)
+        clean = levels == 0
+        if self.context_level:
+            levels = levels.clamp_min(self.context_level)
+            groups = layout.spread(layout.group_levels(levels))
+            faint = add_noise(tokens, veil, groups)
+            tokens = torch.where(layout.spread(layout.group_levels((~clean).long())) == 0, faint, tokens)
         if len(sees) == 1:
             return denoise(tokens, levels, present)
-        forgotten = (levels == 0)[:, None] & ~sees[None, :, None]  # (B, K, W, P)
+        forgotten = clean[:, None] & ~sees[None, :, None]  # (B, K, W, P)
         shown = torch.where(forgotten, LEVELS, levels[:, None])
         was = layout.spread(layout.group_levels(levels))[:, None]
         unknown = (layout.spread(layout.group_levels(shown)) == LEVELS) & (was < LEVELS)
@@ -86,3 +120,9 @@ class Guidance:
                 agent = torch.arange(P, device=tokens.device)
                 special = each[agent, :, :, agent].permute(1, 2, 0, 3)
         return cond + self.weight * (special - uncond)
+
+
+def roughness(clean: Tensor, present: Tensor) -> Tensor:
+    """Squared second differences of predicted tokens along time, summed (paper Eq. 12 and 13). (B, W, P, D) -> ()"""
+    bend = clean[:, :-2] - 2 * clean[:, 1:-1] + clean[:, 2:]
+    return (bend.square().sum(dim=-1) * present[:, None]).sum()

@@ -1,7 +1,11 @@
 """How noise is added and taken away, with a level of its own on every token (paper 3.2, A.3)."""
 
+from __future__ import annotations
+
 import functools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -57,3 +61,45 @@ def ddim_levels(steps: int, K: int = LEVELS) -> Tensor:
     if not 1 <= steps <= K:
         raise ValueError(f"denoising steps: got {steps}, expected 1 to {K}")
     return torch.tensor([K * (steps - s) // steps for s in range(steps + 1)])
+
+
+@dataclass
+class NoiseStream:
+    """Noise of tokens in the order of time: row i is the same however many rows are drawn at a time.
+
+    Args:
+        shape: (B, P, D) of a row.
+        generator: one for all B scenes; or one for each, and then a scene's noise does not depend on what else
+            is in the batch. None: the global one.
+        device: of the noise and of the generators.
+        dtype: of the noise.
+
+    Raises:
+        ValueError: another number of generators than scenes.
+    """
+
+    shape: tuple[int, int, int]
+    generator: torch.Generator | Sequence[torch.Generator] | None = None
+    device: torch.device | str = "cpu"
+    dtype: torch.dtype = torch.float32
+
+    def __post_init__(self) -> None:
+        if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
+            raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
+
+    def rows(self, count: int) -> tuple[Tensor, Tensor]:
+        """The noise of the next `count` token steps, and their veil, which stands in where a view hides them.
+
+        -> (B, count, P, D) each
+        """
+        drawn = [self._row() for _ in range(count)]
+        both = torch.stack(drawn, dim=2) if drawn else torch.empty(2, self.shape[0], 0, *self.shape[1:])
+        return both[0], both[1]
+
+    def _row(self) -> Tensor:
+        """(2, B, P, D)"""
+        B, P, D = self.shape
+        if isinstance(self.generator, Sequence):
+            each = [torch.randn(2, P, D, generator=g, device=self.device, dtype=self.dtype) for g in self.generator]
+            return torch.stack(each, dim=1)
+        return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)

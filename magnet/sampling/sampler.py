@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Protocol
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.noise import LEVELS, ddim_step
+from magnet.sampling.noise import LEVELS, NoiseStream, ddim_step
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 
 
@@ -33,10 +33,11 @@ def sample(
     tokens: Tensor,
     present: Tensor,
     layout: TokenLayout,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator | Sequence[torch.Generator] | None = None,
     settle: Settle | None = None,
     progress: Callable[[int], None] | None = None,
     guidance: Guidance | None = None,
+    noise: NoiseStream | None = None,
 ) -> Tensor:
     """Fill in what a schedule leaves open.
 
@@ -47,29 +48,51 @@ def sample(
             relations whose both ends are known; the rest may hold anything.
         present: (B, P) bool.
         layout: which numbers of a token share a level.
-        generator: source of all noise, on the tokens' device.
+        generator: source of all noise, on the tokens' device; or one for each scene, see `NoiseStream`.
         settle: see `Settle`.
         progress: told 1 after each denoising step.
         guidance: what the prediction is pushed toward.
+        noise: instead of `generator`.
 
     Returns:
         (B, N, P, D). Known tokens come back bit-identical.
     """
-    N, P = tokens.shape[1:3]
+    B, N, P, D = tokens.shape
     if (schedule.tokens, schedule.agents) != (N, P):
         raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
-    clean = layout.spread(layout.group_levels(initial_levels(schedule.known)) == 0).to(tokens.device)
-    noise = torch.randn(tokens.shape, generator=generator, device=tokens.device, dtype=tokens.dtype)
-    canvas = torch.where(clean, tokens, noise)
-    # What a view hides is shown as noise of its own, not as the noise that is about to become the token.
-    veil = torch.randn(tokens.shape, generator=generator, device=tokens.device, dtype=tokens.dtype)
-    for stage in schedule.stages:
+    noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
+    fresh, veil = noise.rows(N)
+    canvas = begin(tokens, fresh, schedule.known, layout)
+    return run_stages(denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance)
+
+
+def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> Tensor:
+    """Noise wherever something is not known. tokens, noise (B, N, P, D), known (N, P) bool -> (B, N, P, D)"""
+    clean = layout.spread(layout.group_levels(initial_levels(known)) == 0).to(tokens.device)
+    return torch.where(clean, tokens, noise)
+
+
+@torch.no_grad()
+def run_stages(
+    denoise: DenoiseFn,
+    stages: Iterable[Stage],
+    canvas: Tensor,
+    veil: Tensor,
+    present: Tensor,
+    layout: TokenLayout,
+    settle: Settle | None = None,
+    progress: Callable[[int], None] | None = None,
+    guidance: Guidance | None = None,
+) -> Tensor:
+    """Run stages in their order on a canvas. canvas, veil (B, N, P, D) -> (B, N, P, D)"""
+    canvas = canvas.clone()
+    for stage in stages:
         window = slice(stage.start, stage.stop)
         canvas[:, window] = run_stage(
             denoise, stage, canvas[:, window], veil[:, window], present, layout, progress, guidance or Guidance()
         )
         if settle is not None:
-            finished = torch.zeros(N, P, dtype=torch.bool)
+            finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
             finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
             canvas = settle(canvas, finished)
     return canvas
@@ -87,11 +110,12 @@ def run_stage(
 ) -> Tensor:
     """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)"""
     device = tokens.device
-    levels = stage.levels.to(device)
+    levels = stage.levels.to(device).long()
     hidden = None if stage.hidden is None else stage.hidden.to(device)
     for now, after in pairwise(levels):
         if hidden is None:
-            clean = guidance.apply(denoise, tokens, now.expand(len(tokens), -1, -1), present, veil, layout)
+            each = now.expand(len(tokens), -1, -1)
+            tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout)
             tokens = _step(tokens, clean, now, after, layout)
         else:
             tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance)
@@ -129,14 +153,16 @@ def _step_in_views(
     # A relation to somebody hidden is unknown too, although the token that carries it is not.
     unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
     views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
-    clean = guidance.apply(
+    moved, clean = guidance.apply(
         denoise,
         views.flatten(0, 1),
         seen_now.expand(B, V, W, P).flatten(0, 1),
         present[:, None].expand(B, V, P).flatten(0, 1),
         veil[:, None].expand_as(views).flatten(0, 1),
         layout,
-    ).unflatten(0, (B, V))
-    stepped = ddim_step(tokens[:, None], clean, group, layout.spread(layout.group_levels(seen_after)))
+    )
+    moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
+    moved = torch.where(unknown, tokens[:, None], moved)
+    stepped = ddim_step(moved, clean, group, layout.spread(layout.group_levels(seen_after)))
     agent = torch.arange(P, device=tokens.device)
     return stepped[:, view_of, :, agent].permute(1, 2, 0, 3)

@@ -21,12 +21,25 @@ class Grid:
     steps: int = 30  # denoising steps S, paper A.3
     window: int = 16  # token steps W that the model sees at once
     stride: int = 4  # token steps finished before the window moves on
+    rolling: int = 0  # denoising steps between a token and the next; 0: the tokens of a stride go together
 
     def __post_init__(self) -> None:
         if not 0 <= self.context <= self.tokens or self.agents < 1 or self.tokens < 1:
             raise ValueError(f"no such grid: {self}")
         if not 1 <= self.stride <= self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
+        if self.rolling < 0:
+            raise ValueError(f"rolling: got {self.rolling}, expected 0 or a number of denoising steps")
+        if self.rolling and self.rolled >= self.window:
+            raise ValueError(
+                f"rolling={self.rolling} with {self.steps} denoising steps keeps {self.rolled} tokens half denoised, "
+                f"and the window holds {self.window}: give more steps between tokens, or fewer denoising steps"
+            )
+
+    @property
+    def rolled(self) -> int:
+        """Token steps that are half denoised at a time when rolling."""
+        return -(-self.steps // self.rolling)
 
     def mask(self) -> Tensor:
         """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""
@@ -46,7 +59,7 @@ class Stage:
     Attributes:
         start: token step at which the window begins.
         levels: (S + 1, W, P) int in 0..K. Row s holds the levels before denoising step s, the last row
-            those after the last step. 0 is clean.
+            those after the last step. 0 is clean. Two bytes each do: a plan is as long as its scene.
         hidden: (P, W, P) bool or None. hidden[p, i, q]: while agent p's tokens are updated, the model must
             not see agent q's token i. None: everybody sees everything. Where agents see different
             things each is updated from a view of its own; views run as one batch.
@@ -146,9 +159,17 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
-            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`.
-            positions: other places for the window, as `window_positions` gives them.
+            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. With `grid.rolling`
+                it moves on token by token.
+            positions: other places for the window, as `window_positions` gives them; these cannot roll.
+
+        Raises:
+            ValueError: rolling was asked for where the window's places are given.
         """
+        if grid.rolling and positions is not None:
+            raise ValueError("rolling goes forward in time, and this task looks ahead to keyframes: leave it at 0")
+        if grid.rolling:
+            return MaskSchedule.roll(known, target, grid)
         stages = []
         level = initial_levels(known)
         plan = ddim_levels(grid.steps)
@@ -157,8 +178,49 @@ class MaskSchedule:
             active = target[start:stop].clone()
             active[: first - start] = False
             active[last - start :] = False
+            if not active.any():  # a stride in the middle that is known already
+                continue
             rows = torch.where(active, plan[:, None, None], level[start:stop])
-            stages.append(Stage(start, rows))
+            stages.append(Stage(start, rows.short()))
+            level[start:stop] = rows[-1]
+        return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+
+    @staticmethod
+    def roll(
+        known: Tensor, target: Tensor, grid: Grid, unseen: Tensor | None = None, lookahead: bool = True
+    ) -> MaskSchedule:
+        """Denoise along a slope: each token `grid.rolling` denoising steps behind the one before it in time.
+
+        A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
+        finishes one more token step.
+
+        Args:
+            known: (N, P) bool, given clean.
+            target: (N, P) bool, to be generated.
+            grid: sizes; `grid.rolling` is the slope.
+            unseen: (P, P) bool; unseen[p, q]: agent p does not see what agent q has not finished.
+            lookahead: False: nobody sees what is known after the token that is being finished.
+        """
+        plan = ddim_levels(grid.steps)
+        wanted = target.any(dim=1).nonzero()[:, 0].tolist()
+        place = torch.full((grid.tokens,), -1)
+        place[wanted] = torch.arange(len(wanted))
+        level, stages = initial_levels(known), []
+        for number, token in enumerate(wanted):
+            ends = grid.steps + number * grid.rolling
+            begins = ends - grid.rolling if number else 0
+            start = max(0, min(token + grid.rolled, grid.tokens) - grid.window)
+            stop = min(start + grid.window, grid.tokens)
+            turn = torch.arange(begins, ends + 1)[:, None] - grid.rolling * place[start:stop]  # (rows, W)
+            planned = plan[turn.clamp(0, grid.steps)][..., None]
+            rows = torch.where(target[start:stop], planned, level[start:stop])
+            hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
+            if unseen is not None:
+                hidden[:, token - start :] = unseen[:, None]
+            if not lookahead:
+                hidden[:, token + 1 - start :] |= known[token + 1 : stop]
+            hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
+            stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
@@ -184,8 +246,15 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is longer than the window.
+            ValueError: the block is longer than the window, or agents wait and `grid.rolling` is asked for.
         """
+        if grid.rolling and delay is not None and bool(delay.any()):
+            raise ValueError(
+                "rolling: agents that take turns cannot roll, for who is ahead would see the others' past late; "
+                "leave rolling at 0, or give an offset of 0"
+            )
+        if grid.rolling:
+            return MaskSchedule.roll(known, target, grid, unseen, lookahead)
         if not 1 <= block <= grid.window:
             raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
@@ -209,7 +278,7 @@ class MaskSchedule:
             if not lookahead:
                 hidden[:, last - start :] = True
             hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
-            stages.append(Stage(start, rows, hidden if hidden.any() else None))
+            stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 

@@ -3,8 +3,8 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import Guidance
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.guidance import Guidance, roughness
+from magnet.sampling.noise import LEVELS, add_noise
 
 PEOPLE = 3
 LAYOUT = TokenLayout(latent=4, agents=PEOPLE)
@@ -37,7 +37,7 @@ def with_history(given, whose: list[int]) -> Tensor:
 
 def run(given, **options) -> Tensor:
     tokens, levels, present, veil = given
-    return Guidance(**options).apply(model, tokens, levels, present, veil, LAYOUT)
+    return Guidance(**options).predict(model, tokens, levels, present, veil, LAYOUT)
 
 
 def test_without_guidance_nothing_changes(given):
@@ -71,7 +71,7 @@ def test_read_literally_self_and_partner_coincide_for_two_people(generator):
     present = torch.ones(1, 2, dtype=torch.bool)
 
     def guided(guide: str, literal: bool) -> Tensor:
-        return Guidance(guide, literal=literal).apply(model, tokens, levels, present, veil, layout)
+        return Guidance(guide, literal=literal).predict(model, tokens, levels, present, veil, layout)
 
     assert torch.allclose(guided("self", True), guided("partner", True), atol=1e-6)
     assert not torch.allclose(guided("self", False), guided("partner", False), atol=1e-3)
@@ -86,6 +86,106 @@ def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
         return model(noisy, levels, present)
 
     tokens, levels, present, veil = given
-    Guidance(guide).apply(counting, tokens, levels, present, veil, LAYOUT)
+    Guidance(guide).predict(counting, tokens, levels, present, veil, LAYOUT)
     assert sizes == [2 * count]
     assert len(Guidance(guide).branches(2)) == min(count, 4)
+
+
+# -- what is finished, shown faintly -----------------------------------------------------------
+
+
+def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(given):
+    tokens, levels, present, veil = given
+    seen = []
+
+    def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
+        seen.append((noisy, shown))
+        return model(noisy, shown, present)
+
+    Guidance(context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    noisy, shown = seen[0]
+    assert (shown[:, :4] == 40).all() and (shown[:, 4:] == 600).all()
+    assert torch.equal(noisy[:, 4:], tokens[:, 4:])
+    expected = add_noise(tokens[:, :4], veil[:, :4], torch.tensor(40))
+    assert torch.allclose(noisy[:, :4], expected, atol=1e-6)
+    with pytest.raises(ValueError, match="context_level: got 1000"):
+        Guidance(context_level=1000)
+
+
+def test_a_forgotten_history_is_pure_noise_at_any_context_level(given):
+    tokens, levels, present, veil = given
+    shown = []
+
+    def spy(noisy: Tensor, seen: Tensor, present: Tensor) -> Tensor:
+        shown.append(seen)
+        return model(noisy, seen, present)
+
+    Guidance("history", context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    assert set(shown[0][:, :4].unique().tolist()) == {40, LEVELS}
+
+
+# -- smoothing (paper A.8) ---------------------------------------------------------------------
+
+
+def test_roughness_is_nothing_for_steady_motion_and_counts_kinks(generator):
+    steady = torch.arange(6.0)[None, :, None, None].expand(1, 6, 2, 3)
+    there = torch.ones(1, 2, dtype=torch.bool)
+    assert roughness(steady, there) == 0
+    kinked = steady.clone()
+    kinked[0, 3, 1, 2] += 1  # second differences 1, -2, 1
+    assert roughness(kinked, there) == 6
+    assert roughness(kinked, torch.tensor([[True, False]])) == 0, "absent agents do not count"
+
+
+def test_smoothing_follows_the_slope_through_the_denoiser(given):
+    """Against finite differences in float64."""
+    tokens, levels, present, veil = given
+    tokens = tokens.double()
+    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, veil, LAYOUT)
+    assert torch.equal(clean, model(tokens, levels, present))
+    for place in ((0, 4, 0, 0), (1, 5, 2, 3), (0, 5, 1, -1)):
+        shift = torch.zeros_like(tokens)
+        shift[place] = 1e-5
+        up, down = (roughness(model(tokens + sign * shift, levels, present), present) for sign in (1, -1))
+        slope = (up - down) / 2e-5
+        assert (tokens - moved)[place] == pytest.approx(0.1 * float(slope), rel=1e-4, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["none", "history", "self", "partner"])
+def test_smoothing_goes_with_every_guidance_and_leaves_known_numbers_alone(given, kind):
+    tokens, levels, present, veil = given
+    guidance = Guidance(kind, smooth=0.3)
+    moved, clean = guidance.apply(model, tokens, levels, present, veil, LAYOUT)
+    known = LAYOUT.spread(LAYOUT.group_levels(levels)) == 0
+    assert torch.equal(moved[known], tokens[known])
+    assert not torch.allclose(moved[~known], tokens[~known])
+    assert torch.equal(clean, Guidance(kind).predict(model, tokens, levels, present, veil, LAYOUT))
+
+
+def test_smoothing_works_in_inference_mode(given):
+    with torch.inference_mode():
+        inside = tuple(x + 0 for x in given)
+        moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT)
+    tokens, levels, present, veil = given
+    assert torch.equal(moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT)[0])
+
+
+def test_smoothing_makes_samples_smoother(generator):
+    """A denoiser that believes what it sees: what it is shown decides how rough its samples are."""
+    from magnet.sampling.sampler import sample
+    from magnet.sampling.schedule import Grid
+    from magnet.tasks.joint import JointFuture
+
+    layout = TokenLayout(latent=4, agents=2)
+    grid = Grid(12, 2, 4, steps=10, window=12)
+    tokens = torch.randn(3, 12, 2, layout.width, generator=generator)
+    there = torch.ones(3, 2, dtype=torch.bool)
+
+    def rough(smooth: float) -> float:
+        seed = torch.Generator().manual_seed(3)
+        plan = JointFuture().schedule(grid)
+        out = sample(model, plan, tokens, there, layout, seed, guidance=Guidance(smooth=smooth))
+        assert torch.equal(out[:, :4], tokens[:, :4])
+        return float(roughness(out[:, 4:], there))
+
+    assert rough(0.05) < 0.9 * rough(0.0)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from magnet.sampling.noise import LEVELS, add_noise, alpha_bar, ddim_levels, ddim_step
+from magnet.sampling.noise import LEVELS, NoiseStream, add_noise, alpha_bar, ddim_levels, ddim_step
 
 
 def test_level_zero_is_clean_and_the_last_level_pure_noise_bit_for_bit(generator):
@@ -55,3 +55,32 @@ def test_what_reaches_level_zero_is_the_prediction(generator):
     levels = torch.arange(LEVELS + 1)
     after = torch.zeros_like(levels)
     assert torch.equal(ddim_step(noisy, clean, levels, after)[1:], clean[1:])
+
+
+def seeded(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_noise_is_the_same_however_many_rows_are_drawn_at_a_time(each):
+    def stream() -> NoiseStream:
+        return NoiseStream((2, 3, 5), seeded(1, 2) if each else seeded(1)[0])
+
+    whole, parts = stream().rows(7), stream()
+    pieces = [parts.rows(count) for count in (1, 0, 4, 2)]
+    for kind in (0, 1):
+        assert torch.equal(torch.cat([piece[kind] for piece in pieces], dim=1), whole[kind])
+    assert whole[0].shape == (2, 7, 3, 5)
+    assert not torch.equal(*whole)
+
+
+def test_with_a_generator_each_a_scenes_noise_does_not_depend_on_the_batch():
+    both = NoiseStream((2, 3, 5), seeded(1, 2)).rows(4)
+    alone = NoiseStream((1, 3, 5), seeded(2)).rows(4)
+    assert torch.equal(both[0][1:], alone[0])
+    assert torch.equal(both[1][1:], alone[1])
+
+
+def test_generators_are_one_for_each_scene():
+    with pytest.raises(ValueError, match="got 1 generators for 2 scenes"):
+        NoiseStream((2, 3, 5), seeded(1))

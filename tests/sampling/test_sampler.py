@@ -87,22 +87,20 @@ def test_agents_have_no_names_in_the_loop(generator):
     layout = TokenLayout(latent=6, agents=3, relations=False)
     tokens = torch.randn(2, 30, 3, layout.width, generator=generator)
 
-    def noise_of(permuted: bool):
-        noise = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(3))
-        return noise[:, :, order] if permuted else noise
+    noise = torch.randn(2, *tokens.shape, generator=generator)
 
-    def run_with(given: Tensor, noise: Tensor) -> Tensor:
-        def first_call_noise(*shape, **kwargs):
-            return noise.clone()
+    class Given:
+        def __init__(self, both: Tensor) -> None:
+            self.both = both
 
-        original, torch.randn = torch.randn, first_call_noise
-        try:
-            return sample(mixing, joint(GRID), given, PRESENT, layout)
-        finally:
-            torch.randn = original
+        def rows(self, count: int) -> tuple[Tensor, Tensor]:
+            return self.both[0], self.both[1]
 
-    plain = run_with(tokens, noise_of(False))
-    permuted = run_with(tokens[:, :, order], noise_of(True))
+    def run_with(given: Tensor, both: Tensor) -> Tensor:
+        return sample(mixing, joint(GRID), given, PRESENT, layout, noise=Given(both))
+
+    plain = run_with(tokens, noise)
+    permuted = run_with(tokens[:, :, order], noise[:, :, :, order])
     assert torch.allclose(plain[:, :, order], permuted, atol=1e-6)
 
 

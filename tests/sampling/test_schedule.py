@@ -80,3 +80,56 @@ def test_a_lone_unknown_future_stays_at_pure_noise():
     target[:, 1] = False
     plan = MaskSchedule.together(grid.past(), target, grid)
     assert (plan.final_levels()[8:, 1] == LEVELS).all()
+
+
+# -- rolling -----------------------------------------------------------------------------------
+
+
+def rolled(**options) -> MaskSchedule:
+    grid = Grid(**{"tokens": 24, "agents": 2, "context": 4, "steps": 6, "window": 8, "rolling": 2, **options})
+    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+
+
+def test_rolling_levels_are_a_slope_along_time():
+    """Each token is `rolling` denoising steps behind the one before it."""
+    plan = rolled()
+    rows = torch.stack(list(plan.rows()))[:, 4:, 0]  # (steps + 1, targets)
+    slope = [1000 * (6 - s) // 6 for s in range(7)]
+    for step, row in enumerate(rows):
+        assert row.tolist() == [slope[min(max(step - 2 * token, 0), 6)] for token in range(20)]
+
+
+def test_rolling_finishes_a_token_at_each_stage_and_costs_its_share():
+    plan = rolled()
+    assert len(plan.stages) == 20
+    assert plan.evaluations == 6 + 19 * 2
+    assert plan.finished.all()
+    for stage in plan.stages:
+        done = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
+        assert done.any(dim=1).sum() == 1
+
+
+def test_a_rolling_window_keeps_some_past_in_view():
+    for stage in rolled().stages[4:]:
+        assert stage.levels.shape[0] == 3
+        assert (stage.levels[0] == 0).all(dim=1).sum() >= 8 - 3 - 1
+
+
+def test_rolling_agents_in_step_do_not_see_what_the_others_have_not_finished():
+    grid = Grid(24, 2, 4, steps=6, window=8, rolling=2)
+    plan = MaskSchedule.blocks(grid.past(), ~grid.past(), grid, unseen=~torch.eye(2, dtype=torch.bool))
+    for stage in plan.stages:
+        unfinished = stage.levels[-1] > 0
+        started = stage.levels[-1] < LEVELS
+        for p, q in ((0, 1), (1, 0)):
+            assert stage.hidden[p, :, q][(unfinished & started)[:, q]].all()
+            assert not stage.hidden[p, :, p].any(), "one always sees oneself"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"rolling": 1, "steps": 30}, "keeps 30 tokens half denoised"), ({"rolling": -1}, "rolling: got -1")],
+)
+def test_a_slope_that_does_not_fit_the_window_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        rolled(**options)

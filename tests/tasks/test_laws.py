@@ -12,6 +12,7 @@ from magnet.tasks import registry
 from magnet.testing import TASK_GRIDS, task_laws
 
 TWO_AND_MORE = ("partner_inpainting", "partner_prediction", "motion_control")
+CANNOT_ROLL = ("agentic_async", "inbetweening")
 FROM_NOTHING = ("generation", "partner_inpainting", "inbetweening")
 NAMELESS = ("joint_future", "generation", "agentic_sync", "inbetweening")
 
@@ -20,7 +21,18 @@ NAMELESS = ("joint_future", "generation", "agentic_sync", "inbetweening")
 def test_every_task_obeys_the_laws(name: str):
     checked = task_laws(registry.get(name)(), nameless=name in NAMELESS)
     expected = [g for g in TASK_GRIDS if g.agents > 1 or name not in TWO_AND_MORE]
+    expected = [g for g in expected if not (g.rolling and name in CANNOT_ROLL)]
     assert checked == [g for g in expected if g.context or name in FROM_NOTHING]
+
+
+@pytest.mark.parametrize("name", CANNOT_ROLL)
+def test_a_task_that_cannot_roll_says_why(name: str):
+    with pytest.raises(ValueError, match="rolling"):
+        registry.get(name)().schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
+
+
+def test_turns_that_all_begin_at_once_can_roll():
+    registry.get("agentic_async")(offset=0.0).schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
 
 
 def test_joint_future_needs_a_past():

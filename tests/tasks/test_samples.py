@@ -134,9 +134,18 @@ class Gaussian:
         return mean[where], (spread @ spread.T)[where][:, where]
 
 
-def distribution(
-    gaussian: Gaussian, schedule: MaskSchedule, values: Tensor, monkeypatch: pytest.MonkeyPatch
-) -> tuple[Tensor, Tensor]:
+class Given:
+    """Noise and veil of one's own choice."""
+
+    def __init__(self, noise: Tensor, veil: Tensor) -> None:
+        self.noise, self.veil = noise, veil
+
+    def rows(self, count: int) -> tuple[Tensor, Tensor]:
+        assert count == self.noise.shape[1]
+        return self.noise, self.veil
+
+
+def distribution(gaussian: Gaussian, schedule: MaskSchedule, values: Tensor) -> tuple[Tensor, Tensor]:
     """Exact mean and covariance of the generated tokens, over their flat indices in order."""
     N, P = gaussian.shape
     layout = TokenLayout(latent=1, agents=P, relations=False)
@@ -145,13 +154,11 @@ def distribution(
     draws = [torch.zeros(1 + 2 * size, size, dtype=torch.float64) for _ in range(2)]
     draws[0][1 : 1 + size] = torch.eye(size)
     draws[1][1 + size :] = torch.eye(size)
-    noise = iter(draw.view(-1, N, P, 1).expand(-1, -1, -1, layout.width) for draw in draws)
-    monkeypatch.setattr(torch, "randn", lambda *shape, **options: next(noise).clone())
+    noise = Given(*(draw.view(-1, N, P, 1).expand(-1, -1, -1, layout.width) for draw in draws))
     tokens = torch.where(schedule.known, values.view(N, P), torch.nan)[None, ..., None]
     tokens = tokens.expand(1 + 2 * size, -1, -1, layout.width).clone()
     present = torch.ones(len(tokens), P, dtype=torch.bool)
-    out = sample(gaussian.denoise, schedule, tokens, present, layout)
-    monkeypatch.undo()
+    out = sample(gaussian.denoise, schedule, tokens, present, layout, noise=noise)
     generated = (schedule.finished & ~schedule.known).flatten()
     flat = out[..., 0].flatten(1)[:, generated]
     response = flat[1:] - flat[0]
@@ -159,7 +166,7 @@ def distribution(
     return flat[0], response[:size].T @ response[:size]
 
 
-def check(task: Task, people: int, monkeypatch: pytest.MonkeyPatch, expected=None, context: int = PAST) -> None:
+def check(task: Task, people: int, expected=None, context: int = PAST, share: int = 0) -> None:
     """Compare with `expected(gaussian, values)`; by default with generated given known."""
     tokens = TOKENS[people]
     gaussian = Gaussian(tokens, people)
@@ -168,8 +175,10 @@ def check(task: Task, people: int, monkeypatch: pytest.MonkeyPatch, expected=Non
     )
     found = []
     for steps in STEPS:
-        schedule = task.schedule(Grid(tokens, people, context, steps, window=tokens, stride=1))
-        found.append(distribution(gaussian, schedule, values, monkeypatch))
+        rolling = steps // share if share else 0
+        grid = Grid(tokens, people, context, steps, window=tokens, stride=1, rolling=rolling)
+        schedule = task.schedule(grid)
+        found.append(distribution(gaussian, schedule, values))
     (mean, coarse), (_, fine) = found
     covariance = 2 * fine - coarse
     if expected is None:
@@ -184,34 +193,44 @@ def check(task: Task, people: int, monkeypatch: pytest.MonkeyPatch, expected=Non
 
 
 @pytest.mark.parametrize("people", [2, 3, 4])
-def test_joint_future_samples_all_futures_given_all_pasts(people, monkeypatch):
-    check(JointFuture(), people, monkeypatch)
+def test_joint_future_samples_all_futures_given_all_pasts(people):
+    check(JointFuture(), people)
+
+
+@pytest.mark.parametrize("people", [1, 2, 3])
+def test_rolling_samples_the_same_futures(people):
+    """Levels that differ along time are still a diffusion of the whole, so its flow is exact."""
+    check(JointFuture(), people, share=2)
+
+
+def test_rolling_prediction_still_integrates_the_partner_out():
+    check(PartnerPrediction((0,)), 2, share=2)
 
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
-def test_generation_samples_the_joint_distribution_of_everything(people, monkeypatch):
-    check(Generation(), people, monkeypatch, context=0)
+def test_generation_samples_the_joint_distribution_of_everything(people):
+    check(Generation(), people, context=0)
 
 
 @pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
-def test_inpainting_samples_the_targets_given_the_others_whole_motion(people, target, monkeypatch):
-    check(PartnerInpainting(target), people, monkeypatch)
+def test_inpainting_samples_the_targets_given_the_others_whole_motion(people, target):
+    check(PartnerInpainting(target), people)
 
 
 @pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
-def test_prediction_samples_the_targets_future_given_all_pasts_whatever_the_others_will_do(people, target, monkeypatch):
+def test_prediction_samples_the_targets_future_given_all_pasts_whatever_the_others_will_do(people, target):
     """P(A_t:t+L | A_0:t-1, B_0:t-1): B's future is integrated out."""
-    check(PartnerPrediction(target), people, monkeypatch)
+    check(PartnerPrediction(target), people)
 
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
 @pytest.mark.parametrize("task", [Inbetweening(keys=(-1,)), Inbetweening(keys=(3,), agents=(0,))], ids=["all", "one"])
-def test_inbetweening_samples_the_gaps_given_past_and_keyframes(task, people, monkeypatch):
-    check(task, people, monkeypatch)
+def test_inbetweening_samples_the_gaps_given_past_and_keyframes(task, people):
+    check(task, people)
 
 
 @pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
-def test_motion_control_samples_each_next_token_given_the_others_up_to_then(people, target, monkeypatch):
+def test_motion_control_samples_each_next_token_given_the_others_up_to_then(people, target):
     """prod_t P(A_t | A_0:t-1, B_0:t). Several targets are drawn jointly at each time step."""
 
     def expected(gaussian: Gaussian, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,11 +245,11 @@ def test_motion_control_samples_each_next_token_given_the_others_up_to_then(peop
 
         return gaussian.turn_by_turn(turns, sees, known, values)
 
-    check(MotionControl(target), people, monkeypatch, expected)
+    check(MotionControl(target), people, expected)
 
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
-def test_agents_in_step_are_independent_given_the_past(people, monkeypatch):
+def test_agents_in_step_are_independent_given_the_past(people):
     """prod_t prod_agents P(A_t | everybody's 0:t-1)."""
 
     def expected(gaussian: Gaussian, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,16 +260,83 @@ def test_agents_in_step_are_independent_given_the_past(people, monkeypatch):
 
         return gaussian.turn_by_turn(turns, sees, list(range(PAST * people)), values)
 
-    check(AgenticSync(), people, monkeypatch, expected)
+    check(AgenticSync(), people, expected)
 
 
 @pytest.mark.parametrize(("people", "order"), [(1, ()), (2, ()), (2, (1, 0)), (3, (2, 0, 1)), (4, ())])
-def test_turn_taking_is_the_chain_rule_of_the_joint_future(people, order, monkeypatch):
+def test_turn_taking_is_the_chain_rule_of_the_joint_future(people, order):
     """prod_t P(A_t | pasts) P(B_t | pasts, A_t) ... = P(all futures | all pasts), in any order of turns."""
-    check(AgenticAsync(1.0, order), people, monkeypatch)
+    check(AgenticAsync(1.0, order), people)
 
 
-def test_agents_in_step_do_not_sample_the_joint_future(monkeypatch):
+def test_agents_in_step_do_not_sample_the_joint_future():
     """The difference between the two is larger than the tolerance: the laws above can tell them apart."""
     with pytest.raises(AssertionError):
-        check(AgenticSync(), 2, monkeypatch)
+        check(AgenticSync(), 2)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.5, 1.0])
+def test_at_every_offset_the_second_sees_the_first_as_noisy_as_it_is_then(offset):
+    """Against the same process written out by hand, one agent and one number at a time."""
+    gaussian, steps = Gaussian(5, 2), 12
+    values = gaussian.mean + torch.randn(10, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    schedule = AgenticAsync(offset).schedule(Grid(5, 2, PAST, steps, window=5, stride=1))
+    mean, covariance = distribution(gaussian, schedule, values)
+    right_mean, right_covariance = by_hand(gaussian, values, offset, steps)
+    assert torch.allclose(mean, right_mean, atol=1e-9)
+    assert torch.allclose(covariance, right_covariance, atol=1e-9)
+
+
+def test_the_first_is_as_if_alone_at_every_offset_and_the_joint_is_reached_at_the_full_one():
+    gaussian = Gaussian(3, 2)
+    values = gaussian.mean.clone()
+    known, target = torch.arange(4), torch.tensor([4, 5])
+    _, right = gaussian.given(target, known, values)
+    off = []
+    for offset in (0.0, 0.5, 1.0):
+        _, coarse = by_hand(gaussian, values, offset, 200)
+        _, fine = by_hand(gaussian, values, offset, 400)
+        covariance = 2 * fine - coarse
+        assert abs(covariance[0, 0] - right[0, 0]) < TOLERANCE
+        off.append(float((covariance - right).abs().max()))
+    assert off[0] > 5 * TOLERANCE, "at offset 0 the first knows nothing of the second, nor the second enough of it"
+    assert off[0] > off[1] > off[2]
+    assert off[2] < TOLERANCE
+
+
+def by_hand(gaussian: Gaussian, values: Tensor, offset: float, steps: int) -> tuple[Tensor, Tensor]:
+    """Turn-taking of two, token by token: mean and covariance of what is generated.
+
+    Each token is `mean + spread @ noise`; a step predicts it from clean pasts and from what the agent sees.
+    """
+    N, size = gaussian.shape[0], len(values)
+    mean = torch.where(torch.arange(size) < 2 * PAST, values, 0.0)
+    spread = torch.eye(size, dtype=torch.float64)
+    spread[: 2 * PAST] = 0
+    plan = [alpha_bar(torch.tensor(1000 * (steps - s) // steps)).double() for s in range(steps + 1)]
+    wait = round(offset * steps)
+
+    def predict(index: int, seen: dict[int, Tensor]) -> tuple[Tensor, Tensor]:
+        """E[x_index | what is seen, each with its share of signal], as mean and spread."""
+        where, share = torch.tensor(list(seen)), torch.stack(list(seen.values()))
+        observed = share.sqrt()[:, None] * gaussian.covariance[where][:, where] * share.sqrt()
+        gain = gaussian.covariance[index, where] * share.sqrt()
+        gain = gain @ torch.linalg.inv(observed + torch.diag(1 - share))
+        off = mean[where] - share.sqrt() * gaussian.mean[where]
+        return gaussian.mean[index] + gain @ off, gain @ spread[where]
+
+    for t in range(PAST, N):
+        first, second = 2 * t, 2 * t + 1
+        past = {index: torch.tensor(1.0, dtype=torch.float64) for index in range(2 * t)}
+        for s in range(steps + wait):
+            now = {p: plan[min(max(s - p * wait, 0), steps)] for p in (0, 1)}
+            after = {p: plan[min(max(s + 1 - p * wait, 0), steps)] for p in (0, 1)}
+            seen = {first: now[0]}
+            predicted = {0: predict(first, past | seen), 1: predict(second, past | seen | {second: now[1]})}
+            for p, index in ((0, first), (1, second)):
+                if now[p] == after[p]:
+                    continue
+                for held, clean in ((mean, predicted[p][0]), (spread, predicted[p][1])):
+                    noise = (held[index] - now[p].sqrt() * clean) / (1 - now[p]).sqrt()
+                    held[index] = after[p].sqrt() * clean + (1 - after[p]).sqrt() * noise
+    return mean[2 * PAST :], (spread @ spread.T)[2 * PAST :, 2 * PAST :]
