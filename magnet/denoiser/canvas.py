@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.denoiser.seams import arrive, fade_rotation, last_known, next_known, seam_weights, step_between
+from magnet.denoiser.generation import reach
+from magnet.denoiser.seams import arrive, hold, joined, paste, step_between
 from magnet.motion.frames import (
     canonical_frame,
     canonical_steps,
@@ -20,7 +21,6 @@ from magnet.motion.frames import (
     place,
     posed,
     project_se2,
-    rigid,
     to_9d,
 )
 from magnet.motion.scene import Scene
@@ -34,20 +34,44 @@ if TYPE_CHECKING:
 
 @dataclass
 class Health:
-    """How well sampled tokens hang together; filled while sampling, for whoever asks.
+    """How well sampled tokens hang together and what they cost; filled while sampling, for whoever asks.
 
     `snap`: distance of a sampled latent to its code, as a share of the code's length. `drift`: metres
-    between a sampled pairwise transform and what the placed agents imply.
+    between a sampled pairwise transform and what the placed agents imply. `calls`: how often the network ran, a
+    batch at a time. `evaluations`: how often it ran for each scene, views and guidance branches counted apart.
     """
 
     snap_sum: float = 0.0
     snaps: int = 0
     drift_sum: float = 0.0
     drifts: int = 0
+    runs: int = 0
+    calls: int = 0
+    scenes: int = 0
+    rows: int = 0  # windows that went through the network
+
+    @property
+    def evaluations(self) -> float:
+        return self.rows / max(self.scenes, 1)
 
     def means(self) -> dict[str, float]:
-        """Means of what was seen."""
-        return {"snap": self.snap_sum / max(self.snaps, 1), "drift": self.drift_sum / max(self.drifts, 1)}
+        """Means of what was seen; `calls` is that of a run of the sampler."""
+        return {
+            "snap": self.snap_sum / max(self.snaps, 1),
+            "drift": self.drift_sum / max(self.drifts, 1),
+            "calls": self.calls / max(self.runs, 1),
+            "evaluations": self.evaluations,
+        }
+
+    def begin(self, scenes: int) -> None:
+        """A run of the sampler starts."""
+        self.runs += 1
+        self.scenes += scenes
+
+    def add_call(self, rows: int) -> None:
+        """The network runs on so many windows."""
+        self.calls += 1
+        self.rows += rows
 
     def add_snap(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
         """latent, code (B, n, P, C), counts (B, n, P) bool"""
@@ -68,6 +92,14 @@ class Canvas:
     After each stage the new tokens are made self-consistent before the model sees them again: codes
     snapped, transforms projected to turns about the vertical and ground shifts, agents placed in the
     world, and both kinds of transforms recomputed from there.
+
+    Args:
+        model: whose tokens these are.
+        given: (B, T) what is known of the scene, the rest scrubbed; or of its first rows, see `extend`.
+        schedule: the plan of the whole scene; only what it knows is read.
+        options: how to sample.
+        samples: scenes drawn for each of B.
+        health: filled.
     """
 
     def __init__(
@@ -82,14 +114,33 @@ class Canvas:
         self.model = model
         self.options = options
         self.health = health or Health()
-        self.known = schedule.known
+        self.samples = samples
+        self.known = schedule.known[: given.frames // STRIDE]
         self.given = given.repeat(samples)
-        self.placed = schedule.known.clone()
+        self.placed = self.known.clone()
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
+        self.rooted = False  # whether something was known in rows that have been let go
+
+    def extend(self, given: Scene, known: Tensor) -> None:
+        """Take in more rows at the end. given (B, 4 n), known (n, P)"""
+        given = given.repeat(self.samples)
+        self.given = joined([self.given, given])
+        self.known, self.placed = torch.cat([self.known, known]), torch.cat([self.placed, known])
+        self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
+
+    def release(self, rows: int) -> None:
+        """Let the first rows go; nothing that follows may depend on them, so one row before what may still
+        change must stay."""
+        frames = rows * STRIDE
+        self.rooted |= bool(self.known[:rows].any())
+        self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
+        self.T_world_can = self.T_world_can[:, frames:].clone()
+        kept = self.given.cut(frames)
+        self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
     def settle(self, canvas: Tensor, finished: Tensor) -> Tensor:
-        """Make the tokens that a stage finished self-consistent. canvas (B, N, P, D), finished (N, P) bool
+        """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
 
         Of known tokens nothing changes but the step that leads into them, once it is known where from.
         """
@@ -117,7 +168,6 @@ class Canvas:
             together = layout.group_present(self.given.present)[:, None] & changed_groups
             self.health.add_drift(relations, implied[:, first - begin :], together[:, first - begin :, :, 1:])
         changed = layout.spread(changed_groups)
-        canvas = canvas.clone()
         canvas[:, begin:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, begin:stop])
         return self._enter(canvas, begin, stop)
 
@@ -235,7 +285,7 @@ class Canvas:
         for agent in arriving:
             T_world_key = self.T_world_can[:, key, agent]
             key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
-            if not bool(self.known[:row].any()) and agent == arriving[0]:
+            if not self.rooted and not bool(self.known[:row].any()) and agent == arriving[0]:
                 expected = self.T_world_can[:, key - 1, agent] @ step_between(
                     self.T_world_can[:, :key, agent], key_step
                 )
@@ -253,46 +303,30 @@ class Canvas:
             moved[start:row, agent] = True
         return moved
 
-    def scene(self, canvas: Tensor) -> Scene:
-        """The finished canvas as bodies in the world."""
-        layout = self.model.layout
-        latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas))
+    def scene(self, canvas: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
+        """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
+
+        `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
+        Poses depend on as many neighbouring rows as the decoder and the seams reach.
+        """
+        layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.paste else 0
+        stop = len(self.known) if stop is None else stop
+        low, high = max(first - blend, 0), min(stop + blend, len(self.known))
+        behind, ahead = reach(self.model)
+        near = slice(max(low - behind, 0), high + ahead)
+        latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas[:, near]))
         features = self.model.tokenizer.decode(latent, self.given.betas, steps)
-        decoded = posed(features, self.T_world_can, self.given)
+        frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
+        given = self.given.cut(low * STRIDE, high * STRIDE)
+        T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
+        decoded = posed(features[:, frames], T_world_can, given)
         if self.options.paste:
-            decoded = self._paste(decoded)
-        return self._hold_unknown(decoded)
+            decoded = paste(decoded, given, T_world_can, self._by_frame(self.known[low:high]), self.options.blend)
+        decoded = decoded.cut((first - low) * STRIDE, (stop - low) * STRIDE)
+        return hold(decoded, self._by_frame(self.placed[first:stop]), before)
 
-    def _hold_unknown(self, scene: Scene) -> Scene:
-        """Agents that the task neither gives nor generates from some time on stand still from there."""
-        ended = self.placed.repeat_interleave(STRIDE, dim=0).to(scene.device)
-        if bool(ended.all()):
-            return scene
-        last, agents = last_known(ended), torch.arange(ended.shape[1], device=scene.device)
-        return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
-
-    def _paste(self, decoded: Scene) -> Scene:
-        """Put given frames back; what they differ by at a seam fades out over the frames on its other side."""
-        keep = self.known.repeat_interleave(STRIDE, dim=0).to(decoded.device)  # (T, P)
-        body_rot, T_world_root = decoded.body_rot, decoded.T_world_root
-        decoded_can_root = inverse(self.T_world_can) @ T_world_root
-        given_can_root = inverse(canonical_frame(self.given.T_world_root)) @ self.given.T_world_root
-        tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
-        agents = torch.arange(keep.shape[1], device=keep.device)
-        behind = (last_known(keep), seam_weights(keep, self.options.blend))
-        ahead = (next_known(keep), seam_weights(keep.flip(0), self.options.blend).flip(0))
-        for seam, fade in (behind, ahead):  # (T, P) each
-            given_at, decoded_at = given_can_root[:, seam, agents], decoded_can_root[:, seam, agents]
-            body_given, body_decoded = self.given.body_rot[:, seam, agents], decoded.body_rot[:, seam, agents]
-            body_rot = fade_rotation(body_rot, body_given, body_decoded, fade[..., None])
-            tilt = fade_rotation(tilt, given_at[..., :3, :3], decoded_at[..., :3, :3], fade)
-            lift = lift + fade[..., None] * (given_at - decoded_at)[..., :3, 3]
-        there = decoded.present[:, None, :, None, None]
-        blended = torch.where(there, self.T_world_can @ rigid(tilt, lift), T_world_root)
-        return decoded.replace(
-            body_rot=torch.where(keep[..., None, None, None], self.given.body_rot, body_rot),
-            T_world_root=torch.where(keep[..., None, None], self.given.T_world_root, blended),
-        )
+    def _by_frame(self, rows: Tensor) -> Tensor:
+        return rows.repeat_interleave(STRIDE, dim=0).to(self.given.device)
 
 
 def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:

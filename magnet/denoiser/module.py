@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,11 +13,14 @@ import torch
 from torch import Tensor
 
 from magnet import weights
+from magnet.body import Body, load_body
+from magnet.denoiser.body_losses import decoded_losses
 from magnet.denoiser.canvas import Health
-from magnet.denoiser.generation import SamplerOptions, generate
+from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
 from magnet.denoiser.statistics import Statistics
+from magnet.denoiser.stream import PIECE, Generators, generate, stream
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
@@ -59,6 +63,11 @@ class Denoiser(L.LightningModule):
         relation_weight: lambda_2 of paper Eq. 10.
         consistency_weight: lambda_3 of paper Eq. 10, for rotation and translation alike.
         consistency_warmup: steps over which lambda_3 grows from 0.
+        pose_weight: adds the distance of decoded joints in metres to the loss (ours); see `body_losses`.
+        motion_weight: adds the error of decoded joints' velocities in m/s (ours).
+        partner_weight: adds the distance of the partners' decoded joints, as each sees them, in metres (ours).
+        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these three.
+        start_from: checkpoint of a denoiser whose weights training starts from, where they fit.
         std_floor: smallest standard deviation used for z-scores.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -90,6 +99,11 @@ class Denoiser(L.LightningModule):
         relation_weight: float = 1.0,
         consistency_weight: float = 0.1,
         consistency_warmup: int = 1000,
+        pose_weight: float = 0.0,
+        motion_weight: float = 0.0,
+        partner_weight: float = 0.0,
+        decoded_share: float = 0.25,
+        start_from: str | None = None,
         std_floor: float = 1e-2,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
@@ -102,6 +116,7 @@ class Denoiser(L.LightningModule):
         self.window = window
         self.tokenizer: Tokenizer | RawPose
         self.evaluation: Evaluation | None = None
+        self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
         elif tokenizer is not None and Path(tokenizer).exists():
@@ -227,23 +242,56 @@ class Denoiser(L.LightningModule):
         frames: int,
         samples: int = 1,
         options: SamplerOptions | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
         progress: Callable[[int], None] | None = None,
         health: Health | None = None,
     ) -> Scene:
-        """Sample a task: see `magnet.denoiser.generation.generate`."""
+        """Sample a task: see `magnet.denoiser.stream.generate`."""
         self._require_tokenizer()
-        with torch.no_grad():
-            return generate(self, scene, task, context, frames, samples, options, generator, progress, health)
+        return generate(self, scene, task, context, frames, samples, options, generator, progress, health)
+
+    def stream(
+        self,
+        scene: Scene,
+        task: Task,
+        context: int,
+        frames: int | None,
+        samples: int = 1,
+        options: SamplerOptions | None = None,
+        generator: Generators = None,
+        progress: Callable[[int], None] | None = None,
+        health: Health | None = None,
+        piece: int = PIECE,
+    ) -> Iterator[Scene]:
+        """Sample a task of any length piece by piece: see `magnet.denoiser.stream.stream`."""
+        self._require_tokenizer()
+        return stream(self, scene, task, context, frames, samples, options, generator, progress, health, piece)
 
     # -- training ------------------------------------------------------------------------------
 
     def on_fit_start(self) -> None:
         if not self.statistics.ready:
             self._fit_statistics()
+            if self.hparams["start_from"]:
+                self._start_from(self.hparams["start_from"])
         if self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
+
+    def _start_from(self, path: str) -> None:
+        """Take over another denoiser's transformer; tokens are normalised anew."""
+        prefix = "transformer."
+        stored = {
+            name.removeprefix(prefix): value
+            for name, value in weights.read(weights.resolve(path))["state_dict"].items()
+            if name.startswith(prefix)
+        }
+        try:
+            self.transformer.load_state_dict(stored)
+        except RuntimeError as error:
+            raise ValueError(
+                f"start_from: {path} does not fit this model: {str(error).splitlines()[1].strip()}"
+            ) from error
 
     @torch.no_grad()
     def _fit_statistics(self) -> None:
@@ -289,7 +337,19 @@ class Denoiser(L.LightningModule):
             losses["consistency"] = rotation + translation
             ramp = min(1.0, (self.global_step + 1) / max(h.consistency_warmup, 1)) if self.training else 1.0
             total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
+        if h.pose_weight or h.motion_weight or h.partner_weight:
+            bodies = decoded_losses(self, clean, tokens, levels, scene.pad_agents(P), there, self._require_body())
+            weighted = {"pose": h.pose_weight, "motion": h.motion_weight, "partner": h.partner_weight}
+            total = total + sum(weighted[name] * value for name, value in bodies.items())
+            losses |= bodies
         return {"loss": total, **losses}
+
+    def _require_body(self) -> Body:
+        if not self._body:
+            datamodule = getattr(self._trainer, "datamodule", None)
+            # A copy, because this one moves to the model's device.
+            self._body = (copy.deepcopy(getattr(datamodule, "body", None) or load_body()).to(self.device),)
+        return self._body[0]
 
     def configure_optimizers(self) -> Any:
         self._require_tokenizer()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import from_planar, inverse, to_planar, turn
+from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar, turn
+from magnet.motion.scene import Scene
 
 
 def smoothstep(ramp: Tensor) -> Tensor:
@@ -77,3 +80,58 @@ def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tens
     """Add the turn that leads from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
     difference = roma.rotmat_to_rotvec(given @ decoded.transpose(-1, -2))
     return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation
+
+
+def paste(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
+    """Put given frames back; what they differ by at a seam fades out over the frames on its other side.
+
+    Args:
+        decoded: (B, T, P) the lossy reconstruction.
+        given: (B, T, P) what is known.
+        T_world_can: (B, T, P, 4, 4) where everybody stands.
+        keep: (T, P) bool, known frames.
+        blend: frames over which a seam fades out.
+    """
+    body_rot, T_world_root = decoded.body_rot, decoded.T_world_root
+    decoded_can_root = inverse(T_world_can) @ T_world_root
+    given_can_root = inverse(canonical_frame(given.T_world_root)) @ given.T_world_root
+    tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
+    agents = torch.arange(keep.shape[1], device=keep.device)
+    behind = (last_known(keep), seam_weights(keep, blend))
+    ahead = (next_known(keep), seam_weights(keep.flip(0), blend).flip(0))
+    for seam, fade in (behind, ahead):  # (T, P) each
+        given_at, decoded_at = given_can_root[:, seam, agents], decoded_can_root[:, seam, agents]
+        body_given, body_decoded = given.body_rot[:, seam, agents], decoded.body_rot[:, seam, agents]
+        body_rot = fade_rotation(body_rot, body_given, body_decoded, fade[..., None])
+        tilt = fade_rotation(tilt, given_at[..., :3, :3], decoded_at[..., :3, :3], fade)
+        lift = lift + fade[..., None] * (given_at - decoded_at)[..., :3, 3]
+    there = decoded.present[:, None, :, None, None]
+    blended = torch.where(there, T_world_can @ rigid(tilt, lift), T_world_root)
+    return decoded.replace(
+        body_rot=torch.where(keep[..., None, None, None], given.body_rot, body_rot),
+        T_world_root=torch.where(keep[..., None, None], given.T_world_root, blended),
+    )
+
+
+def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
+    """Agents that are neither given nor generated from some time on stand still from there.
+
+    there (T, P) bool; `before` is the frame in front of the scene's first, if there is one.
+    """
+    if bool(there.all()):
+        return scene
+    if before is not None:
+        whole = joined([before, scene])
+        return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).cut(1)
+    last, agents = last_known(there), torch.arange(there.shape[1], device=there.device)
+    return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
+
+
+def joined(pieces: Sequence[Scene]) -> Scene:
+    """Consecutive pieces of the same scenes as one."""
+    if len(pieces) == 1:
+        return pieces[0]
+    return pieces[0].replace(
+        body_rot=torch.cat([piece.body_rot for piece in pieces], dim=1),
+        T_world_root=torch.cat([piece.T_world_root for piece in pieces], dim=1),
+    )

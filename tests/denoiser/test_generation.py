@@ -1,10 +1,12 @@
 import pytest
 import torch
 
-from magnet.denoiser.canvas import Health, seam_weights
-from magnet.denoiser.generation import SamplerOptions, scrub, stretches
-from magnet.motion.frames import canonical_frame, pairwise
+from magnet.denoiser.canvas import Health
+from magnet.denoiser.generation import SamplerOptions, known_tokens, scrub, stretches
+from magnet.denoiser.seams import seam_weights
+from magnet.motion.frames import canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene
+from magnet.motion.tokens import scene_transforms
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.joint import Generation, JointFuture
@@ -173,7 +175,6 @@ def test_moving_the_world_moves_the_sample(model, scene):
 def test_tokens_fed_back_agree_with_the_world(model, scene):
     """After a stage, relations are what the placed agents imply."""
     from magnet.denoiser.canvas import Canvas
-    from magnet.denoiser.generation import known_tokens
     from magnet.motion.frames import from_9d
     from magnet.motion.tokens import by_frame, relations_by_frame
     from magnet.sampling.sampler import sample
@@ -227,6 +228,20 @@ def test_seams_fade_out_behind_known_frames():
     weights = seam_weights(keep, 3)[:, 0]
     assert weights[0] == 0 and weights[2] == 1 and weights[5] == 0
     assert (weights[2:].diff() <= 0).all()
+
+
+def test_the_step_into_a_keyframe_is_shown_as_the_keyframes_own_next_step(model, scene):
+    """Nobody knows where from it leads; at the very beginning it is standing still."""
+    known = torch.zeros(16, 3, dtype=torch.bool)
+    known[:2], known[6:8, 1], known[9, 2] = True, True, True
+    tokens = known_tokens(model, scrub(scene, known), known)
+    steps = model.layout.unpack(model.statistics.restore(tokens))[1]
+    true = scene_transforms(scene)[0]
+    for token, agent in ((6, 1), (9, 2)):
+        assert torch.allclose(steps[:, token, agent, 0], true[:, token, agent, 1], atol=1e-5)
+        assert torch.allclose(steps[:, token, agent, 1:], true[:, token, agent, 1:], atol=1e-5)
+    assert torch.allclose(steps[:, 7, 1], true[:, 7, 1], atol=1e-5)
+    assert torch.allclose(steps[:, 0, :, 0], to_9d(torch.eye(4)), atol=1e-5)
 
 
 def test_each_agents_unbroken_stretches_are_found():

@@ -1,0 +1,172 @@
+"""Sixty seconds and more from four frames: does the motion stay real?
+
+    MAGNET_CMU=... python benchmarks/long_horizon.py --ckpt_path duet --out runs/results/long
+
+Continues recorded test takes from 4 context frames for `--frames` frames. Every 5 seconds of what is generated are
+placed like recorded 5 seconds (one world a window, at its first frame) and compared with all recorded test windows:
+FD of each window, and of all windows so far (cumulative, as paper Fig. 7). Beside it: distance of the partners, speed
+of the joints, height of head and feet, which tell frozen, folded and floating bodies. Written: curve.png, strips,
+results.json, two scenes as npz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import torch
+from torch import Tensor
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from magnet import cli_record
+from magnet.body import load_body
+from magnet.datamodules.cmu import CMU
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
+from magnet.evaluation import aligned
+from magnet.export.picture import contact_sheet
+from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
+from magnet.metrics.frechet import moments
+from magnet.motion.scene import Scene, concatenate
+from magnet.report import machine
+from magnet.tasks.joint import JointFuture
+
+CONTEXT, WINDOW = 4, 150
+HEAD, FEET = 15, (10, 11)
+
+
+def windows(data: CMU, split: str, stride: int = 30) -> Scene:
+    """All recorded windows of a split, placed at their first frame."""
+    scenes = [
+        clip.scene.cut(start, start + WINDOW).replace(valid=None, names=())
+        for clip in data.clips(split)  # type: ignore[arg-type]
+        for start in range(0, clip.frames - WINDOW + 1, stride)
+    ]
+    return aligned(concatenate(scenes), 0)
+
+
+def pooled(joints: Tensor, present: Tensor) -> FrechetDistance:
+    metric = FrechetDistance()
+    metric.update(joints[None], joints, present)
+    return metric
+
+
+def distance(a: FrechetDistance, b: FrechetDistance) -> float:
+    return float(
+        frechet_distance(*moments(a.count[1], a.sum[1], a.outer[1]), *moments(b.count[1], b.sum[1], b.outer[1]))
+    )
+
+
+def describe(joints: Tensor, present: Tensor) -> dict[str, float]:
+    """What a window looks like. joints (B, T, P, 22, 3)"""
+    there = joints.transpose(1, 2)[present]
+    speed = 30 * there.diff(dim=1).norm(dim=-1).mean()
+    feet = there[:, :, list(FEET), 1].amin(dim=-1)
+    return {
+        "partner distance m": float(partner_distance(joints[:, :, 0], joints[:, :, 1]).median()),
+        "joint speed m/s": float(speed),
+        "head height m, lowest": float(there[:, :, HEAD, 1].min()),
+        "lower foot m, median": float(feet.median()),
+        "lower foot m, highest": float(feet.max()),
+        "slowest second m/s": float(slowest(there)),
+    }
+
+
+def slowest(people: Tensor) -> Tensor:
+    """Mean speed of the joints in the stillest second of anybody: near 0 is frozen. (M, T, 22, 3)"""
+    speed = 30 * people.diff(dim=1).norm(dim=-1).mean(dim=-1)
+    return speed.unfold(1, 29, 15).mean(dim=-1).min()
+
+
+def main() -> None:
+    """Generate, measure, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--ckpt_path", default=None)
+    parser.add_argument("--out", type=Path, default=Path("runs/results/long"))
+    parser.add_argument("--frames", type=int, default=1800)
+    parser.add_argument("--scenes", type=int, default=6, help="starts, evenly spaced over the test takes")
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--rolling", type=int, default=0)
+    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
+    given = parser.parse_args()
+    body, model = load_body(), Denoiser.load(given.ckpt_path)
+    data = CMU(singles=False, max_agents=model.layout.agents)
+    starts = [
+        clip.scene.cut(k * WINDOW, k * WINDOW + CONTEXT).replace(names=(f"{clip.name} [{k * WINDOW}]",), valid=None)
+        for clip in data.clips("test")
+        for k in range(clip.frames // WINDOW)
+    ]
+    chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
+    options = SamplerOptions(steps=given.steps, rolling=given.rolling)
+    generator = torch.Generator().manual_seed(1111)
+    began = time.perf_counter()
+    with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):
+        long = model.generate(concatenate(chosen), JointFuture(), CONTEXT, given.frames, 1, options, generator)
+    seconds = time.perf_counter() - began
+
+    real, training = windows(data, "test"), windows(data, "train")
+    real_joints = body.joints(real)
+    reference = pooled(real_joints, real.present)
+    floor = distance(pooled(body.joints(training), training.present), reference)
+    curve: list[dict[str, Any]] = []
+    so_far: list[Tensor] = []
+    for start in range(CONTEXT, CONTEXT + given.frames - WINDOW + 1, WINDOW):
+        window = aligned(long.cut(start, start + WINDOW), 0)
+        joints = body.joints(window)
+        so_far.append(joints)
+        cumulative = torch.cat(so_far)
+        there = window.present.repeat(len(so_far), 1)
+        curve.append(
+            {
+                "second": (start - CONTEXT + WINDOW) / 30,
+                "fd": distance(pooled(joints, window.present), reference),
+                "cumulative fd": distance(pooled(cumulative, there), reference),
+                **describe(joints, window.present),
+            }
+        )
+    facts = {
+        "floor: training windows against test windows": floor,
+        "recorded": describe(real_joints, real.present),
+        "finite": all(bool(value.isfinite().all()) for value in long.tensors().values()),
+        "seconds": round(seconds, 1),
+        "frames a second": round(given.frames * len(chosen) / seconds, 1),
+        "options": {key: str(value) for key, value in vars(given).items()},
+    }
+    given.out.mkdir(parents=True, exist_ok=True)
+    content = {"facts": facts, "curve": curve, "meta": cli_record.provenance() | {"machine": machine()}}
+    (given.out / "results.json").write_text(json.dumps(content, indent=1, default=str))
+    draw(curve, floor, given.out / "curve.png")
+    for b in range(min(2, long.scenes)):
+        moments_shown = [CONTEXT + round(i * (given.frames - 1) / 8) for i in range(9)]
+        one = long.pick([b])
+        contact_sheet(
+            [("", one)], given.out / f"strip_{b}.png", frames=moments_shown, context_frames=CONTEXT, body=body
+        )
+        one.save(given.out / f"scene_{b}.npz")
+    print(json.dumps(facts, indent=1))
+    for row in curve:
+        print({key: round(value, 3) for key, value in row.items()})
+
+
+def draw(curve: list[dict[str, Any]], floor: float, path: Path) -> None:
+    """FD over time, each window's and cumulative."""
+    figure, axes = plt.subplots(figsize=(6, 3.2), dpi=150)
+    seconds = [row["second"] for row in curve]
+    axes.plot(seconds, [row["cumulative fd"] for row in curve], color="#377fdd", label="all so far")
+    axes.plot(seconds, [row["fd"] for row in curve], ".", color="#f0911d", label="each 5 s")
+    axes.axhline(floor, color="#888888", lw=1, ls="--", label="recorded training takes")
+    axes.set(xlabel="seconds generated from 4 frames", ylabel="FD, m²", ylim=(0, None))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    figure.tight_layout()
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    main()

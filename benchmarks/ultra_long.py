@@ -1,0 +1,131 @@
+"""Memory and speed of scenes of any length, and whether their people are still upright and together at the end.
+
+    python benchmarks/ultra_long.py                                  # an untrained toy: 1,800 and 20,000 frames
+    python benchmarks/ultra_long.py --model duet --frames 1800       # the model that comes with the package
+
+Each line is a run in a process of its own. `grown` is by how much the process was at most larger than after its
+first piece of frames: it says whether a longer scene needs more memory. `plan` is what came before that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+
+import torch
+
+from magnet.datamodules.synthetic import Synthetic
+from magnet.denoiser.canvas import Health
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
+from magnet.denoiser.seams import joined
+from magnet.motion.scene import Scene
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+
+TOY = "toy"
+CONTEXT = 4  # frames, as in the paper's ultra-long runs
+MIB = 2**20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default=TOY, help="name or checkpoint of a trained model, or `toy`")
+    parser.add_argument("--frames", type=int, nargs="+", default=[1800, 20_000], help="lengths to measure")
+    parser.add_argument("--task", default="joint_future", help="name of a task, as `magnet tasks` lists them")
+    parser.add_argument("--steps", type=int, help="denoising steps; the toy's default is 2, a model's 30")
+    parser.add_argument("--rolling", type=int, default=0, help="denoising steps between a token and the next")
+    parser.add_argument("--coupling", default="circle", help="what the synthetic people in the context do")
+    parser.add_argument("--people", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--save", help="write the scene there, as npz; it is then held in memory whole")
+    options = parser.parse_args()
+    if len(options.frames) == 1:
+        measure(options)
+        return
+    without = [word for word in sys.argv[1:] if not word.isdigit() and word != "--frames"]
+    for frames in options.frames:
+        subprocess.run([sys.executable, __file__, *without, "--frames", str(frames)], check=True)
+
+
+def measure(options: argparse.Namespace) -> None:
+    """One run, one line."""
+    (frames,) = options.frames
+    task = registry.get(options.task)()
+    model = tiny_denoiser(max_agents=2, window=16) if options.model == TOY else Denoiser.load(options.model)
+    context = 0 if options.task == "generation" else CONTEXT
+    sampler = SamplerOptions(steps=options.steps or (2 if options.model == TOY else 30), rolling=options.rolling)
+    health = Health()
+    empty = resident()
+    began = time.perf_counter()
+    pieces = model.stream(
+        recorded(options, frames),
+        task,
+        context,
+        frames - context,
+        options=sampler,
+        generator=torch.Generator().manual_seed(options.seed),
+        health=health,
+    )
+    first = last = next(pieces)
+    kept: list[Scene] = [first]
+    planned = most = resident()
+    seen, finite = first.frames, True
+    for piece in pieces:
+        most, seen, last = max(most, resident()), seen + piece.frames, piece
+        if options.save:
+            kept.append(piece)
+        finite &= bool(piece.T_world_root.isfinite().all() and piece.body_rot.isfinite().all())
+    seconds = time.perf_counter() - began
+    assert seen == frames, f"{seen} frames instead of {frames}"
+    print(
+        f"{options.model} {options.task}: {frames} frames, {frames / seconds:.1f} frames/s, "
+        f"plan {(planned - empty) / MIB:.0f} MiB, grown {(most - planned) / MIB:.0f} MiB, "
+        f"peak {peak() / MIB:.0f} MiB, finite {finite}, {health.means()}"
+    )
+    for name, piece in (("first", first.cut(context)), ("last", last)):
+        print(f"  {name} piece: {looks(piece)}")
+    if options.save:
+        print(f"  saved: {joined(kept).save(options.save)}")
+
+
+def recorded(options: argparse.Namespace, frames: int) -> Scene:
+    """What the task may be given: as many frames as it needs of the toy, the context otherwise."""
+    if options.model == TOY:
+        given = options.task in ("partner_inpainting", "motion_control", "inbetweening")
+        return random_scene(1, frames if given else CONTEXT, 2, torch.Generator().manual_seed(1))
+    data = Synthetic(couplings=[options.coupling], people=[options.people], test_clips=1)
+    return data.clips("test")[0].scene.cut(0, CONTEXT)
+
+
+def looks(scene: Scene) -> str:
+    """Pelvis heights, how upright people are, how fast, how far from each other."""
+    there = scene.present[0]
+    root = scene.T_world_root[0][:, there]
+    height, up, place = root[..., 1, 3], root[..., 1, 1], root[..., [0, 2], 3]
+    speed = (place[1:] - place[:-1]).norm(dim=-1) * scene.fps
+    text = (
+        f"pelvis {height.min():.2f} to {height.max():.2f} m high, upright at least {up.min():.2f}, "
+        f"speed {speed.mean():.2f} m/s"
+    )
+    if int(there.sum()) > 1:
+        apart = torch.cdist(place, place)[:, *torch.triu_indices(int(there.sum()), int(there.sum()), 1)]
+        text += f", {apart.median():.2f} m apart"
+    return text
+
+
+def resident() -> int:
+    """Bytes that this process holds now."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def peak() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+if __name__ == "__main__":
+    main()

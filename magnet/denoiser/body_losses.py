@@ -1,0 +1,133 @@
+"""What predicted tokens mean for bodies: where joints are, how fast, and where the partner's are (ours)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.denoiser.losses import masked_mean
+from magnet.motion.frames import from_9d, partners, pose_features
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, relations_by_frame
+from magnet.sampling.noise import alpha_bar
+from magnet.tokenizer.losses import matrices
+
+if TYPE_CHECKING:
+    from magnet.body import Body
+    from magnet.denoiser.module import Denoiser
+
+FPS = 30.0
+
+Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""latent (B, N, P, C), betas (B, P, 10), steps (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
+Joints = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Forward kinematics: body_rot, T_frame_root, betas -> joints (..., 22, 3) in that frame"""
+
+
+def decoded_losses(
+    model: Denoiser, clean: Tensor, tokens: Tensor, levels: Tensor, scene: Scene, there: Tensor, body: Body
+) -> dict[str, Tensor]:
+    """`body_losses` on the least noisy scenes of a batch, `decoded_share` of them.
+
+    clean (B, N, P, D) predicted, normalised; tokens the true ones in real units; levels (B, N, P); there as below.
+    """
+    signal = alpha_bar(levels)
+    chosen = surest(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
+    few, kind = scene.pick(chosen), model.device.type
+    dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
+
+    def decode(latent: Tensor, betas: Tensor, steps: Tensor) -> Tensor:
+        with torch.autocast(kind, dtype, half):  # only networks may run in half precision
+            return model.tokenizer.decode(latent, betas, steps)
+
+    with torch.autocast(kind, enabled=False):
+        return body_losses(
+            model.statistics.restore(clean[chosen]),
+            tokens[chosen],
+            pose_features(few),
+            few.betas,
+            signal[chosen],
+            there[chosen],
+            model.layout,
+            decode,
+            body.forward_kinematics,
+        )
+
+
+def surest(signal: Tensor, there: Tensor, count: int) -> Tensor:
+    """The scenes of a batch whose tokens are least noisy: only there a mean is close to a motion.
+
+    signal (B, N, P) share of signal, there (B, N, P, G) bool -> (count,) int
+    """
+    counts = there[..., 0]
+    mean = torch.where(counts, signal, 0.0).sum(dim=(1, 2)) / counts.sum(dim=(1, 2)).clamp_min(1)
+    return mean.topk(min(count, len(mean))).indices
+
+
+def body_losses(
+    tokens: Tensor,
+    truth: Tensor,
+    true_pose: Tensor,
+    betas: Tensor,
+    signal: Tensor,
+    there: Tensor,
+    layout: TokenLayout,
+    decode: Decode,
+    joints: Joints,
+) -> dict[str, Tensor]:
+    """Errors of decoded bodies, each weighted by how little noise the tokens had.
+
+    Args:
+        tokens: (B, N, P, D) predicted, in real units.
+        truth: (B, N, P, D) the same of the recording; its latents are not read.
+        true_pose: (B, T, P, 135) of the recording.
+        betas: (B, P, 10).
+        signal: (B, N, P) share of signal of the noisy tokens.
+        there: (B, N, P, 1 + slots) bool, as in `token_losses`.
+        layout: of the tokens.
+        decode: the frozen tokenizer's.
+        joints: of the body.
+
+    Returns:
+        pose: distance of joints in one's own canonical frame, metres. motion: error of the joints' velocities over
+        the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres.
+    """
+    latent, steps, relations = layout.unpack(tokens)
+    _, true_steps, true_relations = layout.unpack(truth)
+    shape = betas[:, None]
+    mine = joints(*matrices(decode(latent, betas, steps)), shape)  # (B, T, P, 22, 3)
+    real = joints(*matrices(true_pose), shape)
+    weight = signal.repeat_interleave(STRIDE, dim=1)  # (B, T, P)
+    counts = there.repeat_interleave(STRIDE, dim=1)
+    own = counts[..., 0]
+    losses = {"pose": masked_mean(weight * _mean_length(mine - real), own)}
+
+    velocity = _velocity(mine, by_frame(steps)) - _velocity(real, by_frame(true_steps))
+    both = own[:, 1:] & own[:, :-1]
+    losses["motion"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
+    if layout.slots:
+        other = partners(layout.agents, tokens.device)
+        seen = _apply(relations_by_frame(relations), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)
+        seen_real = _apply(relations_by_frame(true_relations), real[:, :, other])
+        least = torch.minimum(weight[..., None], weight[:, :, other])
+        losses["partner"] = masked_mean(least * _mean_length(seen - seen_real), counts[..., 1:])
+    return losses
+
+
+def _velocity(joints: Tensor, steps: Tensor) -> Tensor:
+    """Way of the joints from frame to frame over the ground. (B, T, P, 22, 3), (B, T, P, 9) -> (B, T - 1, P, 22, 3)"""
+    return _apply(steps[:, 1:], joints[:, 1:]) - joints[:, :-1]
+
+
+def _apply(nine: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 22, 3) moved by transforms (..., 9)."""
+    T = from_9d(nine)
+    return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
+
+
+def _mean_length(away: Tensor) -> Tensor:
+    """Mean over joints, with a slope at 0 that is finite. (..., 22, 3) -> (...)"""
+    return (away.square().sum(-1) + 1e-8).sqrt().mean(-1)

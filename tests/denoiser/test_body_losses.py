@@ -1,0 +1,106 @@
+import pytest
+import torch
+
+from magnet.body import load_body
+from magnet.denoiser.body_losses import body_losses, surest
+from magnet.motion.frames import canonical_frame, inverse, pose_features
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TokenLayout, scene_transforms
+from magnet.testing import random_scene, tiny_denoiser
+
+LAYOUT = TokenLayout(latent=8, agents=3)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+def tokens_of(scene: Scene) -> torch.Tensor:
+    steps, relations = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, relations)
+
+
+def run(body, seen: Scene, real: Scene, signal: float = 1.0, there: torch.Tensor | None = None):
+    """Losses where the tokens say and the decoder decodes what `seen` is, and `real` was recorded."""
+    tokens, truth = tokens_of(seen), tokens_of(real)
+    counts = torch.ones(*tokens.shape[:3], 3, dtype=torch.bool) if there is None else there
+    return body_losses(
+        tokens,
+        truth,
+        pose_features(real),
+        real.betas,
+        torch.full(tokens.shape[:3], signal),
+        counts,
+        LAYOUT,
+        lambda latent, betas, steps: pose_features(seen),
+        body.forward_kinematics,
+    )
+
+
+def test_the_truth_costs_nothing(body, generator):
+    scene = random_scene(2, 32, 3, generator)
+    assert all(loss < 1e-3 for loss in run(body, scene, scene).values())
+
+
+def test_the_terms_are_distances_and_speeds_of_joints(body, generator):
+    """Against joints in the world, brought into each one's own frame."""
+    seen, real = (random_scene(1, 16, 3, torch.Generator().manual_seed(seed)) for seed in (1, 2))
+    seen = seen.replace(betas=real.betas)
+    got = run(body, seen, real)
+    T_can_world = [inverse(canonical_frame(scene.T_world_root)) for scene in (seen, real)]
+    world = [body.joints(scene) for scene in (seen, real)]
+
+    def local(which: int, of: int, by: int, shift: int = 0) -> torch.Tensor:
+        """Joints of agent `of` in agent `by`'s canonical frame, that of `shift` frames before. (T, 22, 3)"""
+        T = T_can_world[which][0, : 16 - shift, by]
+        points = world[which][0, shift:, of]
+        return points @ T[:, :3, :3].transpose(-1, -2) + T[:, None, :3, 3]
+
+    own = torch.stack([(local(0, p, p) - local(1, p, p)).norm(dim=-1) for p in range(3)])
+    assert got["pose"] == pytest.approx(float(own.mean()), rel=1e-4)
+    way = [torch.stack([local(w, p, p, 1) - local(w, p, p)[:-1] for p in range(3)]) for w in (0, 1)]
+    assert got["motion"] == pytest.approx(float(30 * (way[0] - way[1]).norm(dim=-1).mean()), rel=1e-4)
+    pairs = [(of, by) for of in range(3) for by in range(3) if of != by]
+    seen_away = torch.stack([(local(0, of, by) - local(1, of, by)).norm(dim=-1) for of, by in pairs])
+    assert got["partner"] == pytest.approx(float(seen_away.mean()), rel=1e-4)
+
+
+def test_noisy_tokens_count_less_and_absent_agents_not_at_all(body, generator):
+    seen, real = (random_scene(1, 16, 3, torch.Generator().manual_seed(seed)) for seed in (1, 2))
+    full, half = run(body, seen, real), run(body, seen, real, signal=0.5)
+    for name in full:
+        assert half[name] == pytest.approx(0.5 * float(full[name]), rel=1e-4)
+    nobody = torch.zeros(1, 4, 3, 3, dtype=torch.bool)
+    assert all(loss == 0 for loss in run(body, seen, real, there=nobody).values())
+
+
+def test_the_surest_scenes_are_those_with_the_least_noise():
+    signal = torch.tensor([0.1, 0.9, 0.5])[:, None, None].expand(3, 4, 2)
+    there = torch.ones(3, 4, 2, 2, dtype=torch.bool)
+    assert surest(signal, there, 2).tolist() == [1, 2]
+    there[1] = False
+    assert surest(signal, there, 2).tolist() == [2, 0], "a scene without anybody tells nothing"
+
+
+def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
+    model = tiny_denoiser(max_agents=3, window=8, pose_weight=1.0, motion_weight=0.1, partner_weight=0.5)
+    model.train()
+    losses = model._losses(random_scene(4, 32, 3, generator), generator)
+    losses["loss"].backward()
+    assert {"pose", "motion", "partner"} <= losses.keys()
+    assert all(weight.grad is not None for weight in model.transformer.blocks.parameters())
+    assert all(weight.grad is None for weight in model.tokenizer.parameters())
+    assert not [name for name in model.state_dict() if name.startswith("body")], "a body is no part of a checkpoint"
+
+
+def test_a_denoiser_starts_from_anothers_weights(tmp_path):
+    first, second = tiny_denoiser(seed=1), tiny_denoiser(seed=2)
+    checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
+    first.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "first.ckpt")
+    second._start_from(str(tmp_path / "first.ckpt"))
+    for name, value in second.transformer.state_dict().items():
+        assert torch.equal(value, first.transformer.state_dict()[name])
+    with pytest.raises(ValueError, match=r"start_from: .* does not fit this model: size mismatch"):
+        tiny_denoiser(width=64)._start_from(str(tmp_path / "first.ckpt"))
