@@ -22,6 +22,7 @@ from magnet.body import Body
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
+from magnet.datamodules.speeds import at_speed
 from magnet.motion.scene import Scene
 
 FIT_VERSION = 3
@@ -70,6 +71,7 @@ class CMU(MotionDataModule):
         fps: frame rate of a subject's recordings by its number, which AMC files do not say; adds to `RATES`, and
             others have 120.
         trim: cut two people's files of unequal length to the shorter instead of refusing them.
+        speeds: training recordings are also played at each of these speeds, such as 0.9 and 1.1.
         **kwargs: as for MotionDataModule.
 
     Raises:
@@ -87,6 +89,7 @@ class CMU(MotionDataModule):
         val_singles: Sequence[str] = ("02_03", "05_12"),
         fps: dict[str, float] | None = None,
         trim: bool = False,
+        speeds: Sequence[float] = (),
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
@@ -100,6 +103,7 @@ class CMU(MotionDataModule):
         self.test_singles, self.val_singles = tuple(test_singles), tuple(val_singles)
         self.fps = {**RATES, **(fps or {})}
         self.trim = trim
+        self.speeds = tuple(speeds)
 
     # -- Lightning -----------------------------------------------------------------------------
 
@@ -130,7 +134,10 @@ class CMU(MotionDataModule):
         for take in takes:
             if self.split_of(take) == split and self._file(take).exists():
                 source = "cmu-couples" if take.couple else "cmu-singles"
-                clips.append(Clip(Scene.load(self._file(take)), take.name, source, split))
+                scene = Scene.load(self._file(take))
+                clips.append(Clip(scene, take.name, source, split))
+                for speed in self.speeds if split == "train" else ():
+                    clips.append(Clip(at_speed(scene, speed), f"{take.name} x{speed:g}", source, split))
         return clips
 
     # -- files ---------------------------------------------------------------------------------

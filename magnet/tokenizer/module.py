@@ -18,6 +18,7 @@ from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
 from magnet.optim import adamw_cosine
 from magnet.seeding import derive
+from magnet.tokenizer.augment import exchange_limbs, turn_joints
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
 from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
 from magnet.tokenizer.features import Features, features, statistics, step_known
@@ -54,6 +55,11 @@ class Tokenizer(L.LightningModule):
         commitment_weight: pulls embeddings to their codes; the paper does not say.
         joint_weight: adds the distance of the joints in metres to the loss (ours).
         velocity_weight: adds the error of the joints' velocities in m/s to the loss, against flicker (ours).
+        exchange_limbs: share of limbs that in training move as somebody else's of the batch do (ours).
+        turn_joints: radians by which joints are turned at random in training (ours); with exchanged limbs it
+            keeps a small data set from being learnt by heart.
+        start_from: checkpoint of a tokenizer whose encoder and decoder training starts from; codes start anew
+            where there is another number of them.
         std_floor: smallest standard deviation used for z-scores of poses and steps.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -78,6 +84,9 @@ class Tokenizer(L.LightningModule):
         commitment_weight: float = 0.3,
         joint_weight: float = 0.0,
         velocity_weight: float = 0.0,
+        exchange_limbs: float = 0.0,
+        turn_joints: float = 0.0,
+        start_from: str | None = None,
         std_floor: float = 1e-2,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
@@ -210,6 +219,8 @@ class Tokenizer(L.LightningModule):
         return bool(self.codebook.started) and bool(self.vqvae.pose.ready)
 
     def on_fit_start(self) -> None:
+        if self.hparams["start_from"] and not self._prepared:
+            self._start_from(Path(self.hparams["start_from"]))
         batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
         if not self._prepared and batches is not None:
             self.prepare(batches())
@@ -221,7 +232,26 @@ class Tokenizer(L.LightningModule):
         if not self._prepared:
             self.prepare(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
+    def _start_from(self, path: Path) -> None:
+        """Take over another tokenizer's networks and statistics, and its codes where there are as many."""
+        _, state = read_checkpoint(path)
+        mine = self.state_dict()
+        kept = {name: value for name, value in state.items() if name in mine and mine[name].shape == value.shape}
+        if lost := [name for name in mine if name.startswith("vqvae.") and name not in kept]:
+            raise ValueError(f"start_from: {path} has other networks than this tokenizer: {lost[0]} does not fit")
+        if "codebook.codes" not in kept:
+            kept = {name: value for name, value in kept.items() if not name.startswith("codebook.")}
+        self.load_state_dict(kept, strict=False)
+
+    def _augmented(self, scene: Scene, batch_idx: int) -> Scene:
+        h = self.hparams
+        generator = self._generator("augment", self.global_step, batch_idx)
+        if h["exchange_limbs"]:
+            scene = exchange_limbs(scene, h["exchange_limbs"], generator)
+        return turn_joints(scene, h["turn_joints"], generator) if h["turn_joints"] else scene
+
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
+        batch = self._augmented(batch, batch_idx)
         seen = features(batch)
         losses, pose, quantised = self._losses(seen, batch_idx)
         if self._trainer is not None:

@@ -1,0 +1,60 @@
+"""Poses nobody recorded, for a tokenizer that must code them all (ours)."""
+
+from __future__ import annotations
+
+import roma
+import torch
+from torch import Tensor
+
+from magnet.motion.scene import Scene
+
+LIMBS = {
+    "left leg": (1, 4, 7, 10),
+    "right leg": (2, 5, 8, 11),
+    "trunk": (3, 6, 9),
+    "head": (12, 15),
+    "left arm": (13, 16, 18, 20),
+    "right arm": (14, 17, 19, 21),
+}
+"""Joints of SMPL-X that move together; an arm begins at the collar."""
+
+
+def exchange_limbs(scene: Scene, probability: float, generator: torch.Generator) -> Scene:
+    """Give each limb of each person, with a probability, the motion of that limb of somebody else in the batch.
+
+    A few minutes of dance hold few pairs of an upper and a lower body; a pose coder should not learn which.
+    """
+    B, P = scene.present.shape
+    people = scene.present.flatten().nonzero()[:, 0]
+    if len(people) < 2:
+        return scene
+    flat = scene.body_rot.transpose(1, 2).flatten(0, 1)  # (B P, T, 21, 3, 3)
+    mixed = flat.clone()
+    for limb in LIMBS.values():
+        joints = torch.tensor(limb, device=flat.device) - 1
+        chosen = people[_rand(len(people), generator, flat) < probability]
+        donors = people[(_rand(len(chosen), generator, flat) * len(people)).long()]
+        mixed[chosen[:, None], :, joints] = flat[donors[:, None], :, joints]
+    return scene.replace(body_rot=mixed.unflatten(0, (B, P)).transpose(1, 2))
+
+
+def turn_joints(scene: Scene, angle: float, generator: torch.Generator) -> Scene:
+    """Turn each joint of each person by a random rotation of its own, the same in all frames.
+
+    Args:
+        angle: standard deviation in radians about each axis; the pelvis turns by a third of it.
+    """
+    B, P = scene.present.shape
+    draws = torch.randn(B, 1, P, 22, 3, generator=generator, device=generator.device).to(scene.body_rot)
+    turns = roma.rotvec_to_rotmat(angle * draws)
+    tilt = torch.eye(4, dtype=turns.dtype, device=turns.device).repeat(B, 1, P, 1, 1)
+    tilt[..., :3, :3] = roma.rotvec_to_rotmat(angle / 3 * draws[..., 0, :])
+    present = scene.present[:, None, :, None, None]
+    return scene.replace(
+        body_rot=torch.where(present[..., None], scene.body_rot @ turns[..., 1:, :, :], scene.body_rot),
+        T_world_root=torch.where(present, scene.T_world_root @ tilt, scene.T_world_root),
+    )
+
+
+def _rand(n: int, generator: torch.Generator, like: Tensor) -> Tensor:
+    return torch.rand(n, generator=generator, device=generator.device).to(like.device)
