@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from magnet.api import Model, Motion, load, read
     from magnet.body import load_body
     from magnet.denoiser.module import Denoiser
     from magnet.motion.scene import Scene
@@ -14,14 +15,29 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["Denoiser", "Scene", "Tokenizer", "__version__", "load_body", "register_task"]
+__all__ = [
+    "Denoiser",
+    "Model",
+    "Motion",
+    "Scene",
+    "Tokenizer",
+    "__version__",
+    "load",
+    "load_body",
+    "read",
+    "register_task",
+]
 
 # Torch takes a second to import, Lightning three: nobody pays for them before they use them.
 _EXPORTS = {
     "Denoiser": "magnet.denoiser.module",
+    "Model": "magnet.api",
+    "Motion": "magnet.api",
     "Scene": "magnet.motion.scene",
     "Tokenizer": "magnet.tokenizer.module",
+    "load": "magnet.api",
     "load_body": "magnet.body",
+    "read": "magnet.api",
     "register_task": "magnet.tasks.registry",
 }
 

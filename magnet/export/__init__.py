@@ -1,8 +1,25 @@
-"""What leaves the project: moving and still pictures, and files other tools read."""
+"""What leaves the project and comes back: moving and still pictures, and files other tools read and write."""
 
+from magnet.export.bvh import save_bvh
+from magnet.export.glb import save_glb
+from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.picture import contact_sheet, topview
+from magnet.export.retarget import load_bvh
+from magnet.export.retime import resampled
 from magnet.export.stage import Camera
 from magnet.export.video import render_video
 
-__all__ = ["Camera", "contact_sheet", "load_smplx", "render_video", "save_smplx", "topview"]
+__all__ = [
+    "Camera",
+    "contact_sheet",
+    "load_bvh",
+    "load_smplx",
+    "render_video",
+    "resampled",
+    "save_bvh",
+    "save_csv",
+    "save_glb",
+    "save_smplx",
+    "topview",
+]

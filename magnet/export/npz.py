@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Protocol
 
@@ -70,32 +71,45 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
     return paths
 
 
-def load_smplx(path: str | Path, body: Shaped) -> Scene:
-    """Read what `save_smplx` wrote, one person or several. -> Scene with B = 1, float32
+def load_smplx(path: str | Path, body: Shaped, up: str | None = None) -> Scene:
+    """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several. -> Scene with B = 1, float32
+
+    Also read: AMASS's names (`trans`, `mocap_framerate`, `root_orient` and `pose_body`), more or fewer than ten betas
+    (the first ten count), no betas (zero). A file that does not name its body is SMPL-X's: its betas are taken if
+    `body` is not the open one, and are zero otherwise.
+
+    Args:
+        up: axis of the file that points up, `y` or `z`. None: y in files of ours, in others the axis along which
+            pelvises stand.
 
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: no such file's keys or shapes, or another body's.
     """
-    with np.load(path, allow_pickle=False) as file:
-        wanted = {"poses", "transl", "betas", "mocap_frame_rate"}
-        missing = sorted(wanted - set(file.files))
-        if missing:
-            raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {', '.join(sorted(file.files))}")
-        poses, transl, betas = (torch.from_numpy(file[key]).double() for key in ("poses", "transl", "betas"))
-        fps = float(file["mocap_frame_rate"])
-        written_for = str(file["body"]) if "body" in file.files else body.id
-        name = str(file["name"]) if "name" in file.files else ""
-    if written_for != body.id:
+    arrays, fps, written_for, name = _read(Path(path))
+    if written_for is not None and written_for != body.id:
         raise ValueError(f"{path}: written for body {written_for!r}, but {body.id!r} was given")
+    poses, transl, betas = arrays["poses"], arrays["transl"], arrays["betas"]
     if poses.ndim == 2:
-        poses, transl, betas = poses[None], transl[None], betas[None]
+        poses, transl, betas = poses[None], transl[None], betas.reshape(1, -1)
     P, T = poses.shape[:2]
-    if poses.ndim != 3 or poses.shape[-1] < 3 * BODY_JOINTS or transl.shape != (P, T, 3) or betas.shape != (P, 10):
+    fits = poses.ndim == 3 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
+    if not fits or betas.ndim != 2 or len(betas) != P:
         shapes = f"poses {tuple(poses.shape)}, transl {tuple(transl.shape)}, betas {tuple(betas.shape)}"
         raise ValueError(f"{path}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10)")
+    betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
+    if written_for is None and body.id.startswith("open"):
+        betas = torch.zeros_like(betas)
     rotations = roma.rotvec_to_rotmat(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
     pelvis = transl + body.rest_joints(betas.float())[:, 0].double()[:, None]
     T_world_root = rigid(rotations[:, :, 0], pelvis)
+    if up is None:
+        standing = T_world_root[..., :3, 1].mean(dim=(0, 1))
+        up = "z" if written_for is None and standing[2] > standing[1].abs() else "y"
+    if up not in ("y", "z"):
+        raise ValueError(f"up axis {up!r}: expected y or z in a npz")
+    if up == "z":
+        T_world_root = Z_UP @ T_world_root
     return Scene(
         body_rot=rotations[:, :, 1:].transpose(0, 1)[None].float(),
         T_world_root=T_world_root.transpose(0, 1)[None].float(),
@@ -105,3 +119,40 @@ def load_smplx(path: str | Path, body: Shaped) -> Scene:
         body=body.id,
         names=(name,) if name else (),
     )
+
+
+Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+"""From a world whose z points up to ours."""
+
+ALSO = {"transl": ("transl", "trans"), "mocap_frame_rate": ("mocap_frame_rate", "mocap_framerate", "fps")}
+"""Our keys, and those that mean the same."""
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
+    """Arrays by our keys, frames a second, the body that the file was written for if it says so, and its name."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            there = set(file.files)
+            key = {ours: next((k for k in keys if k in there), ours) for ours, keys in ALSO.items()}
+            parts = ["poses"] if "poses" in there else ["root_orient", "pose_body"]
+            missing = [part for part in parts if part not in there] and ["poses"]
+            missing += [ours for ours, its in key.items() if its not in there]
+            if "body" in there and "betas" not in there:
+                missing.append("betas")
+            if missing:
+                has = ", ".join(sorted(there))
+                raise ValueError(f"{path}: lacks {', '.join(sorted(missing))}; it has {has}")
+            poses = np.concatenate([file[part] for part in parts], axis=-1)
+            transl, fps = file[key["transl"]], float(file[key["mocap_frame_rate"]])
+            betas = file["betas"] if "betas" in there else np.zeros((*poses.shape[:-2], 10))
+            written_for = str(file["body"]) if "body" in there else None
+            name = str(file["name"]) if "name" in there else ""
+    except (OSError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
+    arrays = {"poses": poses, "transl": transl, "betas": betas}
+    bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
+    if bad or not fps > 0:
+        raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
+    return {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}, fps, written_for, name

@@ -1,0 +1,302 @@
+"""What Python users need: `magnet.load("duet").generate(people=2)`, and scenes that show and save themselves."""
+
+from __future__ import annotations
+
+import base64
+import html
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from magnet.body import Body, load_body
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
+from magnet.export import formats
+from magnet.motion.scene import Scene, absent
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+
+if TYPE_CHECKING:
+    from magnet.tasks.base import Task
+
+FPS = 30.0
+"""The rate that models are trained at."""
+
+Player = Literal["page", "film"]
+
+
+def load(name_or_path: str | Path | None = None, *, device: str | torch.device = "cpu", steps: int = 30) -> Model:
+    """A trained model: one that comes with the package by its name ("duet"), or a checkpoint's path.
+
+    Args:
+        device: where it runs.
+        steps: denoising steps; fewer are faster and coarser.
+
+    Raises:
+        ValueError: no such model; names those there are.
+    """
+    return Model(Denoiser.load(name_or_path).to(device), SamplerOptions(steps=steps))
+
+
+def read(
+    *paths: str | Path,
+    body: str | Path | Body | None = None,
+    fps: float | None = FPS,
+    trim: bool = False,
+    unit: str | None = None,
+    up: str | None = None,
+    joints: dict[str, str] | None = None,
+    keep_floor: bool = False,
+) -> Motion:
+    """A scene from a file of ours, SMPL-X npz files or BVH files of any skeleton; several files are several people.
+
+    Args:
+        body: the scene's body model, or its file; None: the open one.
+        fps: brought to this rate, the models'; None: as recorded.
+        trim, unit, up, joints, keep_floor: as in `magnet.export.load_bvh`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a file that cannot be read, or files that do not go together; says what to do.
+    """
+    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor)
+    got = formats.read(list(paths), body, options)
+    return Motion.of(got.scene, got.body, None, got.notes)
+
+
+# -- scenes that show themselves ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Motion(Scene):
+    """A scene that knows its body, which of its frames were given, and how to show and save itself."""
+
+    model: Body | None = None  # the body model `betas` belong to; None: the open one
+    known: Tensor | None = None  # (T, P) bool, given to the model and not sampled; None: nothing was
+    notes: tuple[str, ...] = ()  # what is worth knowing about how it was read
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.known is not None and tuple(self.known.shape) != (self.frames, self.agents):
+            object.__setattr__(self, "known", None)  # frames or agents were changed by those who know nothing of it
+
+    @classmethod
+    def of(
+        cls, scene: Scene, model: Body | None = None, known: Tensor | None = None, notes: Sequence[str] = ()
+    ) -> Motion:
+        """The same motion with what this class adds."""
+        fields = {**scene.tensors(), "fps": scene.fps, "body": scene.body, "names": scene.names}
+        return cls(**fields, model=model, known=known, notes=tuple(notes))  # type: ignore[arg-type]
+
+    def cut(self, start: int, stop: int | None = None) -> Motion:
+        known = None if self.known is None else self.known[start:stop]
+        return Motion.of(super().cut(start, stop), self.model, known, self.notes)
+
+    def order(self, agents: Tensor) -> Motion:
+        known = None if self.known is None else self.known[:, agents]
+        return Motion.of(super().order(agents), self.model, known, self.notes)
+
+    def plain(self) -> Scene:
+        """The scene without what this class adds."""
+        tensors = self.tensors()
+        return Scene(**tensors, fps=self.fps, body=self.body, names=self.names)
+
+    def joints(self) -> Tensor:
+        """World joints of everybody. -> (B, T, P, 22, 3) metres"""
+        return self._body().joints(self)
+
+    def vertices(self) -> Tensor:
+        """World vertices of everybody. -> (B, T, P, V, 3) metres"""
+        return self._body().vertices(self)
+
+    def save(self, path: str | Path, **options: Any) -> Path:
+        """Write the format of the path's suffix: .npz .bvh .glb .csv .html .mp4 .gif .webp .png.
+
+        Options are those of `magnet.export.formats.write`: fps, unit, smplx, style, title.
+
+        Returns:
+            The path written; the first of them where a format needs several files (a BVH a person).
+
+        Raises:
+            ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
+        """
+        path = Path(path)
+        if path.suffix == ".npz" and not options:
+            return super().save(path)
+        given = {"known": self.known, "context_frames": self.context, **options}
+        return formats.write(self.plain(), path, self._body(), **given)[0]
+
+    @property
+    def context(self) -> int:
+        """How many first frames were given of everybody."""
+        return 0 if self.known is None else int(self.known.all(dim=1).long().cumprod(dim=0).sum())
+
+    def show(self, scene: int = 0, player: Player = "page", **options: Any) -> Shown:
+        """Something a notebook plays inline.
+
+        Args:
+            scene: which of the B scenes.
+            player: `page`, an interactive player that works without a server, or `film`, an animated picture.
+            options: of `save` for that kind: style, title, fps.
+        """
+        one = Motion.of(self.pick([scene]), self.model, self.known)
+        with tempfile.TemporaryDirectory() as folder:
+            kind = {"page": ".html", "film": ".webp"}[player]
+            if player == "film":
+                options = {"style": "skeleton", "fps": 15.0, **options}
+            path = one.save(Path(folder) / f"scene{kind}", **options)
+            return Shown(path.read_bytes(), kind)
+
+    def _body(self) -> Body:
+        return self.model or load_body("open")
+
+
+@dataclass(frozen=True, repr=False)
+class Shown:
+    """A page or a film: notebooks play it inline, elsewhere `save` it."""
+
+    data: bytes
+    kind: str  # .html or .webp
+
+    def _repr_html_(self) -> str:
+        if self.kind == ".html":
+            page = html.escape(self.data.decode(), quote=True)
+            return f'<iframe srcdoc="{page}" style="width:100%;height:520px;border:0" allowfullscreen></iframe>'
+        return f'<img alt="scene" src="data:image/webp;base64,{base64.b64encode(self.data).decode()}">'
+
+    def save(self, path: str | Path) -> Path:
+        """Write it to a file, for a browser. Returns the path written."""
+        path = Path(path).with_suffix(self.kind)
+        path.write_bytes(self.data)
+        return path
+
+    def __repr__(self) -> str:
+        return f"a {len(self.data) / 1e6:.1f} MB {self.kind}, played in notebooks; elsewhere .save('scene{self.kind}')"
+
+
+# -- a model -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model and how it samples.
+
+    Every method takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
+    b * samples + s of the result, which includes the given frames.
+    """
+
+    denoiser: Denoiser
+    sampler: SamplerOptions = field(default_factory=SamplerOptions)
+
+    @property
+    def most_people(self) -> int:
+        return self.denoiser.layout.agents
+
+    def generate(self, people: int = 2, frames: int = 300, *, seed: int | None = None, samples: int = 1) -> Motion:
+        """A scene from nothing, of people of average shape.
+
+        Raises:
+            ValueError: more people than the model has room for.
+        """
+        if not 1 <= people <= self.most_people:
+            raise ValueError(f"people: got {people}, the model takes 1 to {self.most_people}")
+        empty = absent(1, STRIDE, people, torch.zeros(()))
+        scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
+        return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples)
+
+    def continue_(
+        self, scene: Scene, frames: int = 150, *, context: int | None = None, seed: int | None = None, samples: int = 1
+    ) -> Motion:
+        """How a scene goes on for everybody in it.
+
+        Args:
+            context: how many of its last frames the model starts from; None: all of them. Rounded down to a multiple
+                of 4; the result begins with them.
+
+        Raises:
+            ValueError: fewer than 4 frames.
+        """
+        given = min(scene.frames, context or scene.frames) // STRIDE * STRIDE
+        scene = scene.cut(scene.frames - given)
+        return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
+
+    def inpaint(
+        self, scene: Scene, agent: int | Sequence[int] = 0, *, seed: int | None = None, samples: int = 1
+    ) -> Motion:
+        """The whole motion of some agents, given all of the others'; nothing of theirs in `scene` is read.
+
+        An agent beyond those in the scene is added: `inpaint(solo, agent=1)` gives a person a partner.
+        """
+        targets = (agent,) if isinstance(agent, int) else tuple(agent)
+        scene = self._with_room(scene, max(targets) + 1)
+        present = scene.present.clone()
+        present[:, list(targets)] = True
+        scene = scene.replace(present=present)
+        return self.predict(scene, "partner_inpainting", context=0, seed=seed, samples=samples, target=targets)
+
+    def react(
+        self, scene: Scene, agent: int = 0, *, context: int = 32, seed: int | None = None, samples: int = 1
+    ) -> Motion:
+        """An agent's answer, from its first `context` frames on, to what the others do up to each moment."""
+        return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=(agent,))
+
+    def predict(
+        self,
+        scene: Scene,
+        task: str = "joint_future",
+        *,
+        context: int = 32,
+        frames: int | None = None,
+        seed: int | None = None,
+        samples: int = 1,
+        **fields: Any,
+    ) -> Motion:
+        """Sample any task; see `magnet tasks`, and `fields` are its own.
+
+        Args:
+            context: frames given of everybody at the start, a multiple of 4.
+            frames: frames after the context; None: to the end of the scene.
+
+        Raises:
+            ValueError: no such task, or a scene it makes no sense on; says what to do.
+        """
+        kind = registry.get(task)
+        if abs(scene.fps - FPS) > 1e-3:
+            raise ValueError(
+                f"the scene runs at {scene.fps:g} fps, the model at {FPS:g}: "
+                f"use magnet.export.resampled(scene, {FPS:g})"
+            )
+        slots = scene.agents
+        if slots > self.most_people:
+            raise ValueError(f"the scene has {slots} agents, the model takes 1 to {self.most_people}")
+        if frames is None:
+            frames = scene.frames // STRIDE * STRIDE - context
+        if frames < 1:
+            raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
+        chosen: Task = kind(**fields)
+        generator = torch.Generator(self.denoiser.device)
+        generator.manual_seed(seed) if seed is not None else generator.seed()
+        plain = scene.plain() if isinstance(scene, Motion) else scene
+        sampled = self.denoiser.generate(plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
+        grid = Grid(
+            -(-(context + frames) // STRIDE),
+            self.most_people,
+            context // STRIDE,
+            self.sampler.steps,
+            self.denoiser.window,
+            self.sampler.stride,
+        )
+        known = chosen.schedule(grid).known.repeat_interleave(STRIDE, dim=0)[: context + frames, :slots]
+        model = scene.model if isinstance(scene, Motion) else None
+        return Motion.of(sampled.order(torch.arange(slots)), model, known)
+
+    def _with_room(self, scene: Scene, slots: int) -> Scene:
+        if slots > self.most_people:
+            raise ValueError(f"agent {slots - 1}: the model takes agents 0 to {self.most_people - 1}")
+        return scene.pad_agents(max(slots, scene.agents))

@@ -1,0 +1,134 @@
+"""Scenes as BVH files, one a person, for Blender, MotionBuilder and whatever else reads skeletons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+Unit = Literal["m", "cm"]
+PER_METRE: dict[str, float] = {"m": 1.0, "cm": 100.0}
+ROTATIONS = "Zrotation Xrotation Yrotation"
+"""Channels of every joint: degrees, R = Rz Rx Ry, the order most tools write."""
+
+TIPS: dict[int, tuple[float, float, float]] = {
+    10: (0.0, 0.0, 0.07), 11: (0.0, 0.0, 0.07), 15: (0.0, 0.18, 0.02), 20: (0.17, 0.0, 0.0), 21: (-0.17, 0.0, 0.0),
+}  # fmt: skip
+"""Metres from a leaf joint to its End Site, which only says how long the last bone is drawn."""
+
+
+class Jointed(Protocol):
+    """What a skeleton asks of a body model: where its joints rest."""
+
+    id: str
+
+    def rest_joints(self, betas: Tensor) -> Tensor: ...
+
+
+def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m") -> list[Path]:
+    """Write one scene (B = 1), a file a person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
+
+    All people keep their places in the one world of the scene, y up. Joints carry SMPL-X's names; the root's position
+    is the pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
+
+    Args:
+        unit: of lengths, which the format does not name. Blender takes metres, MotionBuilder centimetres.
+
+    Returns:
+        The paths written, in the order of the slots.
+
+    Raises:
+        ValueError: more than one scene, nobody present, another body's, or no such unit.
+    """
+    if scene.scenes != 1:
+        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to files of its own")
+    if scene.body != body.id:
+        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
+    if unit not in PER_METRE:
+        raise ValueError(f"unit {unit!r}: expected one of {', '.join(PER_METRE)}")
+    people = scene.people()
+    if not people.scenes:
+        raise ValueError("nobody is present in the scene, so there is no skeleton to write")
+    path = Path(path).with_suffix(".bvh")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    several = people.scenes > 1
+    written = []
+    for p in range(people.scenes):
+        each = path.with_name(f"{path.stem}_{p}.bvh") if several else path
+        offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
+        root = people.T_world_root[p, :, 0].detach().cpu().double()
+        local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)
+        position = root[:, :3, 3].numpy() * PER_METRE[unit]
+        lines = [*_hierarchy(offsets, PER_METRE[unit]), *_motion(position, local.numpy(), scene.fps)]
+        each.write_text("\n".join(lines) + "\n")
+        written.append(each)
+    return written
+
+
+def offsets_of(rest: Tensor) -> Tensor:
+    """Joints relative to their parents at rest, the pelvis's zero. (..., 22, 3) -> same"""
+    offsets = rest - rest[..., [0, *PARENTS[1:]], :]
+    return offsets
+
+
+def _hierarchy(offsets: NDArray[np.float64], per_metre: float) -> Iterator[str]:
+    def joint(j: int, depth: int) -> Iterator[str]:
+        pad = "\t" * depth
+        yield f"{pad}{'JOINT' if j else 'ROOT'} {JOINT_NAMES[j]}"
+        yield pad + "{"
+        yield f"{pad}\tOFFSET {_numbers(offsets[j])}"
+        yield f"{pad}\tCHANNELS {f'3 {ROTATIONS}' if j else f'6 Xposition Yposition Zposition {ROTATIONS}'}"
+        for child in (c for c in range(BODY_JOINTS) if PARENTS[c] == j):
+            yield from joint(child, depth + 1)
+        if j in TIPS:
+            tip = per_metre * np.array(TIPS[j])
+            yield from (f"{pad}\tEnd Site", pad + "\t{", f"{pad}\t\tOFFSET {_numbers(tip)}", pad + "\t}")
+        yield pad + "}"
+
+    yield "HIERARCHY"
+    yield from joint(0, 0)
+
+
+def written_order() -> list[int]:
+    """Joints in the order of the file: depth first."""
+
+    def below(j: int) -> Iterator[int]:
+        yield j
+        for child in (c for c in range(BODY_JOINTS) if PARENTS[c] == j):
+            yield from below(child)
+
+    return list(below(0))
+
+
+def _motion(position: NDArray[np.float64], local: NDArray[np.float64], fps: float) -> Iterator[str]:
+    """position (T, 3), local (T, 22, 3, 3)"""
+    degrees = euler_zxy(local)[:, written_order()]
+    yield "MOTION"
+    yield f"Frames: {len(position)}"
+    yield f"Frame Time: {1 / fps:.10f}"
+    for place, angles in zip(position, degrees, strict=True):
+        yield f"{_numbers(place)} {' '.join(f'{angle:.6f}' for angle in angles.ravel())}"
+
+
+def euler_zxy(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Degrees about z, x and y with R = Rz Rx Ry, free of jumps over time. (T, ..., 3, 3) -> (T, ..., 3)"""
+    x = np.arcsin(np.clip(rotation[..., 2, 1], -1.0, 1.0))
+    z = np.arctan2(-rotation[..., 0, 1], rotation[..., 1, 1])
+    y = np.arctan2(-rotation[..., 2, 0], rotation[..., 2, 2])
+    # Where x is a quarter turn only the sum or difference of the others is known: z is left at zero.
+    locked = np.hypot(rotation[..., 0, 1], rotation[..., 1, 1]) < 1e-9
+    z = np.where(locked, 0.0, z)
+    y = np.where(locked, np.arctan2(rotation[..., 0, 2], rotation[..., 0, 0]), y)
+    return np.degrees(np.unwrap(np.stack([z, x, y], axis=-1), axis=0))
+
+
+def _numbers(vector: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.7f}" for value in vector)

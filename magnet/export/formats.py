@@ -1,0 +1,223 @@
+"""Scenes to and from files of every kind: a file's suffix says which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from magnet.body import Body, load_body
+from magnet.export.bvh import Unit, save_bvh
+from magnet.export.cast import Style
+from magnet.export.glb import save_glb
+from magnet.export.joints_csv import save_csv
+from magnet.export.npz import load_smplx, save_smplx
+from magnet.export.retarget import load_bvh
+from magnet.export.retime import resampled, together
+from magnet.motion.scene import Scene
+
+if TYPE_CHECKING:
+    from magnet.export.video import Report
+
+READ = (".npz", ".bvh")
+PICTURES = (".mp4", ".gif", ".webp")
+WRITTEN = {
+    ".npz": "the scene itself; with smplx, SMPL-X's conventional keys",
+    ".bvh": "a skeleton a person, one file each",
+    ".glb": "everybody skinned and animated in one world",
+    ".csv": "a table of joint positions",
+    ".html": "a page that plays the scene, by itself",
+    ".mp4": "a film",
+    ".gif": "a film",
+    ".webp": "a film",
+    ".png": "a strip of moments",
+}
+"""Suffixes that can be written, and what they hold."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """A scene from files, the body its shapes belong to, and what is worth knowing about how it was read."""
+
+    scene: Scene
+    body: Body
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What files may leave open.
+
+    Args:
+        fps: bring everything to this rate; None: as recorded.
+        trim: cut people of different lengths to the shortest.
+        unit: of a BVH's lengths; None: by the length of its legs.
+        up: axis of the file that points up; None: found.
+        joints: for BVH: our joint's name: theirs, where no naming scheme fits.
+        keep_floor: leave people whose skeleton had to be fitted at the height they were recorded at.
+    """
+
+    fps: float | None = None
+    trim: bool = False
+    unit: str | None = None
+    up: str | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
+    keep_floor: bool = False
+
+
+def read(
+    paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
+) -> Read:
+    """Read a scene from a Scene npz, SMPL-X npz files or BVH files; several files are several people.
+
+    Args:
+        body: the scene's body model, or its file; None: the open one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a file that cannot be read, or files that do not go together; says what to do.
+    """
+    files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    options = options or Reading()
+    suffixes = {file.suffix.lower() for file in files}
+    if len(suffixes) != 1 or not suffixes <= set(READ):
+        names = ", ".join(file.name for file in files) or "nothing"
+        raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind")
+    body = body if isinstance(body, Body) else load_body("open" if body is None else body)
+    if suffixes == {".bvh"}:
+        imported = load_bvh(
+            files,
+            body,
+            fps=options.fps,
+            trim=options.trim,
+            unit=options.unit,
+            up=options.up,
+            joints=options.joints,
+            keep_floor=options.keep_floor,
+        )
+        notes = [str(source) for source in imported.sources]
+        if imported.floor:
+            notes.append(f"everybody was lowered by {100 * imported.floor:.1f} cm onto the floor")
+        return Read(imported.scene, body, tuple(notes))
+    scenes, notes = [], []
+    for file in files:
+        scene, note = _read_npz(file, body, options.up)
+        scenes.append(scene)
+        notes += note
+    if len(scenes) == 1:
+        scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
+        return Read(scene, body, tuple(notes))
+    for file, scene in zip(files, scenes, strict=True):
+        if scene.scenes != 1:
+            raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
+    labels = [str(file) for file in files]
+    return Read(together(scenes, labels, fps=options.fps, trim=options.trim), body, tuple(notes))
+
+
+def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str]]:
+    """A scene of ours or SMPL-X's keys, told apart by what they hold."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            keys = set(file.files)
+    except Exception as error:  # a damaged archive may raise anything
+        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
+    if "meta" in keys:
+        scene = Scene.load(path)
+        if scene.body != body.id:
+            raise ValueError(
+                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
+            )
+        return scene, []
+    scene = load_smplx(path, body, up)
+    note = []
+    if "body" not in keys and body.id.startswith("open"):
+        note.append(
+            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
+        )
+    return scene, note
+
+
+def write(
+    scene: Scene,
+    path: str | Path,
+    body: Body | None = None,
+    *,
+    fps: float | None = None,
+    unit: Unit = "m",
+    smplx: bool = False,
+    context_frames: int = 0,
+    known: Tensor | None = None,
+    style: Style = "body",
+    title: str | None = None,
+    progress: bool | Report = False,
+) -> list[Path]:
+    """Write a scene in the format of the path's suffix.
+
+    Of several scenes (B > 1), npz and csv hold all, pictures show them side by side, and every other format gets a
+    file each: out_scene0.glb ...
+
+    Args:
+        body: the scene's body model; None: the open one.
+        fps: frames a second of what is written; None: the scene's.
+        unit: of lengths in BVH.
+        smplx: npz with SMPL-X's conventional keys.
+        context_frames: how many first frames were given to a model; pictures mark them.
+        known: (T, P) bool instead, for pictures.
+        style: how pictures show people: `body`, `capsules` or `skeleton`.
+        title: of pictures.
+        progress: True for a bar while films are drawn, or a function told (done, all).
+
+    Returns:
+        The paths written.
+
+    Raises:
+        ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
+        ImportError: an optional package is missing; says which.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in WRITTEN:
+        raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(WRITTEN)}")
+    body = body or load_body("open")
+    if scene.body != body.id:
+        raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
+    look: dict[str, Any] = {"context_frames": context_frames, "known": known, "body": body, "style": style}
+    if suffix in PICTURES:
+        from magnet.export.video import render_video
+
+        return [render_video(scene, path, fps=fps or scene.fps, title=title, progress=progress, **look)]
+    if suffix == ".png":
+        from magnet.export.picture import contact_sheet
+
+        return [contact_sheet(scene, path, title=title, **look)]
+    if fps is not None and abs(fps - scene.fps) > 1e-6:
+        context_frames = round(context_frames * fps / scene.fps)
+        scene = resampled(scene, fps)
+    if suffix == ".csv":
+        return [save_csv(scene, path, body)]
+    if suffix == ".npz" and not smplx:
+        return [scene.save(path)]
+    each: dict[str, Callable[[Scene, Path], list[Path]]] = {
+        ".npz": lambda one, to: save_smplx(one, to, body),
+        ".bvh": lambda one, to: save_bvh(one, to, body, unit=unit),
+        ".glb": lambda one, to: [save_glb(one, to, body)],
+        ".html": lambda one, to: [_save_page(one, to, body, context_frames, title)],
+    }
+    if scene.scenes == 1:
+        return each[suffix](scene, path)
+    written = []
+    for b in range(scene.scenes):
+        written += each[suffix](scene.pick([b]), path.with_name(f"{path.stem}_scene{b}{suffix}"))
+    return written
+
+
+def _save_page(scene: Scene, path: Path, body: Body, context: int, title: str | None) -> Path:
+    from magnet.viewer.html import save_html  # late: the viewer stands on this room
+
+    return save_html(scene, path, body, context=context, title=title or "")

@@ -1,0 +1,236 @@
+"""Scenes as one animated GLB: everybody skinned in one world, for Blender, Unity, Unreal and the browser."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet import __version__
+from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.export.stage import AGENTS
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
+VERTEX_DATA, INDICES = 34962, 34963
+INFLUENCES = 4
+"""Joints that move one vertex; what engines take."""
+
+
+class Skinned(Protocol):
+    """What a skinned mesh asks of a body model (`magnet.body.Body` is one)."""
+
+    id: str
+    v_template: Tensor  # (V, 3)
+    shapedirs: Tensor  # (V, 3, 10)
+    weights: Tensor  # (V, 22)
+    faces: Tensor  # (F, 3)
+
+    def rest_joints(self, betas: Tensor) -> Tensor: ...
+
+
+def save_glb(scene: Scene, path: str | Path, body: Skinned) -> Path:
+    """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
+
+    Each person present is a node `person_0`, `person_1` ... with the 22 joints below it under SMPL-X's names, and a
+    mesh skinned to them in the colour that pictures give the slot. People of one shape share their mesh. Pose
+    correctives of a SMPL-X file cannot be expressed and are left out.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ValueError: more than one scene, nobody present, no frames, or another body's.
+    """
+    if scene.scenes != 1:
+        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to a file of its own")
+    if scene.body != body.id:
+        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
+    slots = scene.present[0].nonzero()[:, 0].tolist()
+    if not slots or not scene.frames:
+        raise ValueError(f"{len(slots)} people and {scene.frames} frames: there is nothing to write")
+    gltf = _Gltf()
+    skin = gltf.skin_of(body)
+    times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
+    shaped: dict[bytes, dict[str, int]] = {}
+    animation: dict[str, Any] = {"name": "motion", "samplers": [], "channels": []}
+    for number, slot in enumerate(slots):
+        betas = scene.betas[0, slot].detach().cpu().float()
+        shape = shaped.setdefault(betas.numpy().tobytes(), {})
+        if not shape:
+            shape |= gltf.shape_of(body, betas)
+        first = gltf.person(number, slot, body.rest_joints(betas), {**skin, **shape})
+        T_world_root = scene.T_world_root[0, :, slot].detach().cpu()
+        local = torch.cat([T_world_root[:, None, :3, :3], scene.body_rot[0, :, slot].detach().cpu()], dim=1)
+        gltf.animate(animation, times, first, T_world_root[:, :3, 3], local)
+    gltf.document["animations"] = [animation]
+    path = Path(path).with_suffix(".glb")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(gltf.packed())
+    return path
+
+
+class _Gltf:
+    """A glTF document and its one binary buffer, grown part by part."""
+
+    def __init__(self) -> None:
+        self.document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": f"magnet {__version__}"},
+            "scene": 0,
+            "scenes": [{"name": "scene", "nodes": []}],
+            "nodes": [],
+            "meshes": [],
+            "materials": [],
+            "skins": [],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self.binary = bytearray()
+
+    def add(self, kind: str, item: dict[str, Any]) -> int:
+        self.document[kind].append(item)
+        return len(self.document[kind]) - 1
+
+    def accessor(
+        self,
+        array: NDArray[Any],
+        component: int,
+        kind: str,
+        target: int | None = None,
+        normalised: bool = False,
+        bounds: bool = False,
+    ) -> int:
+        """Put numbers into the buffer. (N,) or (N, C) -> number of the accessor"""
+        array = np.ascontiguousarray(array, dtype={FLOAT: "<f4", BYTE: "u1", SHORT: "<u2", INT: "<u4"}[component])
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": array.nbytes}
+        self.binary += array.tobytes() + bytes(-array.nbytes % 4)
+        item: dict[str, Any] = {
+            "bufferView": self.add("bufferViews", view | ({"target": target} if target else {})),
+            "componentType": component,
+            "count": len(array),
+            "type": kind,
+        }
+        if normalised:
+            item["normalized"] = True
+        if bounds:
+            flat = array.reshape(len(array), -1)
+            item |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
+        return self.add("accessors", item)
+
+    def skin_of(self, body: Skinned) -> dict[str, int]:
+        """What meshes of every shape share: faces, and which joints move which vertex."""
+        joints, weights = influences(body.weights.detach().cpu().double().numpy())
+        faces = body.faces.detach().cpu().numpy()
+        wide = INT if faces.max() > 65534 else SHORT
+        return {
+            "indices": self.accessor(faces.reshape(-1), wide, "SCALAR", INDICES),
+            "JOINTS_0": self.accessor(joints, BYTE, "VEC4", VERTEX_DATA),
+            "WEIGHTS_0": self.accessor(weights, SHORT, "VEC4", VERTEX_DATA, normalised=True),
+        }
+
+    def shape_of(self, body: Skinned, betas: Tensor) -> dict[str, int]:
+        """The mesh at rest of one shape."""
+        at = body.v_template.detach().cpu().double() + body.shapedirs.detach().cpu().double() @ betas.double()
+        vertices = at.numpy()
+        normals = vertex_normals(vertices, body.faces.detach().cpu().numpy())
+        return {
+            "POSITION": self.accessor(vertices, FLOAT, "VEC3", VERTEX_DATA, bounds=True),
+            "NORMAL": self.accessor(normals, FLOAT, "VEC3", VERTEX_DATA),
+        }
+
+    def person(self, number: int, slot: int, rest: Tensor, mesh: dict[str, int]) -> int:
+        """Nodes, colour, mesh and skin of one person at rest. Returns the pelvis's node; joints follow in order."""
+        label = f"person_{number}"
+        rest = rest.detach().cpu().double()
+        group = self.add("nodes", {"name": label, "children": []})
+        pelvis = group + 1
+        self.document["nodes"][group]["children"].append(pelvis)
+        for j, name in enumerate(JOINT_NAMES):
+            away = rest[j] - (rest[PARENTS[j]] if j else 0.0)
+            node: dict[str, Any] = {"name": name, "translation": away.tolist()}
+            children = [pelvis + c for c in range(BODY_JOINTS) if PARENTS[c] == j]
+            self.add("nodes", node | ({"children": children} if children else {}))
+        bind = np.tile(np.eye(4), (BODY_JOINTS, 1, 1))
+        bind[:, 3, :3] = -rest.numpy()  # column-major: the translation is the last row
+        matrices = self.accessor(bind.reshape(BODY_JOINTS, 16), FLOAT, "MAT4")
+        joints = list(range(pelvis, pelvis + BODY_JOINTS))
+        skin = {"name": label, "joints": joints, "skeleton": pelvis, "inverseBindMatrices": matrices}
+        look = {
+            "name": label,
+            "pbrMetallicRoughness": {
+                "baseColorFactor": [*linear(AGENTS[slot % len(AGENTS)]), 1.0],
+                "metallicFactor": 0.0,
+                "roughnessFactor": 0.7,
+            },
+        }
+        attributes = {key: mesh[key] for key in ("POSITION", "NORMAL", "JOINTS_0", "WEIGHTS_0")}
+        primitive = {"attributes": attributes, "indices": mesh["indices"], "material": self.add("materials", look)}
+        body = {
+            "name": f"{label}_body",
+            "mesh": self.add("meshes", {"name": f"{label}_body", "primitives": [primitive]}),
+            "skin": self.add("skins", skin),
+        }
+        # A skinned mesh moves with its joints alone, so that it must not also hang on a node that moves.
+        self.document["scenes"][0]["nodes"] += [group, self.add("nodes", body)]
+        return pelvis
+
+    def animate(self, animation: dict[str, Any], times: int, pelvis: int, place: Tensor, local: Tensor) -> None:
+        """Keyframes of one person. place (T, 3), local (T, 22, 3, 3)"""
+        quaternions = unbroken(roma.rotmat_to_unitquat(local.double()))
+        tracks = [("translation", pelvis, self.accessor(place.numpy(), FLOAT, "VEC3"))]
+        for j in range(BODY_JOINTS):
+            tracks.append(("rotation", pelvis + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))
+        for what, node, output in tracks:
+            animation["channels"].append(
+                {"sampler": len(animation["samplers"]), "target": {"node": node, "path": what}}
+            )
+            animation["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
+
+    def packed(self) -> bytes:
+        """The file: header, JSON padded with spaces, buffer padded with zeros."""
+        self.document["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(self.document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + len(self.binary)
+        head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
+        return head + text + struct.pack("<I4s", len(self.binary), b"BIN\0") + bytes(self.binary)
+
+
+def unbroken(quaternions: Tensor) -> Tensor:
+    """The same rotations without changes of sign, between which players would take the long way. (T, ..., 4) -> same"""
+    turns = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdim=True) < 0
+    sign = torch.where(turns, -1.0, 1.0).to(quaternions).cumprod(dim=0)
+    return torch.cat([quaternions[:1], quaternions[1:] * sign])
+
+
+def influences(weights: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each vertex's four strongest joints, and their weights as whole shares of 65535. (V, 22) -> (V, 4) x 2"""
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
+    strongest = np.take_along_axis(weights, joints, axis=1)
+    shares = np.round(65535 * strongest / strongest.sum(axis=1, keepdims=True)).astype(np.int64)
+    shares[:, 0] += 65535 - shares.sum(axis=1)
+    return np.where(shares > 0, joints, 0), shares  # glTF asks unused joints to be 0
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Unit normals, each the mean of its faces' by their areas. (V, 3), (F, 3) -> (V, 3)"""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 0, normals / np.maximum(length, 1e-12), [0.0, 1.0, 0.0])
+
+
+def linear(colour: tuple[int, int, int]) -> list[float]:
+    """A colour of pictures (sRGB, 0 to 255) as glTF wants it: linear, 0 to 1."""
+    share = np.array(colour) / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).tolist()

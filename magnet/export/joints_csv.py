@@ -1,0 +1,38 @@
+"""Joint positions as a table, for spreadsheets, R and whoever needs no rotations."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Protocol
+
+from torch import Tensor
+
+from magnet.body.base import JOINT_NAMES
+from magnet.motion.scene import Scene
+
+
+class Posed(Protocol):
+    """What a table asks of a body model."""
+
+    def joints(self, scene: Scene) -> Tensor: ...
+
+
+COLUMNS = ("scene", "frame", "time_s", "person", *(f"{name}_{axis}_m" for name in JOINT_NAMES for axis in "xyz"))
+"""scene, frame and person count from 0 (a person by slot); time in seconds; world joints in metres, y up."""
+
+
+def save_csv(scene: Scene, path: str | Path, body: Posed) -> Path:
+    """Write one row a frame and person present, all B scenes in one table; see `COLUMNS`. Returns the path written."""
+    path = Path(path).with_suffix(".csv")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for b in range(scene.scenes):
+            slots = scene.present[b].nonzero()[:, 0].tolist()
+            joints = body.joints(scene.pick([b]))[0].detach().flatten(-2).double().cpu().numpy()  # (T, P, 66)
+            for t, frame in enumerate(joints):
+                for p in slots:
+                    table.writerow([b, t, f"{t / scene.fps:.6f}", p, *(f"{metres:.5f}" for metres in frame[p])])
+    return path

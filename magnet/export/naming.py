@@ -1,0 +1,143 @@
+"""Which joint of a stranger's skeleton is which of ours, by the naming schemes in use."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from magnet.body.base import JOINT_NAMES
+
+SIDED: dict[str, int] = {
+    "hip": 1, "knee": 4, "ankle": 7, "foot": 10, "collar": 13, "shoulder": 16, "elbow": 18, "wrist": 20,
+}  # fmt: skip
+"""Our left joint of each role; the right one follows it."""
+MIDDLE: dict[str, int] = {"neck": 12, "head": 15}
+NEEDED = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
+"""Without these limbs nobody can be posed; the spine is found in the hierarchy, the rest may be missing."""
+
+SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
+    "SMPL-X, Biovision, Xsens": {
+        "hip": ("hip",), "knee": ("knee",), "ankle": ("ankle",), "foot": ("foot", "toe", "toes", "toebase"),
+        "collar": ("collar", "thorax", "clavicle"), "shoulder": ("shoulder",), "elbow": ("elbow",),
+        "wrist": ("wrist",), "neck": ("neck", "neck1"), "head": ("head",),
+    },
+    "Mixamo, MotionBuilder, CMU": {
+        "hip": ("upleg", "upperleg", "thigh"), "knee": ("leg", "lowleg", "lowerleg", "shin"), "ankle": ("foot",),
+        "foot": ("toebase", "toe"), "collar": ("shoulder", "collar"), "shoulder": ("arm", "uparm", "upperarm"),
+        "elbow": ("forearm", "lowarm", "lowerarm"), "wrist": ("hand",), "neck": ("neck", "neck1"), "head": ("head",),
+    },
+    "3ds Max Biped, Unreal, Rigify": {
+        "hip": ("thigh",), "knee": ("calf", "shin"), "ankle": ("foot",), "foot": ("toe0", "toe", "ball", "toebase"),
+        "collar": ("clavicle", "shoulder"), "shoulder": ("upperarm",), "elbow": ("forearm", "lowerarm"),
+        "wrist": ("hand",), "neck": ("neck", "neck01", "neck1"), "head": ("head",),
+    },
+    "Motive": {
+        "hip": ("thigh",), "knee": ("shin",), "ankle": ("foot",), "foot": ("toe",), "collar": ("shoulder",),
+        "shoulder": ("uarm",), "elbow": ("farm",), "wrist": ("hand",), "neck": ("neck",), "head": ("head",),
+    },
+    "Acclaim": {
+        "hip": ("femur",), "knee": ("tibia",), "ankle": ("foot",), "foot": ("toes",), "collar": ("clavicle",),
+        "shoulder": ("humerus",), "elbow": ("radius",), "wrist": ("wrist",), "neck": ("lowerneck",), "head": ("head",),
+    },
+}  # fmt: skip
+"""Names of each role without the side, spaces or punctuation. One word means another joint in another scheme."""
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What names say: the scheme they follow, and our joint: number of theirs."""
+
+    scheme: str
+    joints: dict[int, int]
+
+    @property
+    def missing(self) -> list[str]:
+        """Our joints that are needed and that no name stands for."""
+        return [JOINT_NAMES[j] for j in NEEDED if j not in self.joints]
+
+
+def recognised(names: Sequence[str], given: Mapping[str, str] | None = None) -> Naming:
+    """The scheme that explains most of a skeleton's names.
+
+    Args:
+        given: our joint's name: their joint's name, where names alone do not tell; goes before any scheme.
+
+    Raises:
+        ValueError: `given` names a joint that does not exist.
+    """
+    words = [split_side(name) for name in plain(names)]
+    best = Naming("none", {})
+    for scheme, roles in SCHEMES.items():
+        found = _matched(words, roles)
+        if _score(found) > _score(best.joints):
+            best = Naming(scheme, found)
+    if not given:
+        return best
+    return Naming(best.scheme, best.joints | dict(_told(names, given)))
+
+
+def _told(names: Sequence[str], given: Mapping[str, str]) -> list[tuple[int, int]]:
+    told = []
+    for ours, theirs in given.items():
+        if ours not in JOINT_NAMES or theirs not in names:
+            what = f"we have {', '.join(JOINT_NAMES)}" if ours not in JOINT_NAMES else f"it has {', '.join(names)}"
+            raise ValueError(f"joint {ours}={theirs}: expected OUR_NAME=THEIR_NAME; {what}")
+        told.append((JOINT_NAMES.index(ours), names.index(theirs)))
+    return told
+
+
+def _score(joints: Mapping[int, int]) -> tuple[int, int]:
+    return sum(j in joints for j in NEEDED), len(joints)
+
+
+def _matched(words: Sequence[tuple[str, set[str]]], roles: Mapping[str, tuple[str, ...]]) -> dict[int, int]:
+    found: dict[int, int] = {}
+    for role, known in roles.items():
+        sides = (("left", SIDED[role]), ("right", SIDED[role] + 1)) if role in SIDED else (("", MIDDLE[role]),)
+        for side, joint in sides:
+            for name in known:
+                numbers = [k for k, (its, rests) in enumerate(words) if its in (side, "?") and _is(side, rests, name)]
+                if numbers and joint not in found:
+                    found[joint] = numbers[0]
+    return found
+
+
+def _is(side: str, rests: set[str], name: str) -> bool:
+    return name in rests if not side else f"{side}:{name}" in rests
+
+
+def plain(names: Sequence[str]) -> list[str]:
+    """Names without what all of them begin with: a namespace, a character's name, Bip01."""
+    short = [name.rsplit(":", 1)[-1] for name in names]
+    least, most = min(short, default=""), max(short, default="")
+    same = next((i for i, (a, b) in enumerate(zip(least, most, strict=False)) if a != b), min(len(least), len(most)))
+    # A prefix ends where a word does: "Left" must not be cut off from two joints that both are left.
+    cut = max((m.end() for m in re.finditer(r"[ _.\-]", least[:same])), default=0)
+    short = [name[cut:] for name in short]
+    return [
+        re.sub(r"(?i)^(bip\d+|mixamorig\d*|skeleton|character\d*|def|org)[ _.\-]*(?=.)", "", name) for name in short
+    ]
+
+
+def split_side(name: str) -> tuple[str, set[str]]:
+    """The side of the body a name says ("left", "right", "" for none), and what the rest may be.
+
+    "LeftUpLeg", "upleg_l", "L UpLeg" and "lUpLeg" all give ("left", {"left:upleg"}); a name that merely begins with
+    an l or r, such as "lowerback", may also be taken whole, and has side "?".
+    """
+    letters = re.sub(r"[^0-9a-z]", "", name.lower())
+    for side in ("left", "right"):
+        if letters.startswith(side):
+            return side, {f"{side}:{letters[len(side) :]}"}
+        if letters.endswith(side):
+            return side, {f"{side}:{letters[: -len(side)]}"}
+    words = [word.lower() for word in re.split(r"[ _.\-]+", name) if word]
+    for letter, side in (("l", "left"), ("r", "right")):
+        if letter in words and len(words) > 1:
+            words.remove(letter)
+            return side, {f"{side}:{''.join(words)}"}
+    first = {"l": "left", "r": "right"}.get(letters[:1])
+    if first:
+        return "?", {letters, f"{first}:{letters[1:]}"}
+    return "", {letters}

@@ -1,0 +1,258 @@
+"""BVH files of any skeleton brought onto a body: by joint names, whatever their units, up axis and rest pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body.base import JOINT_NAMES, PARENTS, Body
+from magnet.body.fit import fit_body, floor_height, swing
+from magnet.export.bvh import offsets_of
+from magnet.export.bvh_read import read_bvh
+from magnet.export.retime import together
+from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood
+from magnet.motion.frames import rigid
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+Floats = NDArray[np.float64]
+
+NECK = 12
+TARGETS = {1: 1.0, 4: 1.0, 7: 1.0, 10: 0.5, NECK: 0.1, 16: 1.0, 18: 1.0, 20: 2.0}
+"""Left joints (and the neck) that the body's joints are drawn to, with weights. Spine, collars and head lie elsewhere
+in every rig: of them only rotations are taken."""
+FARTHEST_SWING = math.radians(110.0)
+"""Between the bone of our rest pose and of theirs; beyond it nobody can say how the bone is rolled."""
+SAME_BODY = 0.002
+"""Metres that rest joints may differ by from a body's own for a skeleton to be that body's."""
+POOR_FIT, REFUSED_FIT = 0.04, 0.15
+"""Mean distance of joints in metres that is worth a warning, and that is no fit."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """How one file was understood."""
+
+    path: Path
+    scheme: str
+    joints: dict[str, str]  # our joint's name: theirs
+    unused: tuple[str, ...]  # their joints that nothing was taken from
+    unit: str
+    up: str
+    exact: bool  # the skeleton is the body's own: nothing had to be fitted
+    residual: float  # metres between limb joints and the file's, mean over joints and frames
+    worst: str  # limb joint with the largest mean residual
+
+    @property
+    def poor(self) -> bool:
+        return self.residual > POOR_FIT
+
+    def __str__(self) -> str:
+        how = "the body's own skeleton" if self.exact else f"names of {self.scheme}; {len(self.joints)} joints mapped"
+        lines = [f"{self.path.name}: {how}; unit {self.unit}, {self.up} up"]
+        if not self.exact:
+            lines.append(f"  limbs lie {100 * self.residual:.1f} cm from the file's on average, most at {self.worst}")
+            if self.poor:
+                lines.append("  that is much: its proportions are far from a person's; hands and feet may miss")
+            if self.unused:
+                lines.append(f"  not mapped: {', '.join(self.unused)}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Imported:
+    """People read from BVH files as one scene (B = 1), and how each file was understood."""
+
+    scene: Scene
+    sources: tuple[Source, ...]
+    floor: float  # metres that everybody was lowered by, so that resting feet stand on y = 0
+
+
+def load_bvh(
+    paths: str | Path | Sequence[str | Path],
+    body: Body,
+    *,
+    fps: float | None = None,
+    trim: bool = False,
+    unit: str | None = None,
+    up: str | None = None,
+    joints: Mapping[str, str] | None = None,
+    keep_floor: bool = False,
+) -> Imported:
+    """Read BVH files, one a person, of our own writing or of any skeleton with known joint names.
+
+    A skeleton that is the body's own comes back exactly; any other is fitted: limbs to positions, all else to
+    rotations relative to the file's rest pose, which may be a T or an A pose.
+
+    Args:
+        fps: bring all files to this rate; None: the files' own, which must agree.
+        trim: cut files of different lengths to the shortest.
+        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: by the length of the legs.
+        up: `y`, `z`, `-y` ...; None: by where the torso points.
+        joints: our joint's name: theirs, for names that no scheme knows.
+        keep_floor: leave fitted people at the height they were recorded at.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a BVH file, unknown names, units or up axis, rates or lengths that differ, no fit.
+    """
+    each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    if not each:
+        raise ValueError("no BVH files given")
+    if up is not None and up not in UP:
+        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+    files = [read_bvh(path) for path in each]
+    rates = {file.fps for file in files}
+    if len(rates) > 1 and fps is None:
+        found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
+        raise ValueError(f"frame rates differ: {found}; bring all to one with --fps 30 (fps=30)")
+    skeletons = [understood(file, unit, up, joints) for file in files]
+    read = [_exact(skeleton, body) or _fitted(skeleton, body) for skeleton in skeletons]
+    labels = [str(path) for path in each]
+    scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
+    floor = 0.0
+    if not keep_floor and not all(source.exact for _, source in read):
+        floor = float(floor_height(body.joints(scene)[0], body, scene.betas[0]).amin(dim=-1).median())
+        T_world_root = scene.T_world_root.clone()
+        T_world_root[..., 1, 3] -= floor
+        scene = scene.replace(T_world_root=T_world_root)
+    return Imported(scene.replace(names=(each[0].stem,)), tuple(source for _, source in read), floor)
+
+
+# -- a skeleton of the body's own --------------------------------------------------------------
+
+
+def _exact(skeleton: Skeleton, body: Body) -> tuple[Scene, Source] | None:
+    """The scene of a skeleton with our names, tree and a shape that the body can take; None for any other."""
+    file = skeleton.file
+    if not set(JOINT_NAMES) <= set(file.names):
+        return None
+    number = [file.names.index(name) for name in JOINT_NAMES]
+    if any(file.parents[number[j]] != number[PARENTS[j]] for j in range(1, BODY_JOINTS)):
+        return None
+    Q = skeleton.R_rest_ours
+    offsets = torch.from_numpy(skeleton.metres * file.offsets[number] @ Q)
+    betas, off = shape_of(offsets, body)
+    slides = float(np.abs(file.place[:, number[1:]] - file.offsets[number[1:]]).max()) * skeleton.metres
+    if max(off, slides) > SAME_BODY:
+        return None
+    turned, at = skeleton.turned[:, number[0]], skeleton.at[:, number[0]]
+    local = Q.T @ file.local[:, number[1:]] @ Q
+    scene = Scene(
+        body_rot=torch.from_numpy(local).float()[None, :, None],
+        T_world_root=rigid(torch.from_numpy(turned @ Q), torch.from_numpy(at)).float()[None, :, None],
+        betas=betas.float()[None, None],
+        present=torch.ones(1, 1, dtype=torch.bool),
+        fps=file.fps,
+        body=body.id,
+    )
+    residual = np.linalg.norm(body.joints(scene)[0, :, 0].numpy() - skeleton.at[:, number], axis=-1).mean(axis=0)
+    return scene, _source(skeleton, {j: number[j] for j in range(BODY_JOINTS)}, True, residual, range(BODY_JOINTS))
+
+
+def shape_of(offsets: Tensor, body: Body) -> tuple[Tensor, float]:
+    """Shape numbers whose joints at rest are `offsets` (22, 3) apart, and the largest distance left, metres."""
+    zero = torch.zeros(10, dtype=torch.float64)
+    base = offsets_of(body.rest_joints(zero))[1:].flatten()
+    directions = offsets_of(body.J_shapedirs.double().movedim(-1, 0))[:, 1:].flatten(1).T  # (63, 10)
+    betas = torch.linalg.lstsq(directions, offsets[1:].double().flatten() - base).solution
+    left = offsets_of(body.rest_joints(betas))[1:] - offsets[1:]
+    return betas, float(left.norm(dim=-1).max())
+
+
+def _source(
+    skeleton: Skeleton, used: Mapping[int, int], exact: bool, residual: Floats, joints: Sequence[int]
+) -> Source:
+    names = skeleton.file.names
+    taken = {*used.values(), *skeleton.chain}
+    return Source(
+        path=skeleton.file.path,
+        scheme=skeleton.naming.scheme,
+        joints={JOINT_NAMES[j]: names[k] for j, k in sorted(used.items())},
+        unused=tuple(name for k, name in enumerate(names) if k not in taken),
+        unit=skeleton.unit,
+        up=skeleton.up,
+        exact=exact,
+        residual=float(residual.mean()),
+        worst=JOINT_NAMES[joints[int(residual.argmax())]],
+    )
+
+
+# -- any other skeleton ------------------------------------------------------------------------
+
+
+def _fitted(skeleton: Skeleton, body: Body) -> tuple[Scene, Source]:
+    ours = skeleton.naming.joints
+    wanted = {j: w for left, w in TARGETS.items() for j in ((left,) if left == NECK else (left, left + 1))}
+    weights = {j: w for j, w in wanted.items() if j in ours}
+    joints = sorted(weights)
+    targets = torch.from_numpy(skeleton.at[:, [ours[j] for j in joints]])[:, None]
+    rotations, used = hints(skeleton, body.rest_joints(torch.zeros(10)).double())
+    try:
+        fit = fit_body(
+            targets,
+            joints,
+            body,
+            rotations=rotations[:, None],
+            weights=torch.tensor([weights[j] for j in joints]),
+            fps=skeleton.file.fps,
+            refuse_above=REFUSED_FIT,
+        )
+    except ValueError as error:
+        raise ValueError(f"{skeleton.file.path}: {error}") from error
+    limbs = [joint for joint in joints if joint != NECK]
+    residual = fit.residual[:, 0, [joints.index(joint) for joint in limbs]].mean(dim=0).double().numpy()
+    return fit.scene, _source(skeleton, ours | used, False, residual, limbs)
+
+
+def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
+    """World rotations of our joints from our rest pose, NaN where unknown, and the joint each was taken from.
+
+    A bone that rests otherwise than ours is first swung to where theirs rests, its parent's swing included. rest
+    (22, 3) -> (T, 22, 3, 3)
+    """
+    ours, theirs = skeleton.naming.joints, torch.from_numpy(skeleton.file.rest())
+    Q = torch.from_numpy(skeleton.R_rest_ours)
+    aligned = {j: Q for j in range(BODY_JOINTS)}
+    for left, child in LIMBS:
+        for s in (0, 1):
+            j, c = left + s, child + s
+            first = aligned[PARENTS[j]] if left in (4, 7, 18) else Q
+            aligned[j] = first
+            if c not in ours:
+                continue
+            ours_bone, their_bone = first @ (rest[c] - rest[j]), theirs[ours[c]] - theirs[ours[j]]
+            cos = torch.nn.functional.cosine_similarity(ours_bone, their_bone, dim=0)
+            if torch.acos(cos.clamp(-1, 1)) <= FARTHEST_SWING:
+                aligned[j] = swing(ours_bone, their_bone) @ first
+            else:
+                aligned[j] = torch.full_like(Q, torch.nan)
+    for s in (0, 1):
+        aligned[10 + s], aligned[20 + s] = aligned[7 + s], aligned[18 + s]
+    used = dict(zip(*_spine(len(skeleton.chain)), strict=True))
+    source = {joint: skeleton.chain[place] for joint, place in used.items()}
+    source |= {j: k for j, k in ours.items() if j not in (13, 14)}  # collars differ most of all from rig to rig
+    known = torch.full((skeleton.file.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
+    for j, k in source.items():
+        known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
+    return known, source
+
+
+def _spine(bones: int) -> tuple[list[int], list[int]]:
+    """Our pelvis and spine joints, and which of so many bones from the pelvis to the chest each takes."""
+    last = bones - 1
+    if last < 1:
+        return [0], [0]
+    if last == 1:
+        return [0, 9], [0, 1]
+    if last == 2:
+        return [0, 3, 9], [0, 1, 2]
+    return [0, 3, 6, 9], [0, 1, (1 + last) // 2, last]

@@ -1,0 +1,169 @@
+"""BVH: what we write comes back, an independent reader finds the same joints, and broken files are named."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from magnet.body import Body
+from magnet.body.base import JOINT_NAMES
+from magnet.export import load_bvh, save_bvh
+from magnet.export.bvh import euler_zxy
+from magnet.export.bvh_read import read_bvh
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.fixture
+def trio() -> Scene:
+    return random_scene(1, 20, 3, torch.Generator().manual_seed(2))
+
+
+@pytest.mark.parametrize("unit", ["m", "cm"])
+def test_joints_and_skin_return_within_a_hundredth_of_a_millimetre(unit, trio: Scene, body: Body, tmp_path: Path):
+    paths = save_bvh(trio, tmp_path / "trio.bvh", body, unit=unit)
+    assert [path.name for path in paths] == ["trio_0.bvh", "trio_1.bvh", "trio_2.bvh"]
+    back = load_bvh(paths, body)
+    assert all(source.exact and source.unit == unit and source.up == "y" for source in back.sources)
+    assert (back.scene.fps, back.scene.body, back.floor) == (30.0, trio.body, 0.0)
+    assert (body.joints(back.scene) - body.joints(trio)).abs().max() < 1e-5
+    assert (body.vertices(back.scene) - body.vertices(trio)).abs().max() < 1e-5
+    assert (back.scene.betas - trio.betas).abs().max() < 1e-3
+
+
+def test_an_independent_reader_finds_the_same_joints(trio: Scene, body: Body, tmp_path: Path):
+    bvhio = pytest.importorskip("bvhio", reason="bvhio is not installed")
+    truth = body.joints(trio)[0].numpy()
+    for person, path in enumerate(save_bvh(trio, tmp_path / "trio.bvh", body)):
+        root = bvhio.readAsHierarchy(str(path))
+        for frame in (0, 7, 19):
+            root.loadPose(frame)
+            found = {joint.Name: np.array(joint.PositionWorld) for joint, _, _ in root.layout()}
+            assert set(found) == set(JOINT_NAMES)
+            there = np.stack([found[name] for name in JOINT_NAMES])
+            assert np.abs(there - truth[frame, person]).max() < 1e-3
+
+
+def test_only_people_present_are_written_and_one_keeps_the_plain_name(trio: Scene, body: Body, tmp_path: Path):
+    gone = trio.replace(present=torch.tensor([[False, True, False]]))
+    (path,) = save_bvh(gone, tmp_path / "solo", body)
+    assert path.name == "solo.bvh"
+    back = load_bvh(path, body).scene
+    assert (body.joints(back)[:, :, 0] - body.joints(trio)[:, :, 1]).abs().max() < 1e-5
+
+
+def test_the_header_states_order_and_rate(trio: Scene, body: Body, tmp_path: Path):
+    text = save_bvh(trio, tmp_path / "trio.bvh", body)[0].read_text()
+    assert text.count("CHANNELS 3 Zrotation Xrotation Yrotation") == 21
+    assert "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in text
+    assert "Frames: 20" in text and "Frame Time: 0.0333333333" in text
+
+
+@given(st.lists(st.floats(-180, 180), min_size=3, max_size=3), st.booleans())
+def test_euler_angles_give_the_rotation_back_also_at_a_quarter_turn(angles, locked):
+    z, x, y = angles
+    rotation = Rotation.from_euler("ZXY", [z, 90.0 if locked else x, y], degrees=True).as_matrix()[None]
+    again = Rotation.from_euler("ZXY", euler_zxy(rotation)[0], degrees=True).as_matrix()
+    assert np.abs(again - rotation[0]).max() < 1e-6
+
+
+def test_euler_angles_do_not_jump():
+    turning = Rotation.from_euler("Y", np.arange(0, 1000, 10)[:, None], degrees=True).as_matrix()
+    assert np.abs(np.diff(euler_zxy(turning), axis=0)).max() < 11
+
+
+@pytest.mark.parametrize(("step", "fps"), [("0.033333", 30.0), ("0.00833333", 120.0), ("0.0417", 23.976), ("0.1", 10)])
+def test_a_rounded_frame_time_is_the_rate_it_stands_for(step, fps, trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    path.write_text(re.sub(r"Frame Time: \S+", f"Frame Time: {step}", path.read_text()))
+    assert read_bvh(path).fps == pytest.approx(fps, rel=1e-3)
+
+
+def test_positions_that_repeat_the_offset_and_positions_added_to_it_are_told_apart(tmp_path: Path):
+    for added in (False, True):
+        place = "0 0 0" if added else "0 5 0"
+        path = tmp_path / "two.bvh"
+        path.write_text(
+            "HIERARCHY\nROOT a {\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n"
+            "JOINT b\n{\nOFFSET 0 5 0\nCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
+            f"End Site\n{{\nOFFSET 0 1 0\n}}\n}}\n}}\nMOTION\nFrames: 1\nFrame Time: 0.1\n1 2 3 {place} 0 0 0\n"
+        )
+        _, at = read_bvh(path).world()
+        assert at[0].tolist() == [[1, 2, 3], [1, 7, 3]]
+
+
+BREAKS = {
+    "does not begin with HIERARCHY": lambda text: "garbage\n" + text,
+    "has no MOTION part": lambda text: text[: text.index("MOTION")],
+    "the HIERARCHY is incomplete": lambda text: text.replace("}\nMOTION", "MOTION"),
+    "Frames: 20, but 15.04 frames of 69 numbers follow; the file is truncated": lambda text: "\n".join(
+        [*text.split("\n")[:-6], "1 2 3"]
+    ),
+    "Frames: 2, but 20 frames of 69 numbers": lambda text: text.replace("Frames: 20", "Frames: 2"),
+    "expected the lines 'Frames: N'": lambda text: text.replace("Frames: 20", "Frames: many"),
+    "frame 20 holds NaN": lambda text: re.sub(r"\S+\n$", "nan\n", text),
+    "something that is no number": lambda text: re.sub(r"\S+\n$", "1.2.3\n", text),
+    r":5: CHANNELS 6 X .*: expected 6 of": lambda text: text.replace("CHANNELS 6 Xposition", "CHANNELS 6 X", 1),
+    r":4: got 0.0 0.0, expected 3 finite": lambda text: re.sub(r"OFFSET [0. ]+", "OFFSET 0.0 0.0", text, count=1),
+    "a second ROOT": lambda text: text.replace("JOINT left_hip", "ROOT left_hip"),
+    "expected ROOT, JOINT": lambda text: text.replace("JOINT left_hip", "BONE left_hip"),
+    "frames of 0 s": lambda text: re.sub(r"Frame Time: \S+", "Frame Time: 0", text),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", BREAKS)
+def test_a_broken_file_is_named_with_what_is_wrong(message, trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    broken = BREAKS[message](path.read_text())
+    assert broken != path.read_text()
+    path.write_text(broken)
+    with pytest.raises(ValueError, match=message) as error:
+        read_bvh(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.5, 0.9, 0.99])
+def test_a_file_cut_anywhere_is_refused(share, trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    text = path.read_text()
+    path.write_text(text[: int(share * len(text))])
+    with pytest.raises(ValueError, match=r"truncated|not a BVH|incomplete|expected|without"):
+        read_bvh(path)
+
+
+def test_a_damaged_file_is_read_or_refused_but_never_breaks_the_reader(trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio.cut(0, 3), tmp_path / "trio.bvh", body)[0]
+    text, draw = path.read_text(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(150):
+        letters = list(text)
+        for _ in range(draw.integers(1, 4)):
+            at = int(draw.integers(len(letters)))
+            letters[at : at + int(draw.integers(0, 30))] = draw.choice(["", "{", "}", "x", "\n", "-", "1e999", "\0"])
+        path.write_text("".join(letters))
+        try:
+            read_bvh(path)
+        except ValueError as error:
+            refused += 1
+            assert str(path) in str(error)
+    assert refused > 75
+
+
+def test_scenes_that_cannot_be_written_are_named(trio: Scene, body: Body, tmp_path: Path):
+    with pytest.raises(ValueError, match="got 2 scenes"):
+        save_bvh(trio.repeat(2), tmp_path / "a.bvh", body)
+    with pytest.raises(ValueError, match="nobody is present"):
+        save_bvh(trio.replace(present=torch.zeros(1, 3, dtype=torch.bool)), tmp_path / "a.bvh", body)
+    with pytest.raises(ValueError, match="belongs to body 'other'"):
+        save_bvh(trio.replace(body="other"), tmp_path / "a.bvh", body)
+    with pytest.raises(ValueError, match="unit 'km'"):
+        save_bvh(trio, tmp_path / "a.bvh", body, unit="km")  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_bvh(tmp_path / "none.bvh")

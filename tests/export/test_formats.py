@@ -1,0 +1,138 @@
+"""Every format by its suffix: what goes out comes back, and what cannot is named."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation, Slerp
+
+from magnet.body import Body, load_body
+from magnet.body.base import JOINT_NAMES
+from magnet.export import formats, resampled
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.mark.parametrize(("name", "smplx"), [("a.npz", False), ("a.npz", True), ("a.bvh", False)])
+def test_what_can_be_read_back_holds_the_same_joints(name, smplx, duet: Scene, body: Body, tmp_path: Path):
+    written = formats.write(duet, tmp_path / name, body, smplx=smplx)
+    got = formats.read(written)
+    assert (got.scene.fps, got.scene.agents, got.body.id) == (30.0, 2, body.id)
+    assert (body.joints(got.scene) - body.joints(duet)).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s not in (".mp4",)])
+def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_path: Path):
+    written = formats.write(duet.cut(0, 3), tmp_path / f"deep/a{suffix}", body, style="skeleton")
+    assert written and all(path.exists() and path.suffix == suffix for path in written)
+    begins = {".npz": b"PK", ".bvh": b"HIERARCHY", ".glb": b"glTF", ".csv": b"scene,frame", ".gif": b"GIF89a",
+              ".webp": b"RIFF", ".png": b"\x89PNG"}  # fmt: skip
+    assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
+
+
+def test_mp4_is_written_where_its_package_is(duet: Scene, body: Body, tmp_path: Path):
+    pytest.importorskip("av", reason="PyAV is not installed")
+    (path,) = formats.write(duet.cut(0, 3), tmp_path / "a.mp4", body, style="skeleton")
+    assert b"ftyp" in path.read_bytes()[:16]
+
+
+def test_several_scenes_go_into_a_file_each_where_a_format_holds_one(duet: Scene, body: Body, tmp_path: Path):
+    both = duet.repeat(2)
+    names = {
+        suffix: [p.name for p in formats.write(both, tmp_path / f"a{suffix}", body)] for suffix in (".glb", ".bvh")
+    }
+    assert names[".glb"] == ["a_scene0.glb", "a_scene1.glb"]
+    assert names[".bvh"] == ["a_scene0_0.bvh", "a_scene0_1.bvh", "a_scene1_0.bvh", "a_scene1_1.bvh"]
+    assert [p.name for p in formats.write(both, tmp_path / "a.csv", body)] == ["a.csv"]
+    assert formats.read(formats.write(both, tmp_path / "b.npz", body)).scene.scenes == 2
+
+
+def test_the_table_says_where_every_joint_is(duet: Scene, body: Body, tmp_path: Path):
+    gone = random_scene(2, 3, 2, torch.Generator().manual_seed(1), torch.tensor([[True, True], [False, True]]))
+    (path,) = formats.write(gone, tmp_path / "a.csv", body)
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["scene"], r["frame"], r["person"]) for r in rows] == [
+        *(("0", str(t), str(p)) for t in range(3) for p in range(2)),
+        *(("1", str(t), "1") for t in range(3)),
+    ]
+    joints = body.joints(gone)
+    for row in rows:
+        b, t, p = (int(row[key]) for key in ("scene", "frame", "person"))
+        there = [[float(row[f"{name}_{axis}_m"]) for axis in "xyz"] for name in JOINT_NAMES]
+        assert (torch.tensor(there) - joints[b, t, p]).abs().max() < 1e-5
+        assert float(row["time_s"]) == pytest.approx(t / 30, abs=1e-6)
+
+
+def test_a_rate_that_is_asked_for_is_that_of_the_file(duet: Scene, body: Body, tmp_path: Path):
+    got = formats.read(formats.write(duet, tmp_path / "a.bvh", body, fps=60.0))
+    assert (got.scene.fps, got.scene.frames) == (60.0, 23)
+    assert (body.joints(got.scene)[:, ::2] - body.joints(duet)).abs().max() < 1e-4
+
+
+def test_rotations_between_frames_are_those_of_an_independent_slerp(duet: Scene):
+    fast = resampled(duet, 100.0)
+    at = np.arange(fast.frames) / 100
+    want = Slerp(np.arange(12) / 30, Rotation.from_matrix(duet.body_rot[0, :, 1, 5].numpy()))(at).as_matrix()
+    assert np.abs(fast.body_rot[0, :, 1, 5].numpy() - want).max() < 1e-5
+    want = np.stack([np.interp(at, np.arange(12) / 30, x) for x in duet.T_world_root[0, :, 0, :3, 3].numpy().T], axis=1)
+    assert np.abs(fast.T_world_root[0, :, 0, :3, 3].numpy() - want).max() < 1e-5
+
+
+def test_a_frame_beside_one_that_is_not_valid_is_not_valid(duet: Scene):
+    valid = torch.ones(1, 12, dtype=torch.bool)
+    valid[0, 4] = False
+    twice = resampled(duet.replace(valid=valid), 60.0).valid
+    assert twice is not None and (~twice[0]).nonzero()[:, 0].tolist() == [7, 8, 9]
+
+
+def test_several_npz_are_several_people(duet: Scene, body: Body, tmp_path: Path):
+    from magnet.export import save_smplx
+
+    got = formats.read(save_smplx(duet, tmp_path / "a.npz", body, apart=True))
+    assert (body.joints(got.scene) - body.joints(duet)).abs().max() < 1e-4
+
+
+def test_a_stranger_body_is_asked_for(duet: Scene, body: Body, tmp_path: Path):
+    other = duet.replace(body="smplx-neutral")
+    other.save(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="belong to body 'smplx-neutral', not 'open-1'; give its file: --body"):
+        formats.read(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="belong to body 'smplx-neutral'"):
+        formats.write(other, tmp_path / "a.glb", body)
+
+
+def test_what_cannot_be_read_or_written_is_named(duet: Scene, body: Body, tmp_path: Path):
+    (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 cut")
+    with pytest.raises(ValueError, match="not a readable npz"):
+        formats.read(tmp_path / "a.npz")
+    with pytest.raises(FileNotFoundError, match=r"b\.npz: no such file"):
+        formats.read(tmp_path / "b.npz")
+    for paths in ([], ["a.glb"], ["a.npz", "b.bvh"]):
+        with pytest.raises(ValueError, match=r"expected \.npz or \.bvh files, all of one kind"):
+            formats.read(paths)
+    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'; use \.npz"):
+        formats.write(duet, tmp_path / "a.fbx", body)
+    formats.write(duet.repeat(2), tmp_path / "two.npz", body)
+    with pytest.raises(ValueError, match="holds 2 scenes; several files are several people"):
+        formats.read([tmp_path / "two.npz", tmp_path / "two.npz"])
+
+
+def test_pictures_mark_what_was_given(duet: Scene, body: Body, tmp_path: Path, pixels_like):
+    from magnet.export.stage import CONTEXT
+
+    known = torch.zeros(12, 2, dtype=torch.bool)
+    plain, marked = (
+        Image.open(formats.write(duet, tmp_path / f"{i}.png", body, known=k)[0]) for i, k in enumerate((known, ~known))
+    )
+    assert pixels_like(marked, CONTEXT[0]) > 10 * pixels_like(plain, CONTEXT[0])
+
+
+def test_the_open_body_is_the_default(duet: Scene, tmp_path: Path):
+    (path,) = formats.write(duet, tmp_path / "a.glb")
+    assert path.read_bytes() == formats.write(duet, tmp_path / "b.glb", load_body("open"))[0].read_bytes()

@@ -1,0 +1,181 @@
+"""GLB, opened by an independent reader: joints where the body's are, skin where its vertices are."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from magnet.body import Body
+from magnet.body.base import JOINT_NAMES
+from magnet.export import save_glb
+from magnet.export.glb import influences, linear, unbroken, vertex_normals
+from magnet.export.stage import AGENTS
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+Floats = NDArray[np.float64]
+WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+KIND = {5126: "<f4", 5121: "u1", 5123: "<u2", 5125: "<u4"}
+
+
+@pytest.fixture
+def trio() -> Scene:
+    return random_scene(1, 24, 3, torch.Generator().manual_seed(2))
+
+
+class Opened:
+    """A GLB as pygltflib reads it, posed by the glTF specification's rules alone."""
+
+    def __init__(self, path: Path) -> None:
+        pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+        self.gltf = pygltflib.GLTF2().load(str(path))
+        self.blob = self.gltf.binary_blob()
+
+    def numbers(self, accessor: int) -> NDArray[Any]:
+        a = self.gltf.accessors[accessor]
+        view = self.gltf.bufferViews[a.bufferView]
+        start = (view.byteOffset or 0) + (a.byteOffset or 0)
+        flat = np.frombuffer(self.blob, KIND[a.componentType], a.count * WIDTH[a.type], start)
+        array = flat.reshape(a.count, WIDTH[a.type]).astype(np.float64)
+        return array / np.iinfo(flat.dtype).max if a.normalized else array
+
+    def world(self, seconds: float) -> list[Floats]:
+        """World matrix of every node at a time."""
+        moved: dict[tuple[int, str], Floats] = {}
+        (animation,) = self.gltf.animations
+        for channel in animation.channels:
+            sampler = animation.samplers[channel.sampler]
+            times, values = self.numbers(sampler.input)[:, 0], self.numbers(sampler.output)
+            at = np.clip(seconds, times[0], times[-1])
+            if channel.target.path == "rotation":
+                value = Slerp(times, Rotation.from_quat(values))(at).as_matrix()
+            else:
+                value = np.array([np.interp(at, times, column) for column in values.T])
+            moved[channel.target.node, channel.target.path] = value
+        matrices: list[Floats] = [np.eye(4)] * len(self.gltf.nodes)
+
+        def place(number: int, above: Floats) -> None:
+            node = self.gltf.nodes[number]
+            local = np.eye(4)
+            local[:3, 3] = moved.get((number, "translation"), node.translation or np.zeros(3))
+            resting = Rotation.from_quat(node.rotation or [0, 0, 0, 1]).as_matrix()
+            local[:3, :3] = moved.get((number, "rotation"), resting)
+            matrices[number] = above @ local
+            for child in node.children or []:
+                place(child, matrices[number])
+
+        for number in self.gltf.scenes[self.gltf.scene].nodes:
+            place(number, np.eye(4))
+        return matrices
+
+    def people(self) -> list[Any]:
+        """Nodes with a skinned mesh, by name."""
+        return sorted((node for node in self.gltf.nodes if node.skin is not None), key=lambda node: node.name)
+
+    def skinned(self, node: Any, matrices: list[Floats]) -> Floats:
+        skin = self.gltf.skins[node.skin]
+        (primitive,) = self.gltf.meshes[node.mesh].primitives
+        rest = self.numbers(primitive.attributes.POSITION)
+        joints = self.numbers(primitive.attributes.JOINTS_0).astype(int)
+        weights = self.numbers(primitive.attributes.WEIGHTS_0)
+        bind = self.numbers(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+        moving = np.stack([matrices[j] for j in skin.joints]) @ bind
+        blended = (weights[..., None, None] * moving[joints]).sum(axis=1)
+        return (blended @ np.concatenate([rest, np.ones((len(rest), 1))], axis=1)[..., None])[:, :3, 0]
+
+
+def test_joints_and_skin_are_the_bodys_within_a_tenth_of_a_millimetre(trio: Scene, body: Body, tmp_path: Path):
+    opened = Opened(save_glb(trio, tmp_path / "trio.glb", body))
+    joints, vertices = body.joints(trio)[0].numpy(), body.vertices(trio)[0]
+    assert [node.name for node in opened.people()] == [f"person_{p}_body" for p in range(3)]
+    for frame in (0, 11, 23):
+        matrices = opened.world(frame / 30)
+        for person, node in enumerate(opened.people()):
+            skin = opened.gltf.skins[node.skin]
+            assert [opened.gltf.nodes[j].name for j in skin.joints] == list(JOINT_NAMES)
+            found = np.stack([matrices[j][:3, 3] for j in skin.joints])
+            assert np.abs(found - joints[frame, person]).max() < 1e-4
+            assert np.abs(opened.skinned(node, matrices) - vertices[frame, person].numpy()).max() < 1e-4
+
+
+def test_there_is_a_keyframe_for_every_frame(trio: Scene, body: Body, tmp_path: Path):
+    opened = Opened(save_glb(trio, tmp_path / "trio.glb", body))
+    (animation,) = opened.gltf.animations
+    times = opened.numbers(animation.samplers[0].input)[:, 0]
+    assert np.abs(times - np.arange(24) / 30).max() < 1e-6
+    assert len(animation.channels) == 3 * 23
+    assert all(opened.gltf.accessors[sampler.output].count == 24 for sampler in animation.samplers)
+
+
+def test_the_file_is_whole_and_aligned(trio: Scene, body: Body, tmp_path: Path):
+    data = save_glb(trio, tmp_path / "trio", body).read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    (text, kind) = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and text % 4 == 0
+    (binary, kind) = struct.unpack_from("<I4s", data, 20 + text)
+    assert kind == b"BIN\0" and 28 + text + binary == len(data)
+
+
+def test_people_wear_the_colours_of_pictures_by_slot(trio: Scene, body: Body, tmp_path: Path):
+    gone = trio.replace(present=torch.tensor([[True, False, True]]))
+    opened = Opened(save_glb(gone, tmp_path / "duo.glb", body))
+    colours = [material.pbrMetallicRoughness.baseColorFactor for material in opened.gltf.materials]
+    for got, slot in zip(colours, (0, 2), strict=True):
+        assert got[:3] == pytest.approx(linear(AGENTS[slot]))
+    assert linear((255, 0, 188))[:2] == [1.0, 0.0] and linear((0, 0, 188))[2] == pytest.approx(0.5029, abs=1e-3)
+
+
+def test_people_of_one_shape_share_their_mesh(trio: Scene, body: Body, tmp_path: Path):
+    apart = save_glb(trio, tmp_path / "a.glb", body)
+    alike = save_glb(trio.replace(betas=torch.zeros_like(trio.betas)), tmp_path / "b.glb", body)
+    mesh = 2 * 12 * len(body.v_template)
+    assert apart.stat().st_size - alike.stat().st_size == pytest.approx(2 * mesh, rel=0.02)
+    opened = Opened(alike)
+    positions = {mesh.primitives[0].attributes.POSITION for mesh in opened.gltf.meshes}
+    assert len(positions) == 1
+
+
+def test_weights_sum_to_one_exactly(body: Body):
+    joints, shares = influences(body.weights.double().numpy())
+    assert (shares.sum(axis=1) == 65535).all() and (shares >= 0).all()
+    assert (joints[shares == 0] == 0).all()
+    back = np.zeros(tuple(body.weights.shape))
+    np.add.at(back, (np.arange(len(back))[:, None], joints), shares / 65535)
+    assert np.abs(back - body.weights.numpy()).max() < 1e-4
+
+
+def test_quaternions_take_the_short_way_round():
+    turning = Rotation.from_euler("Y", np.arange(0, 1000, 10)[:, None], degrees=True).as_quat(canonical=True)
+    way = unbroken(torch.from_numpy(turning))
+    assert (way[1:] * way[:-1]).sum(-1).min() > 0
+    assert np.abs(Rotation.from_quat(way.numpy()).as_matrix() - Rotation.from_quat(turning).as_matrix()).max() < 1e-9
+
+
+def test_normals_of_a_cube_point_outwards():
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    hull = pytest.importorskip("scipy.spatial").ConvexHull(corners)
+    faces = hull.simplices.copy()
+    for face, plane in zip(faces, hull.equations, strict=True):
+        a, b, c = corners[face]
+        if np.cross(b - a, c - a) @ plane[:3] < 0:
+            face[1], face[2] = face[2], face[1]
+    normals = vertex_normals(corners, faces)
+    assert ((normals * corners).sum(axis=1) > 1.5).all()
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
+
+
+def test_scenes_that_cannot_be_written_are_named(trio: Scene, body: Body, tmp_path: Path):
+    with pytest.raises(ValueError, match="got 2 scenes"):
+        save_glb(trio.repeat(2), tmp_path / "a.glb", body)
+    with pytest.raises(ValueError, match="0 people and 24 frames"):
+        save_glb(trio.replace(present=torch.zeros(1, 3, dtype=torch.bool)), tmp_path / "a.glb", body)
+    with pytest.raises(ValueError, match="belongs to body 'other'"):
+        save_glb(trio.replace(body="other"), tmp_path / "a.glb", body)

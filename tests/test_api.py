@@ -1,0 +1,147 @@
+"""`magnet.load(...)` and the scenes it gives."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import magnet
+from magnet.api import Model, Motion
+from magnet.body import load_body
+from magnet.denoiser.generation import SamplerOptions
+from magnet.export import save_bvh
+from magnet.motion.scene import Scene
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model(tiny_denoiser(max_agents=3), SamplerOptions(steps=2))
+
+
+@pytest.fixture
+def duet() -> Scene:
+    return random_scene(1, 50, 2, torch.Generator().manual_seed(5))
+
+
+def test_importing_the_package_loads_neither_torch_nor_the_api():
+    code = "import magnet, sys; assert not {'torch', 'magnet.api', 'magnet.export'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert {"load", "read", "Model", "Motion"} <= set(dir(magnet))
+
+
+def test_scenes_from_nothing_have_the_people_and_frames_asked_for(model: Model):
+    motion = model.generate(people=3, frames=30, seed=1, samples=2)
+    assert (motion.scenes, motion.frames, motion.agents) == (2, 30, 3)
+    assert motion.present.all() and motion.known is not None and not motion.known.any() and motion.context == 0
+    assert not torch.equal(motion.T_world_root[0], motion.T_world_root[1])
+
+
+def test_a_seed_decides_and_no_seed_does_not(model: Model):
+    roots = [model.generate(frames=8, seed=seed).T_world_root for seed in (1, 1, 2, None, None)]
+    assert torch.equal(roots[0], roots[1])
+    assert not torch.equal(roots[0], roots[2]) and not torch.equal(roots[3], roots[4])
+
+
+def test_a_continuation_begins_with_the_end_of_what_was_given(model: Model, duet: Scene):
+    longer = model.continue_(duet, frames=20, seed=1)
+    assert longer.frames == 48 + 20 and longer.context == 48
+    assert torch.allclose(longer.T_world_root[:, :40], duet.T_world_root[:, 2:42], atol=1e-5)
+    assert model.continue_(duet, frames=20, context=18, seed=1).context == 16
+
+
+def test_a_filled_in_agent_owes_nothing_to_its_own_motion(model: Model, duet: Scene):
+    filled = model.inpaint(duet, agent=0, seed=1)
+    assert filled.frames == 48
+    assert filled.known is not None and filled.known.all(dim=0).tolist() == [False, True]
+    assert torch.allclose(filled.T_world_root[:, :, 1], duet.T_world_root[:, :48, 1], atol=1e-5)
+    other = duet.replace(T_world_root=torch.cat([duet.T_world_root[:, :, :1].flip(1), duet.T_world_root[:, :, 1:]], 2))
+    assert torch.equal(model.inpaint(other, agent=0, seed=1).T_world_root, filled.T_world_root)
+
+
+def test_somebody_alone_is_given_a_partner(model: Model, duet: Scene):
+    solo = duet.order(torch.tensor([0]))
+    pair = model.inpaint(solo, agent=1, seed=1)
+    assert pair.agents == 2 and pair.present.all()
+    assert torch.allclose(pair.T_world_root[:, :, 0], solo.T_world_root[:, :48, 0], atol=1e-5)
+
+
+def test_a_reaction_keeps_everybodys_past_and_the_others_future(model: Model, duet: Scene):
+    answer = model.react(duet, agent=1, context=16, seed=1)
+    assert answer.known is not None
+    assert answer.known[:16].all() and answer.known[16:, 0].all() and not answer.known[16:, 1].any()
+
+
+@pytest.mark.parametrize("task", registry.names())
+def test_every_task_can_be_asked_for_by_name(task, model: Model, duet: Scene):
+    context = 0 if task in ("generation", "partner_inpainting") else 16
+    motion = model.predict(duet, task, context=context, frames=16, seed=1)
+    assert (motion.frames, motion.agents) == (context + 16, 2)
+    schedule = registry.get(task)().schedule(Grid((context + 16) // 4, 3, context // 4, 2, 8, 4))
+    assert motion.known is not None
+    assert torch.equal(motion.known[::4], schedule.known[:, :2])
+
+
+def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
+    motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
+    assert motion.known is not None and not motion.known[16:].any()
+
+
+def test_scenes_keep_what_they_know_when_cut_and_ordered(model: Model, duet: Scene):
+    longer = model.continue_(duet, frames=12, seed=1)
+    part = longer.cut(40, 56)
+    assert isinstance(part, Motion) and part.context == 8
+    assert isinstance(longer.pick([0]), Motion) and longer.pick([0]).context == 48
+    filled = model.inpaint(duet, agent=0, seed=1).order(torch.tensor([1, 0]))
+    assert filled.known is not None and filled.known.all(dim=0).tolist() == [True, False]
+    assert longer.pad_agents(3).agents == 3 and longer.held(2).frames == 64
+    assert longer.joints().shape == (1, 60, 2, 22, 3)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".bvh", ".glb", ".csv", ".html", ".webp", ".png"])
+def test_a_scene_saves_itself_by_suffix(suffix, model: Model, tmp_path: Path):
+    motion = model.generate(frames=8, seed=1)
+    path = motion.save(tmp_path / f"scene{suffix}")
+    assert path.stat().st_size > 1000
+    if suffix == ".npz":
+        assert torch.equal(Scene.load(path).T_world_root, motion.T_world_root)
+
+
+def test_a_notebook_plays_a_page_or_a_film(model: Model, tmp_path: Path):
+    motion = model.generate(frames=8, seed=1, samples=2)
+    page, film = motion.show(1), motion.show(player="film")
+    assert page._repr_html_().startswith("<iframe srcdoc=") and "http://" not in page._repr_html_().split("&gt;")[0]
+    assert film._repr_html_().startswith('<img alt="scene" src="data:image/webp;base64,')
+    assert "played in notebooks" in repr(page)
+    assert page.save(tmp_path / "x").read_bytes() == page.data
+
+
+def test_files_of_any_kind_are_read_at_the_models_rate(model: Model, duet: Scene, tmp_path: Path):
+    paths = save_bvh(duet.replace(fps=60.0), tmp_path / "a.bvh", load_body())
+    motion = magnet.read(*paths)
+    assert (motion.fps, motion.frames, motion.agents) == (30.0, 25, 2)
+    assert any("own skeleton" in note for note in motion.notes)
+    assert model.continue_(motion, frames=8, seed=1).frames == 32
+
+
+def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
+    with pytest.raises(ValueError, match="people: got 4, the model takes 1 to 3"):
+        model.generate(people=4)
+    with pytest.raises(ValueError, match="runs at 60 fps, the model at 30"):
+        model.continue_(duet.replace(fps=60.0))
+    with pytest.raises(ValueError, match="no task named generatoin; did you mean generation"):
+        model.predict(duet, "generatoin")
+    with pytest.raises(ValueError, match="agent 3: the model takes agents 0 to 2"):
+        model.inpaint(duet, agent=3)
+    with pytest.raises(ValueError, match="leave none to sample after 64 of context"):
+        model.react(duet, context=64)
+    with pytest.raises(ValueError, match="no checkpoint trio"):
+        magnet.load("trio")
+    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'"):
+        model.generate(frames=8).save("a.fbx")
