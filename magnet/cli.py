@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import os
 import re
 import sys
@@ -19,6 +20,9 @@ TRAINER_COMMANDS = {
 LIGHT_COMMANDS = {
     "tasks": "list the tasks that are installed, with their options; `tasks show NAME` draws one",
     "demo": "the main job on the embedded default, from nothing to a table and pictures",
+    "data": "prepare, check, describe, fake and download data sets",
+    "view": "watch scenes in the browser, or let a model play live",
+    "export": "write scenes as bvh, glb, csv, npz, html or a picture",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS
 
@@ -85,10 +89,9 @@ def run(command: str, arguments: list[str]) -> int:
         from magnet.cli_tasks import list_tasks
 
         return list_tasks(arguments)
-    if command == "demo":
-        from magnet.demo import main as demo
-
-        return int(demo(arguments) or 0)
+    if command in LIGHT_COMMANDS:
+        module = "magnet.demo" if command == "demo" else f"magnet.cli_{command}"
+        return int(importlib.import_module(module).main(arguments) or 0)
     raise CommandError(no_such("command", command, COMMANDS, "magnet --help"))
 
 

@@ -30,6 +30,15 @@ DATA = {
     "Synthetic": "magnet.datamodules.synthetic",
     "CMU": "magnet.datamodules.cmu",
     "Mixed": "magnet.datamodules.mixed",
+    "DuoBox": "magnet.datamodules.duobox",
+    "DD100": "magnet.datamodules.dd100",
+    "ReMoCap": "magnet.datamodules.remocap",
+    "InterX": "magnet.datamodules.interx",
+    "Embody3D": "magnet.datamodules.embody3d",
+    "InterHuman": "magnet.datamodules.interhuman",
+    "AIOZ": "magnet.datamodules.aioz",
+    "Hi4D": "magnet.datamodules.hi4d",
+    "CHI3D": "magnet.datamodules.chi3d",
 }
 """Classes with short names, and where they are; the first ones are the default."""
 

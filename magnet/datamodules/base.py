@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -59,6 +59,8 @@ class MotionDataModule(LightningDataModule):
     Raises:
         ValueError: a number is out of its range.
     """
+
+    maps_files: ClassVar[bool] = False  # `open_store` leaves frames on disk and sends them compact to the device
 
     def __init__(
         self,
@@ -152,19 +154,27 @@ class MotionDataModule(LightningDataModule):
         device = torch.device(device)
         if (split, device) not in self._stores:
             if device.type == "cpu":
-                clips = self.clips(split)
-                if not clips:
-                    raise ValueError(
-                        f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
-                    )
-                self._stores[split, device] = Store(clips, self.max_agents)
+                self._stores[split, device] = self.open_store(split)
             else:
                 self._stores[split, device] = self.store(split).to(device)
         return self._stores[split, device]
 
+    def open_store(self, split: Split) -> Store:
+        """The clips of a split as a store on the CPU; all in memory, unless a data set knows better.
+
+        Raises:
+            ValueError: the split has no clips.
+        """
+        clips = self.clips(split)
+        if not clips:
+            raise ValueError(
+                f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
+            )
+        return Store(clips, self.max_agents)
+
     def _gather(self, split: Split, frames: int, draw: Draw) -> Scene:
         device = torch.device("cpu")
-        if self.device_resident and self.trainer is not None:
+        if self.trainer is not None and (self.device_resident or self.maps_files):
             device = self.trainer.strategy.root_device
         return self.store(split, device).gather(draw, frames, self.compose_clearance)
 
@@ -176,10 +186,16 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> TrainLoader:
         """Random windows (batch_size, window_frames, max_agents); resumes where a loaded state stood."""
         store = self.store("train")
-        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed)
+        place = self._shard()
+        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
         size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
         self._train_loader = TrainLoader(
-            draws, lambda draw: self._gather("train", self.window_frames, draw), self.batch_size, size, *self._shard()
+            draws,
+            lambda draw: self._gather("train", self.window_frames, draw),
+            self.batch_size,
+            size,
+            *place,
+            shared=draws.shared,
         )
         if self._resume is not None:
             self._train_loader.load_state_dict(self._resume)

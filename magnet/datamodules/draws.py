@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.datamodules.windows import Draw, Ints, Store, all_starts, spaced_starts
+from magnet.seeding import derive
 
 Floats = NDArray[np.float64]
 
@@ -38,12 +39,17 @@ def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Flo
 class RandomDraws:
     """Training windows: sample i of epoch e depends only on (seed, e, i) and the clips.
 
+    Where the store divides its clips among processes, a process draws from its own alone. Sample k of process r is
+    then sample k * world + r of the epoch and depends on (seed, e, k, r, world).
+
     Args:
         store: the training clips.
         frames: window length.
         weights: share of each source; None: every valid window is equally likely.
         augmentation: what happens to the windows.
         seed: of all randomness.
+        rank: of this process.
+        world: number of processes.
 
     Raises:
         ValueError: no clip has a valid frame, or a weight names no source, or they leave nothing.
@@ -52,23 +58,44 @@ class RandomDraws:
     COLUMNS = 12
 
     def __init__(
-        self, store: Store, frames: int, weights: Mapping[str, float] | None, augmentation: Augmentation, seed: int
+        self,
+        store: Store,
+        frames: int,
+        weights: Mapping[str, float] | None,
+        augmentation: Augmentation,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
     ) -> None:
         self.store, self.augmentation, self.seed = store, augmentation, seed
-        starts = [all_starts(clip.good(), frames) for clip in store.clips]
-        self.starts = np.concatenate(starts)
-        self.count = np.array([len(s) for s in starts], dtype=np.int64)
-        self.first = np.cumsum(self.count) - self.count
+        self.count = np.maximum(store.length - frames + 1, 1)
+        self.starts, self.first = self._listed(frames)
         share = self.count * self._weigh(weights)
         if not share.sum() > 0:
             raise ValueError(f"split train: no valid window of {frames} frames is left by weights={weights}")
+        owners = store.owners(share / share.sum(), world) if world > 1 else None
+        self.shared = owners is not None
+        if owners is not None:
+            self.seed = derive(seed, "share", rank, world)
+            share = np.where(owners == rank, share, 0.0)
         self.cdf = np.cumsum(share) / share.sum()
+
+    def _listed(self, frames: int) -> tuple[Ints, Ints]:
+        """Starts of clips with invalid frames, and where each clip's begin among them; -1: any start will do."""
+        first = np.full(len(self.count), -1, dtype=np.int64)
+        starts: list[Ints] = [np.zeros(0, dtype=np.int64)]
+        total = 0
+        for clip in np.flatnonzero(~self.store.whole):
+            starts.append(all_starts(self.store.good(int(clip)), frames))
+            first[clip], self.count[clip] = total, len(starts[-1])
+            total += len(starts[-1])
+        return np.concatenate(starts), first
 
     def _weigh(self, weights: Mapping[str, float] | None) -> Floats:
         """Weight of one window of each clip."""
         if weights is None:
             return np.ones(len(self.count))
-        source = np.array([clip.source for clip in self.store.clips], dtype=object)
+        source = self.store.sources
         unknown = sorted(set(weights) - set(source))
         if unknown:
             raise ValueError(f"weights: no training clip has the source {unknown}; there are {sorted(set(source))}")
@@ -78,7 +105,7 @@ class RandomDraws:
         return np.array([weights.get(s, 0.0) / max(windows.get(s, 1), 1) for s in source])
 
     def __call__(self, epoch: int, first: int, count: int) -> Draw:
-        """Samples `first` to `first + count` of an epoch."""
+        """Samples `first` to `first + count` of an epoch; of this process's share, if there are shares."""
         slots = self.store.max_agents
         u = uniforms(self.seed, epoch, first, count, self.COLUMNS + slots)
         augment = self.augmentation
@@ -104,7 +131,10 @@ class RandomDraws:
 
     def _window(self, u: Floats, v: Floats) -> tuple[Ints, Ints]:
         clip = np.minimum(np.searchsorted(self.cdf, u, side="right"), len(self.cdf) - 1)
-        return clip, self.starts[self.first[clip] + (v * self.count[clip]).astype(np.int64)]
+        start = (v * self.count[clip]).astype(np.int64)
+        listed = np.flatnonzero(self.first[clip] >= 0)
+        start[listed] = self.starts[self.first[clip[listed]] + start[listed]]
+        return clip, start
 
 
 def seat(first: Ints, joining: Ints, second: Ints, turn: Ints, slots: int) -> tuple[Ints, Ints]:
@@ -136,8 +166,8 @@ def fixed_draws(store: Store, frames: int, stride: int, pad: bool = False) -> Dr
         pad: a clip shorter than the window gives one, padded; otherwise none.
     """
     pairs = []
-    for c, clip in enumerate(store.clips):
-        good = clip.good()
+    for c in range(len(store.length)):
+        good = store.good(c)
         starts = all_starts(good, frames) if pad and len(good) < frames else spaced_starts(good, frames, stride)
         pairs += [(c, int(start)) for start in starts]
     return whole_clips(store, pairs)

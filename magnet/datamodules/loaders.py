@@ -20,7 +20,8 @@ class TrainLoader:
     """An endless stream of epochs: each pass yields the rest of the current epoch, the next pass the next epoch.
 
     Global batch g of an epoch covers its samples g * world * batch_size and on; each rank takes its own part
-    of them, so that the samples seen do not depend on how many processes share the work.
+    of them, so that the samples seen do not depend on how many processes share the work. Where every process
+    draws from clips of its own, its samples are numbered on their own.
 
     Args:
         draw: (epoch, first sample, count) to the windows drawn.
@@ -29,6 +30,7 @@ class TrainLoader:
         epoch_size: samples an epoch, over all processes; rounded down to whole batches, at least one.
         rank: of this process.
         world: number of processes.
+        shared: `draw` numbers the samples of this process alone.
     """
 
     def __init__(
@@ -39,8 +41,9 @@ class TrainLoader:
         epoch_size: int,
         rank: int = 0,
         world: int = 1,
+        shared: bool = False,
     ) -> None:
-        self.draw, self.gather = draw, gather
+        self.draw, self.gather, self.shared = draw, gather, shared
         self.batch_size, self.rank, self.world = batch_size, rank, world
         self.batches = max(1, epoch_size // (batch_size * world))
         self.epoch, self.batch = 0, 0
@@ -51,7 +54,8 @@ class TrainLoader:
     def __iter__(self) -> Iterator[Scene]:
         # Lightning makes the iterator before it restores anything: read the place only when asked for a batch.
         while True:
-            first = (self.batch * self.world + self.rank) * self.batch_size
+            block = self.batch if self.shared else self.batch * self.world + self.rank
+            first = block * self.batch_size
             batch = self.gather(self.draw(self.epoch, first, self.batch_size))
             self.batch += 1
             last = self.batch >= self.batches

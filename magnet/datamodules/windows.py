@@ -1,7 +1,8 @@
-"""Clips in memory: flat tensors of all frames of a split, from which batches of windows are gathered."""
+"""Clips of a split: their index, and flat rows of all frames, from which batches of windows are gathered."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -90,7 +91,8 @@ class Draw:
 class Store:
     """All clips of a split as flat tensors on one device; rows are frames of one person.
 
-    Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there.
+    Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there. What
+    keeps its frames elsewhere overrides `_frames`, `good` and `__init__`, and calls `_index`.
 
     Args:
         clips: at least one, all of one fps and body.
@@ -102,58 +104,86 @@ class Store:
 
     def __init__(self, clips: Sequence[Clip], max_agents: int) -> None:
         self.clips = list(clips)
-        self.max_agents = max_agents
         first = self.clips[0]
         for clip in self.clips:
-            if clip.agents > max_agents:
-                raise ValueError(
-                    f"clip {clip.name} has {clip.agents} people, but max_agents is {max_agents}; raise max_agents"
-                )
             for field in ("fps", "body"):
                 got, want = getattr(clip.scene, field), getattr(first.scene, field)
                 if got != want:
                     raise ValueError(f"clip {clip.name}: {field} is {got}, but clip {first.name} has {want}")
-        self.fps, self.body = first.scene.fps, first.scene.body
-        self.length = np.array([clip.frames for clip in self.clips], dtype=np.int64)
-        self.people = np.array([clip.agents for clip in self.clips], dtype=np.int64)
-        self.tensors = self._flatten()
+        goods = [clip.good() for clip in self.clips]
+        self._index(
+            names=[clip.name for clip in self.clips],
+            sources=[clip.source for clip in self.clips],
+            length=[clip.frames for clip in self.clips],
+            people=[clip.agents for clip in self.clips],
+            whole=[bool(good.all()) for good in goods],
+            max_agents=max_agents,
+            fps=first.scene.fps,
+            body=first.scene.body,
+        )
+        self.tensors |= {"valid": torch.from_numpy(np.concatenate(goods)), **self._flatten()}
+        self.device = self.tensors["body_rot"].device
+
+    def _index(
+        self,
+        names: Sequence[str],
+        sources: Sequence[str],
+        length: Sequence[int] | Ints,
+        people: Sequence[int] | Ints,
+        whole: Sequence[bool] | NDArray[np.bool_],
+        max_agents: int,
+        fps: float,
+        body: str,
+    ) -> None:
+        """Where each clip's people begin: person after person, one row a frame, from row 1 on."""
+        self.names, self.sources = list(names), np.array(sources, dtype=object)
+        self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
+        self.whole = np.array(whole, dtype=bool)  # every frame is valid
+        self.max_agents, self.fps, self.body = max_agents, fps, body
+        most = int(self.people.argmax())
+        if self.people[most] > max_agents:
+            raise ValueError(
+                f"clip {self.names[most]} has {self.people[most]} people, but max_agents is {max_agents}; raise"
+                " max_agents"
+            )
+        rows = self.length * self.people
+        slot = np.arange(max_agents)
+        there = slot < self.people[:, None]
+        first_row = 1 + (np.cumsum(rows) - rows)[:, None] + slot * self.length[:, None]
+        person = 1 + (np.cumsum(self.people) - self.people)[:, None] + slot
+        self.tensors = {
+            "first_row": torch.from_numpy(np.where(there, first_row, 0)),
+            "person": torch.from_numpy(np.where(there, person, 0)),
+            "length": torch.from_numpy(self.length),
+            "first_frame": torch.from_numpy(np.cumsum(self.length) - self.length),
+        }
 
     def _flatten(self) -> dict[str, Tensor]:
         eye = torch.eye(4)
         rot = [eye[:3, :3].expand(1, BODY_JOINTS - 1, 3, 3)]
         root, betas = [eye[None]], [torch.zeros(1, 10)]
-        first_row = np.zeros((len(self.clips), self.max_agents), dtype=np.int64)
-        person = np.zeros_like(first_row)
-        row = 1
-        for c, clip in enumerate(self.clips):
+        for clip in self.clips:
             scene = clip.scene.to("cpu")
             for p in range(clip.agents):
                 rot.append(scene.body_rot[0, :, p].float())
                 root.append(scene.T_world_root[0, :, p].float())
                 betas.append(scene.betas[:, p].float())
-                first_row[c, p], person[c, p] = row, len(betas) - 1
-                row += clip.frames
-        return {
-            "body_rot": torch.cat(rot),
-            "T_world_root": torch.cat(root),
-            "betas": torch.cat(betas),
-            "valid": torch.from_numpy(np.concatenate([clip.good() for clip in self.clips])),
-            "first_row": torch.from_numpy(first_row),
-            "person": torch.from_numpy(person),
-            "length": torch.from_numpy(self.length),
-            "first_frame": torch.from_numpy(np.cumsum(self.length) - self.length),
-        }
+        return {"body_rot": torch.cat(rot), "T_world_root": torch.cat(root), "betas": torch.cat(betas)}
 
-    @property
-    def device(self) -> torch.device:
-        return self.tensors["body_rot"].device
+    def good(self, clip: int) -> NDArray[np.bool_]:
+        """Which frames of a clip are valid. (T,) bool"""
+        return self.clips[clip].good()
+
+    def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
+        """Which of `world` processes draws from each clip, given how likely each is; None: all draw from all. (C,)"""
+        return None
 
     def to(self, device: torch.device | str) -> Store:
         """The same clips on another device; itself when they are there already."""
         if torch.device(device) == self.device:
             return self
-        other = object.__new__(Store)
-        other.__dict__.update(self.__dict__)
+        other = copy.copy(self)
+        other.device = torch.device(device)
         other.tensors = {name: tensor.to(device) for name, tensor in self.tensors.items()}
         return other
 
@@ -163,37 +193,47 @@ class Store:
         Beyond a clip's end its last frame is repeated with `valid` False.
         """
         t = self.tensors
+        near = t["length"].device  # of the index; a mapped store's is not where the frames go
 
-        def on_device(array: Ints) -> Tensor:
-            return torch.from_numpy(array).to(self.device, non_blocking=True)
+        def to_index(array: Ints) -> Tensor:
+            return torch.from_numpy(array).to(near, non_blocking=True)
 
-        clips, starts = on_device(np.maximum(draw.clips, 0)), on_device(draw.starts)
-        members, groups = on_device(draw.members), on_device(draw.groups)
+        clips, starts = to_index(np.maximum(draw.clips, 0)), to_index(draw.starts)
+        members, groups = to_index(draw.members), to_index(draw.groups)
         there, member = members >= 0, members.clamp_min(0)
 
-        wanted = starts[..., None] + torch.arange(frames, device=self.device)  # (B, 2, T)
+        wanted = starts[..., None] + torch.arange(frames, device=near)  # (B, 2, T)
         last = t["length"][clips][..., None] - 1
         frame = torch.minimum(wanted, last)
-        good = (wanted <= last) & t["valid"][t["first_frame"][clips][..., None] + frame]
-        valid = (good | on_device(draw.clips)[..., None].lt(0)).all(dim=1)
+        good = wanted <= last
+        if "valid" in t:
+            good &= t["valid"][t["first_frame"][clips][..., None] + frame]
+        valid = (good | to_index(draw.clips)[..., None].lt(0)).all(dim=1)
 
         clip = clips.gather(1, groups)  # (B, P)
         frame_of_slot = frame.gather(1, groups[..., None].expand(-1, -1, frames))  # (B, P, T)
         rows = torch.where(there[..., None], t["first_row"][clip, member][..., None] + frame_of_slot, 0)
-        rows = rows.transpose(1, 2).flatten()
-        B, P = there.shape
-        T_world_root = t["T_world_root"].index_select(0, rows).view(B, frames, P, 4, 4)
+        rows = rows.transpose(1, 2)
+        betas = t["betas"][torch.where(there, t["person"][clip, member], 0)]
+        body_rot, T_world_root = self._frames(rows)
+        there, groups = there.to(self.device), groups.to(self.device)
         scene = Scene(
-            body_rot=t["body_rot"].index_select(0, rows).view(B, frames, P, BODY_JOINTS - 1, 3, 3),
+            body_rot=body_rot,
             T_world_root=self._compose(T_world_root, there, groups, draw, clearance),
-            betas=t["betas"][torch.where(there, t["person"][clip, member], 0)],
+            betas=betas.to(self.device),
             present=there,
             fps=self.fps,
             body=self.body,
-            valid=valid,
-            names=self.names(draw, frames),
+            valid=valid.to(self.device),
+            names=self.labels(draw, frames),
         )
         return self._mirror(scene, draw)
+
+    def _frames(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """body_rot and T_world_root of rows, on `self.device`. rows: (B, T, P) int"""
+        body_rot = self.tensors["body_rot"].index_select(0, rows.flatten())
+        T_world_root = self.tensors["T_world_root"].index_select(0, rows.flatten())
+        return body_rot.unflatten(0, rows.shape), T_world_root.unflatten(0, rows.shape)
 
     def _compose(self, T_world_root: Tensor, there: Tensor, groups: Tensor, draw: Draw, clearance: float) -> Tensor:
         chosen = torch.from_numpy(np.flatnonzero(draw.clips[:, 1] >= 0)).to(self.device)
@@ -213,11 +253,11 @@ class Store:
             scene.T_world_root.index_copy_(0, index, half.T_world_root)
         return scene
 
-    def names(self, draw: Draw, frames: int) -> tuple[str, ...]:
+    def labels(self, draw: Draw, frames: int) -> tuple[str, ...]:
         """A label a scene: clip and frames, such as "60_05+61_05 [120:302]"; composed ones say so."""
 
         def label(clip: int, start: int) -> str:
-            return f"{self.clips[clip].name} [{start}:{min(start + frames, self.length[clip])}]"
+            return f"{self.names[clip]} [{start}:{min(start + frames, self.length[clip])}]"
 
         return tuple(
             label(a, s) if b < 0 else f"composed: {label(a, s)} + {label(b, z)}"

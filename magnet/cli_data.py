@@ -1,0 +1,346 @@
+"""`magnet data list|info|check|fake|prepare|download`: from a download to a store that trains."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magnet.cli_data_shown import bar, file_bars, show_skipped, show_splits
+
+if TYPE_CHECKING:
+    from magnet.datamodules.recording import Reader
+
+DESCRIPTION = """\
+Prepare, check, describe, fake and download data sets.
+
+  magnet data list                                   what is known, its licence, where to ask for it
+  magnet data fake interx OUT                        a tiny made-up download, to try everything out
+  magnet data check DOWNLOAD_OR_STORE                all assertions, a summary, a picture
+  magnet data prepare interx --root DOWNLOAD --out STORE --body SMPLX_NEUTRAL.npz
+  magnet data info STORE                             what a store holds
+  magnet data download cmu --subjects 60,61 OUT      CMU's free recordings
+"""
+FAILED = 1
+"""Exit code of a check that found a problem."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """`magnet data ...`. Returns the exit code.
+
+    Raises:
+        ValueError: a data set, option or folder that does not fit; says what does.
+        OSError: a folder or disk that cannot be used.
+    """
+    given = list(arguments)
+    name = given[1] if len(given) > 1 and given[0] in ("prepare", "check") else None
+    known, rest = parser().parse_known_args(given)
+    if "run" not in known:
+        parser().print_help()
+        return 0
+    if rest and not (known.takes_reader_options and all_reader_options(rest)):
+        raise ValueError(f"magnet data {given[0]}: no option {rest[0]}; see magnet data {given[0]} --help")
+    known.reader_options = rest
+    if known.help:
+        return show_help(given[0], name)
+    return int(known.run(known))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The commands and their options."""
+    whole = argparse.ArgumentParser(
+        prog="magnet data", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = whole.add_subparsers(metavar="COMMAND")
+    for name, (add, run, what) in COMMANDS.items():
+        one = commands.add_parser(name, help=what, description=what, add_help=False, allow_abbrev=False)
+        one.add_argument("-h", "--help", action="store_true", help="show this")
+        add(one)
+        one.set_defaults(run=run, parser=one, takes_reader_options=name in ("prepare", "check"))
+    return whole
+
+
+def show_help(command: str, name: str | None) -> int:
+    """Help of a command, with a data set's own options where one is named."""
+    from magnet.datamodules import catalogue
+
+    for one in parser()._subparsers._group_actions[0].choices.items():  # type: ignore[union-attr]
+        if one[0] == command:
+            one[1].print_help()
+    if name in catalogue.NAMES:
+        kind = catalogue.find(name).load_reader()
+        print(f"\noptions of {kind.title}:\n")
+        reader_parser(kind).print_help()
+    return 0
+
+
+# -- options -----------------------------------------------------------------------------------
+
+
+def add_list(one: argparse.ArgumentParser) -> None:
+    """Nothing to say."""
+
+
+def add_info(one: argparse.ArgumentParser) -> None:
+    one.add_argument("path", nargs="?", help="a prepared store")
+
+
+def add_work(one: argparse.ArgumentParser) -> None:
+    one.add_argument("--body", default="open", help="SMPL-X's npz (register at https://smpl-x.is.tue.mpg.de)")
+    one.add_argument(
+        "--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)"
+    )
+    one.add_argument("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
+    one.add_argument("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
+    one.add_argument("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
+    one.add_argument("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
+
+
+def add_check(one: argparse.ArgumentParser) -> None:
+    one.add_argument("path", nargs="?", help="a prepared store, or the folder of a download")
+    one.add_argument("--name", default=None, help="which data set a download is; default: found by its layout")
+    one.add_argument("--picture", default=None, help="PNG to write (default: NAME_check.png here); none: no picture")
+    add_work(one)
+
+
+def add_prepare(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
+    one.add_argument("--root", help="folder of the download")
+    one.add_argument("--out", help="folder of the store; run again to go on or to bring it up to date")
+    one.add_argument("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
+    add_work(one)
+    one.add_argument("--reader.OPTION", metavar="VALUE", help="an option of the data set: prepare NAME --help")
+
+
+def add_fake(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
+    one.add_argument("out", nargs="?", help="folder to write to; new or empty")
+    one.add_argument("--takes", type=int, default=4, help="(default: %(default)s)")
+    one.add_argument("--frames", type=int, default=300, help="of each take, at its own rate (default: %(default)s)")
+    one.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
+
+
+def add_download(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="cmu; the others are given out by their authors alone")
+    one.add_argument("out", nargs="?", help="folder to write to; run again to go on")
+    one.add_argument("--subjects", default="60,61", help="numbers with commas (default: %(default)s, salsa couples)")
+    one.add_argument("--base_url", default=None, help="another copy of the site")
+
+
+def needed(given: argparse.Namespace, *names: str) -> list[str]:
+    """Values that must be there.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name in names:
+        if getattr(given, name) is None:
+            raise ValueError(f"{given.parser.prog}: {name} is missing; see {given.parser.prog} --help")
+    return [getattr(given, name) for name in names]
+
+
+def all_reader_options(words: Sequence[str]) -> bool:
+    """Whether words are `--reader.OPTION VALUE` or `--reader.OPTION=VALUE` alone."""
+    expected = "flag"
+    for word in words:
+        if word.startswith("--reader."):
+            expected = "value or flag" if "=" not in word else "flag"
+        elif expected == "flag":
+            return False
+    return True
+
+
+def reader_parser(kind: type[Reader]) -> Any:
+    """Options of a data set's reader, from its constructor."""
+    from jsonargparse import ArgumentParser
+
+    options = ArgumentParser(prog="magnet data prepare", exit_on_error=False, add_help=False)
+    options.add_class_arguments(kind, "reader", skip={"root"})
+    return options
+
+
+def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
+    """What was given of them.
+
+    Raises:
+        ValueError: an option that the reader has not, or a value that does not fit.
+    """
+    from jsonargparse import ArgumentError
+
+    options = reader_parser(kind)
+    try:
+        config = options.parse_args(list(words)).as_dict().get("reader", {})
+    except ArgumentError as error:
+        known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
+        raise ValueError(f"{kind.title}: {error}; its options are {', '.join(known) or 'none'}") from error
+    flags = {word.split("=")[0].removeprefix("--reader.") for word in words if word.startswith("--reader.")}
+    return {name: value for name, value in config.items() if name in flags}
+
+
+# -- commands ----------------------------------------------------------------------------------
+
+
+def run_list(given: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.text import Text
+
+    from magnet.datamodules import catalogue
+
+    console = Console(highlight=False)
+    for name, entry in catalogue.NAMES.items():
+        kind = entry.load_reader()
+        console.print(
+            Text.assemble((f"{name:<12}", "bold cyan"), kind.title, ("  " + kind.source, "dim")), soft_wrap=True
+        )
+        console.print(Text(f"{'':<12}{kind.licence}"), soft_wrap=True)
+    console.print(f"{'cmu':<12}CMU Graphics Lab Motion Capture Database: magnet data download cmu", style="dim")
+    return 0
+
+
+def run_info(given: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from magnet.datamodules.store import Folder
+
+    (path,) = needed(given, "path")
+    folder = Folder(path)
+    m = folder.manifest
+    out = Console(highlight=False)
+    out.print(f"[bold]{m['title']}[/bold]  {m['licence']}\n{m['source']}", soft_wrap=True)
+    out.print(f"body {m['body']['id']} ({m['body']['sha256'][:8]}), {m['fps']:g} fps, store format {m['format']}")
+    rows = sum(split["person frames"] for split in m["splits"].values())
+    files = [folder.path / name for name in folder.files()]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    out.print(f"{rows:,} frames of one person, {size / 2**20:.1f} MiB; splits by {m['splits by']}")
+    if m.get("limit"):
+        out.print(f"a try-out: at most {m['limit']} takes of each split")
+    show_splits(
+        [
+            (
+                name,
+                str(split["takes"]),
+                f"{split['clips']} ({', '.join(f'{k} of {n}' for n, k in split['clips by people'].items())})",
+                f"{split['frames']:,}",
+                f"{split['frames'] / 30 / 60:.1f}",
+                str(len(split["shards"])),
+            )
+            for name, split in sorted(m["splits"].items(), key=lambda item: ("train", "val", "test").index(item[0]))
+        ]
+    )
+    for entry in m["notes"]:
+        out.print(f"note: {entry['note']} ({len(entry['takes'])} takes)", soft_wrap=True, markup=False)
+    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    if m["left out"]:
+        out.print(f"{len(m['left out'])} takes are in no split")
+    return 0
+
+
+def run_check(given: argparse.Namespace) -> int:
+    from magnet.body import load_body
+    from magnet.datamodules import catalogue, check
+    from magnet.datamodules.prepare_takes import Order
+    from magnet.datamodules.store import MANIFEST, STATE, Folder
+
+    path = Path(needed(given, "path")[0]).expanduser()
+    body = load_body(given.body) if given.body != "open" else None
+    if (path / MANIFEST).exists() or (path / STATE).is_dir():
+        folder = Folder(path)
+        name = folder.manifest["name"]
+        with bar() as tell:
+            found = check.check_store(folder, body, tell)
+    else:
+        if not path.is_dir():
+            raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
+        name = given.name or check.recognise(path)
+        options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
+        order = Order(name, str(path), options, given.body, steps_of(given))
+        body = order.body()
+        with bar() as tell:
+            found = check.check_download(order, given.workers, given.limit, tell)
+    show_splits(list(check.lines(found)), title=found.title)
+    for note in found.notes:
+        print(f"note: {note}")
+    show_skipped(found.skipped)
+    if given.picture != "none" and (picture := check.draw(found, Path(given.picture or f"{name}_check.png"), body)):
+        print(f"picture: {picture}")
+    for problem in found.problems:
+        print(f"PROBLEM: {problem}", file=sys.stderr)
+    print(f"{len(found.problems)} problems" if found.problems else "all assertions hold")
+    return FAILED if found.problems else 0
+
+
+def run_prepare(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+    from magnet.datamodules.prepare import prepare, read_splits
+    from magnet.datamodules.prepare_takes import Order
+
+    name, root, out = needed(given, "name", "root", "out")
+    options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
+    order = Order(name, root, options, given.body, steps_of(given))
+    splits = read_splits(given.splits) if given.splits else None
+    with bar() as tell:
+        report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
+    m = report.folder.manifest
+    print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
+    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    takes = sum(split["takes"] for split in m["splits"].values())
+    data = catalogue.find(name).data.partition(":")[2]
+    body = "" if given.body == "open" else f" --data.body_model {given.body}"
+    print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
+    print(f"  magnet fit --data {data} --data.path {out}{body}")
+    return 0
+
+
+def run_fake(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+
+    name, out = needed(given, "name", "out")
+    write, folder = catalogue.find(name).load_fake(), Path(out).expanduser()
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} is not empty; give a new folder")
+    write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    print(f"{len(files)} files of a made-up {name} are in {folder}. To prepare it:")
+    print(f"  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}")
+    return 0
+
+
+def run_download(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+
+    (name,) = needed(given, "name")
+    if name != "cmu":
+        kind = catalogue.find(name).load_reader()
+        raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
+    (out,) = needed(given, "out")
+    from magnet.datamodules.download import download_cmu
+
+    subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]
+    where = {} if given.base_url is None else {"base_url": given.base_url}
+    with file_bars() as tell:
+        got = download_cmu(subjects, out, progress=tell, **where)
+    print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
+    if got.unlike:
+        print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")
+    print(f"to train on them: magnet fit --data CMU --data.root {out}")
+    return 0
+
+
+COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int], str]] = {
+    "list": (add_list, run_list, "data sets, their licences, where to ask for them"),
+    "info": (add_info, run_info, "what a prepared store holds"),
+    "check": (add_check, run_check, "run all assertions on a store or a download; a summary and a picture"),
+    "fake": (add_fake, run_fake, "write a tiny made-up download in a data set's layout"),
+    "prepare": (add_prepare, run_prepare, "turn a download into a store, once"),
+    "download": (add_download, run_download, "fetch CMU's free recordings"),
+}
+
+
+def steps_of(given: argparse.Namespace) -> Any:
+    """What was chosen about the common steps."""
+    from magnet.datamodules.common import Steps
+
+    return Steps(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)

@@ -1,0 +1,55 @@
+"""What `magnet data` shows: tables of splits, takes that were skipped, progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+SKIPPED_SHOWN = 20
+
+
+def show_splits(rows: list[tuple[str, ...]], title: str | None = None) -> None:
+    """The table of splits."""
+    from rich.console import Console
+    from rich.table import Table
+
+    heads = ("split", "takes", "clips", "frames", "minutes", "shards")
+    table = Table(*heads[: len(rows[0])], title=title, title_justify="left", header_style="bold")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def show_skipped(skipped: list[tuple[str, str]]) -> None:
+    """Takes that were not used, and why."""
+    if not skipped:
+        return
+    print(f"skipped {len(skipped)} takes:")
+    for take, why in skipped[:SKIPPED_SHOWN]:
+        print(f"  {take}: {why}")
+    if len(skipped) > SKIPPED_SHOWN:
+        print(f"  ... and {len(skipped) - SKIPPED_SHOWN} more, all of them in the store's manifest.json")
+
+
+@contextmanager
+def bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar with what is being done and how long it will take."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)
+
+
+@contextmanager
+def file_bars() -> Iterator[Callable[[str, int, int | None], None]]:
+    """A progress bar of the file that is being fetched."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)

@@ -1,0 +1,131 @@
+"""AIOZ-GDANCE: groups of up to seven dancers, SMPL poses at 30 fps without shapes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from magnet.datamodules.arrays import AGAIN, Doubles, floats, hashed_split, listed_splits, open_names, require
+from magnet.datamodules.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.unpickle import load_pickle
+from magnet.datamodules.windows import Split
+
+LARGEST = 7
+LIST = "split_sequence_names.txt"
+LISTS: tuple[Split, ...] = ("train", "val", "test")
+SHAPELESS = "no shapes in this data set: everybody has the body's mean shape"
+
+
+class AIOZReader(Reader):
+    """AIOZ-GDANCE's `motions_smpl/<sequence>.pkl`: smpl_poses (P, T, 72) and root_trans (P, T, 3).
+
+    Splits are the lists {train,val,test}_split_sequence_names.txt where they are there. The first parts of the
+    download had only split_sequence_names.txt, which names sequences and no splits: then each video, the sequence
+    without its first and last frame, goes to one split by a hash of its name.
+
+    Args:
+        root: the folder with `motions_smpl`.
+
+    Raises:
+        DataError: no motions; says what was found.
+    """
+
+    name: ClassVar[str] = "aioz"
+    title: ClassVar[str] = "AIOZ-GDANCE"
+    source: ClassVar[str] = "https://github.com/aioz-ai/AIOZ-GDANCE"
+    licence: ClassVar[str] = "non-commercial scientific research only"
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+
+    def __init__(self, root: str | Path) -> None:
+        super().__init__(root)
+        if not (self.root / "motions_smpl").is_dir():
+            raise DataError(
+                f"{self.root}: no folder motions_smpl; it holds {listing(self.root)}; give the folder that has it"
+            )
+
+    def takes(self) -> list[Take]:
+        names = sorted(path.stem for path in (self.root / "motions_smpl").glob("*.pkl"))
+        official = any(path.is_file() for path in self._lists().values())
+        splits = listed_splits(self._lists(), _listed) if official else self._hashed(names)
+        return [
+            Take(
+                name=name,
+                files=(self.root / "motions_smpl" / f"{name}.pkl",),
+                split=splits.get(name),
+                group=name if official else _video(name),
+            )
+            for name in names
+        ]
+
+    def read(self, take: Take) -> Recording:
+        """All dancers at 30 fps, y up, of the mean shape."""
+        (path,) = take.files
+        said = mapping(path, load_pickle(path))
+        require(path, said, ("smpl_poses", "root_trans"))
+        trans = floats(f"{path}: root_trans", said["root_trans"], ("people", "T", 3))
+        if len(trans) > LARGEST:
+            raise DataError(
+                f"{path}: root_trans {trans.shape} would be {len(trans)} people, expected up to {LARGEST}: people come "
+                f"first, then frames; {AGAIN}"
+            )
+        poses = self._poses(path, said)
+        if poses.shape[:2] != trans.shape[:2]:
+            raise DataError(
+                f"{path}: people and frames are {poses.shape[:2]} of smpl_poses, but {trans.shape[:2]} of root_trans: "
+                f"a partner is missing or the lengths are unequal; {AGAIN}"
+            )
+        people = [Person(poses[p], trans[p], np.zeros(10), f"dancer {p + 1}") for p in range(len(trans))]
+        return side_by_side(path, people, 30.0, "+y", notes=[SHAPELESS])
+
+    def _poses(self, path: Path, said: Mapping[str, Any]) -> Doubles:
+        """(P, T, 22, 3); some releases keep the root's rotations apart and leave the hands out."""
+        poses = floats(f"{path}: smpl_poses", said["smpl_poses"], ("people", "T", "72"))
+        if "smpl_orients" in said:
+            orients = floats(f"{path}: smpl_orients", said["smpl_orients"], (*poses.shape[:2], 3))
+            poses = np.concatenate([orients, poses], axis=-1)
+        if poses.shape[2] not in (66, 72):
+            raise DataError(
+                f"{path}: smpl_poses are {poses.shape}, expected (people, frames, 72) for 24 joints, or 63 or 69 "
+                f"beside smpl_orients; {AGAIN}"
+            )
+        return poses[..., :66].reshape(*poses.shape[:2], 22, 3)
+
+    def _lists(self) -> dict[Split, Path]:
+        return {split: self.root / f"{split}_{LIST}" for split in LISTS}
+
+    def _hashed(self, names: list[str]) -> dict[str, Split]:
+        if (self.root / LIST).is_file():
+            listed = set(map(_listed, open_names(self.root / LIST)))
+            names = [name for name in names if name in listed]
+        return {name: hashed_split(_video(name)) for name in names}
+
+
+def _listed(line: str) -> str:
+    """The first column without an extension."""
+    return line.split(",")[0].strip().removesuffix(".pkl")
+
+
+def _video(name: str) -> str:
+    """A sequence is named after its video, first and last frame: x_100_400 -> x."""
+    return re.sub(r"_\d+_\d+$", "", name)
+
+
+class AIOZ(Prepared):
+    """AIOZ-GDANCE from a prepared store: scenes of up to seven people.
+
+    Args:
+        path: the store's folder.
+        max_agents: slots P of every batch.
+        **kwargs: as for Prepared.
+    """
+
+    reader: ClassVar[type[Reader]] = AIOZReader
+
+    def __init__(self, path: str = "", max_agents: int = 7, **kwargs: Any) -> None:
+        super().__init__(path=path, max_agents=max_agents, **kwargs)

@@ -1,0 +1,235 @@
+"""`magnet data check`: every assertion on a store or a download, what it holds, and a picture of some scenes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from magnet.body import Body, load_body
+from magnet.datamodules import catalogue
+from magnet.datamodules.prepare import chosen
+from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all
+from magnet.datamodules.recording import Reader
+from magnet.datamodules.store import SCALE, SPLITS, Folder, StoreError, body_hash, decode, file_hash
+from magnet.datamodules.store import Part as Stored
+from magnet.datamodules.windows import Split
+from magnet.export.picture import contact_sheet
+from magnet.motion.scene import Scene
+
+UNIT = 2.0
+"""By how much a stored quaternion's length may differ from the scale: rounding to whole numbers moves it by one."""
+PELVIS = (-1.0, 6.0)
+"""Metres over the floor that pelvises are found at, climbing and lifting included."""
+SHOWN, SHOWN_FRAMES = 4, 120
+"""Clips in the picture, and frames of each."""
+
+
+@dataclass
+class Checked:
+    """What a check found."""
+
+    title: str
+    problems: list[str] = field(default_factory=list)
+    counts: dict[Split, Counter[str]] = field(default_factory=dict)  # takes, clips, frames, person frames, N people
+    skipped: list[tuple[str, str]] = field(default_factory=list)  # take, why
+    notes: list[str] = field(default_factory=list)
+    scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture, all of one length
+
+
+def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], people: list[int]) -> None:
+    """Add one take's clips."""
+    count = counts.setdefault(split, Counter())
+    count["takes"] += 1
+    count["clips"] += len(frames)
+    count["frames"] += sum(frames)
+    count["person frames"] += sum(f * p for f, p in zip(frames, people, strict=True))
+    for number in people:
+        count[f"of {number}"] += 1
+
+
+# -- a store -----------------------------------------------------------------------------------
+
+
+def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = None) -> Checked:
+    """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
+
+    Args:
+        folder: the opened store.
+        body: its body, to check that it is; None: not checked.
+        tell: is told of progress, by file.
+    """
+    manifest = folder.manifest
+    found = Checked(manifest["title"])
+    files = folder.files()
+    for number, (name, digest) in enumerate(sorted(files.items())):
+        if tell is not None:
+            tell(name, number, 2 * len(files))
+        path = folder.path / name
+        if not path.is_file():
+            found.problems.append(f"{name} is missing; prepare the store again")
+        elif file_hash(path) != digest:
+            found.problems.append(f"{name} is damaged: its checksum is not the manifest's; prepare the store again")
+    if body is not None and body_hash(body) != manifest["body"]["sha256"]:
+        theirs = manifest["body"]["id"]
+        found.problems.append(f"the store is of body {theirs!r}, and {body.id!r} has other joints at rest")
+    found.skipped = [(entry["take"], entry["why"]) for entry in manifest["skipped"]]
+    found.notes = [f"{entry['note']} ({len(entry['takes'])} takes)" for entry in manifest["notes"]]
+    if found.problems:
+        return found
+    try:
+        for split in SPLITS:
+            _check_split(folder, split, found)
+    except StoreError as error:
+        found.problems.append(str(error))
+    return found
+
+
+def _check_split(folder: Folder, split: Split, found: Checked) -> None:
+    part, said = folder.split(split), folder.manifest["splits"][split]
+    take_of: dict[str, tuple[list[int], list[int]]] = {}
+    for c, take in enumerate(part.take):
+        frames, people = take_of.setdefault(take, ([], []))
+        frames.append(int(part.frames[c]))
+        people.append(int(part.people[c]))
+    for frames, people in take_of.values():
+        tally(found.counts, split, frames, people)
+    counted = found.counts.get(split, Counter())
+    for name in ("takes", "clips", "frames", "person frames"):
+        if counted[name] != said[name]:
+            found.problems.append(f"split {split}: the index has {counted[name]} {name}, the manifest {said[name]}")
+    total = int(part.ends[-1]) if len(part.ends) else 0
+    if total != counted["person frames"]:
+        found.problems.append(f"split {split}: shards have {total} rows, the index {counted['person frames']}")
+        return
+    if len(set(part.name)) < len(part.name):
+        found.problems.append(f"split {split}: clips are named twice")
+    if not np.isfinite(part.betas).all():
+        found.problems.append(f"split {split}: shape numbers hold NaN or infinity")
+    for c, name in enumerate(part.name):
+        if wrong := _wrong_rows(part, c):
+            found.problems.append(f"clip {name}: {wrong}; prepare the store again")
+    found.scenes += _scenes(folder, part, SHOWN - len(found.scenes))
+
+
+def _wrong_rows(part: Stored, clip: int) -> str | None:
+    rows = part.rows(clip)
+    length = np.sqrt(np.square(rows["rotations"].astype(np.float32)).sum(axis=-1))
+    if np.abs(length - SCALE).max() > UNIT:
+        return "rotations are not unit quaternions"
+    pelvis = rows["pelvis"]
+    if not np.isfinite(pelvis).all():
+        return "pelvises hold NaN or infinity"
+    low, high = float(pelvis[..., 1].min()), float(pelvis[..., 1].max())
+    if low < PELVIS[0] or high > PELVIS[1]:
+        return f"pelvises are {low:.1f} to {high:.1f} m over the floor, expected {PELVIS[0]:g} to {PELVIS[1]:g} m"
+    return None
+
+
+def _scenes(folder: Folder, part: Stored, most: int) -> list[tuple[str, Scene]]:
+    """Some clips, evenly spread over those that are long enough."""
+    longest = int(part.frames.max()) if len(part.frames) else 0
+    good = np.flatnonzero(part.frames >= min(SHOWN_FRAMES, longest))
+    count = min(most, 2, len(good))
+    chosen_clips = good[np.arange(count) * len(good) // max(count, 1)]
+    return [(part.name[c], _scene(part.rows(c), part.betas_of(c), folder.body)) for c in chosen_clips.tolist()]
+
+
+def _scene(rows: np.ndarray, betas: np.ndarray, body: str) -> Scene:
+    rows = rows[:, :SHOWN_FRAMES]
+    body_rot, T_world_root = decode(*(torch.from_numpy(rows[key].copy()) for key in ("rotations", "pelvis")))
+    return Scene(
+        body_rot=body_rot.transpose(0, 1)[None],
+        T_world_root=T_world_root.transpose(0, 1)[None],
+        betas=torch.from_numpy(np.array(betas))[None],
+        present=torch.ones(1, len(rows), dtype=torch.bool),
+        body=body,
+    )
+
+
+# -- a download --------------------------------------------------------------------------------
+
+
+def recognise(root: Path) -> str:
+    """Which data set's layout lies under a folder.
+
+    Raises:
+        ValueError: none does, or several do.
+    """
+    found, said = [], []
+    for name, entry in catalogue.NAMES.items():
+        try:
+            if entry.load_reader()(root).takes():
+                found.append(name)
+        except (ValueError, OSError) as error:
+            said.append(f"\n  {name}: {str(error)[:200]}")
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name")
+    raise ValueError(f"{root} is neither a prepared store nor a download that is known:{''.join(said)}")
+
+
+def check_download(order: Order, workers: int = 1, limit: int | None = None, tell: Tell | None = None) -> Checked:
+    """Every take of a download read and put through the common steps; nothing is written.
+
+    Raises:
+        DataError: there are no takes at all.
+    """
+    reader: Reader = order.reader()
+    body = order.body()
+    found = Checked(reader.title)
+    takes, left_out = chosen(reader, None, limit)
+    if left_out:
+        found.notes.append(f"{len(left_out)} takes are in no split by the data set's rule")
+    notes: Counter[str] = Counter()
+    parts: dict[str, Part] = {}
+    for take, part in convert_all(order, takes, lambda take: None, workers, tell):
+        if part.error is None and len(found.scenes) < SHOWN:
+            P, T = part.people[0], part.frames[0]
+            found.scenes.append((part.names[0], _scene(part.rows[: P * T].reshape(P, T), part.betas[:P], body.id)))
+        parts[take.name] = part
+    for take in takes:
+        part = parts[take.name]
+        if part.error is not None:
+            found.skipped.append((take.name, part.error))
+            continue
+        notes.update(part.notes)
+        tally(found.counts, take.split or "train", list(part.frames), list(part.people))
+    found.notes += [f"{note} ({count} takes)" for note, count in notes.items()]
+    if not found.counts:
+        found.problems.append(f"none of {len(takes)} takes can be used")
+    return found
+
+
+# -- the picture -------------------------------------------------------------------------------
+
+
+def draw(found: Checked, path: Path, body: Body | None) -> Path | None:
+    """A contact sheet of the scenes kept, as skeletons; None when there are none.
+
+    Without the store's own body the open one is drawn, in its mean shape.
+    """
+    if not found.scenes:
+        return None
+    frames = min(scene.frames for _, scene in found.scenes)
+    scenes = [(name, scene.cut(0, frames)) for name, scene in found.scenes]
+    title = found.title
+    if body is None or body.id != scenes[0][1].body:
+        body = load_body()
+        scenes = [(n, s.replace(body=body.id, betas=torch.zeros_like(s.betas))) for n, s in scenes]
+        title += " (drawn with the open body's mean shape)"
+    return contact_sheet(scenes, path, context_frames=0, body=body, style="capsules", title=title)
+
+
+def lines(found: Checked) -> Iterator[tuple[str, ...]]:
+    """Rows of the table of counts: split, takes, clips by people, frames, minutes."""
+    for split in SPLITS:
+        count = found.counts.get(split, Counter())
+        people = ", ".join(f"{n} {what}" for what, n in sorted(count.items()) if what.startswith("of "))
+        minutes = count["frames"] / 30 / 60
+        yield split, f"{count['takes']}", f"{count['clips']} ({people})", f"{count['frames']:,}", f"{minutes:.1f}"

@@ -1,0 +1,259 @@
+"""The steps between any reader and clips: y up, 30 fps at exact times, floor at 0, origin, cuts at lost tracking."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body import Body
+from magnet.body.fit import fit_body, floor_height
+from magnet.datamodules import check_motion
+from magnet.datamodules.recording import Axis, DataError, Recording
+from magnet.datamodules.windows import Clip, Split
+from magnet.motion.frames import rigid
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+STEPS_VERSION = 1
+"""Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
+FPS = 30.0
+FLOOR_PERCENTILE = 5.0
+"""Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
+Family = Literal["smplx", "smpl", "positions"]
+
+R_WORLD_FILE: dict[Axis, Tensor] = {
+    "+y": torch.eye(3, dtype=torch.float64),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)),
+    "+z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64),
+    "-z": torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64),
+    "+x": torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64),
+    "-x": torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64),
+}
+"""Rotation that takes a file's up axis to +y."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What can be chosen about the common steps; part of what a prepared store is remembered by.
+
+    Args:
+        min_frames: shortest clip that is kept, at 30 fps.
+        up: the files' up axis, in place of the one that the reader declares; None: the reader's.
+        trust_fps: do not refuse people who move too fast or too slowly for the declared frame rate.
+    """
+
+    min_frames: int = 30
+    up: Axis | None = None
+    trust_fps: bool = False
+
+    def __post_init__(self) -> None:
+        if self.min_frames < 1:
+            raise ValueError(f"min_frames: got {self.min_frames}, expected at least 1")
+        if self.up is not None and self.up not in R_WORLD_FILE:
+            raise ValueError(f"up: got {self.up!r}, expected one of {', '.join(R_WORLD_FILE)}")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """T frames of P people at 30 fps on their way to clips."""
+
+    rotations: Tensor  # (T, P, 22, 3, 3) float32, the pelvis's in the world, others relative to their parents
+    pelvis: Tensor  # (T, P, 3) float64 metres, the joint
+    betas: Tensor  # (P, 10)
+    valid: NDArray[np.bool_]  # (T, P)
+    joints: Tensor  # (T, P, 22, 3) float32 world
+
+    def turned(self, R: Tensor) -> Motion:
+        """Seen from a world turned by R_new_old (3, 3) float64."""
+        rotations = self.rotations.clone()
+        rotations[:, :, 0] = R.float() @ rotations[:, :, 0]
+        return Motion(rotations, self.pelvis @ R.T, self.betas, self.valid, self.joints @ R.T.float())
+
+    def lowered(self, height: float) -> Motion:
+        """With the floor, now at `height`, at 0."""
+        down = torch.tensor([0.0, height, 0.0], dtype=torch.float64)
+        return Motion(self.rotations, self.pelvis - down, self.betas, self.valid, self.joints - down.float())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The clips of one take, and what should be known about them."""
+
+    clips: list[Clip]
+    notes: tuple[str, ...]
+
+
+def to_clips(
+    recording: Recording,
+    body: Body,
+    name: str,
+    source: str,
+    split: Split,
+    family: Family = "smplx",
+    steps: Steps | None = None,
+) -> Outcome:
+    """All common steps: a recording to clips of `body`.
+
+    Args:
+        recording: as read, at any rate and with any up axis.
+        body: whose shape numbers `betas` are; for positions: the body to fit.
+        name: the take's; pieces of it are called "name [start:stop]" by their frames at 30 fps.
+        source: the data set.
+        split: of the take.
+        family: of the data set.
+        steps: what can be chosen.
+
+    Raises:
+        DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or
+            positions that the body does not fit within 4 cm.
+    """
+    steps = steps or Steps()
+    notes = list(recording.notes)
+    up = steps.up or recording.up
+    valid = check_motion.usable(recording)
+    if recording.poses is not None:
+        motion = _posed(recording, valid, body)
+        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
+        motion = motion.turned(R_WORLD_FILE[up])
+        check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
+    else:
+        motion, residual = _fitted(recording, valid, body, up, steps)
+        notes.append(f"body {body.id} fitted to positions: {residual}")
+    jumps = check_motion.jumps(motion.pelvis.numpy(), motion.valid, FPS)
+    if len(jumps):
+        notes.append(f"cut at {len(jumps)} jumps of more than {check_motion.JUMP:g} m between frames")
+    if not steps.trust_fps:
+        check_motion.check_rate(motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.fps, FPS)
+    soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
+    motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
+    if family == "smpl" and not any("shape" in note for note in notes):
+        notes.append("shape numbers are SMPL's, another basis than SMPL-X's: limb lengths are approximate")
+    return Outcome(_cut(motion, jumps, body, name, source, split, steps.min_frames), tuple(notes))
+
+
+# -- resampling --------------------------------------------------------------------------------
+
+
+def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:
+    """Which two frames each new frame i at time i / target lies between, and how far on: before, after, share."""
+    count = math.floor((frames - 1) * target / fps + 1e-9) + 1
+    place = torch.arange(count, dtype=torch.float64) * (fps / target)
+    before = (place + 1e-9).floor().long().clamp_max(frames - 1)
+    share = (place - before).clamp(0.0, 1.0)
+    share[share < 1e-9] = 0.0  # exact frames stay exact, and need no valid neighbour
+    return before, (before + 1).clamp_max(frames - 1), share
+
+
+def resample_rotations(quat: Tensor, fps: float, target: float = FPS) -> Tensor:
+    """Rotations at exact times, by slerp along the shorter arc. (T, ..., 4) unit quaternions -> (T', ..., 4)"""
+    before, after, share = times(len(quat), fps, target)
+    if not bool(share.any()):
+        return quat[before]
+    start = quat[before]
+    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), quat[after]))
+    share = share.view(-1, *[1] * (quat.dim() - 1))
+    return roma.quat_product(start, roma.rotvec_to_unitquat(turn * share))
+
+
+def resample_points(points: Tensor, fps: float, target: float = FPS) -> Tensor:
+    """Points at exact times, linearly. (T, ..., 3) -> (T', ..., 3)"""
+    before, after, share = times(len(points), fps, target)
+    return torch.lerp(points[before], points[after], share.view(-1, *[1] * (points.dim() - 1)))
+
+
+def resample_valid(valid: NDArray[np.bool_], fps: float, target: float = FPS) -> NDArray[np.bool_]:
+    """A new frame is valid when all frames that it is made of are. (T, P) -> (T', P)"""
+    before, after, share = times(len(valid), fps, target)
+    return valid[before.numpy()] & (valid[after.numpy()] | (share.numpy() == 0)[:, None])
+
+
+# -- the two kinds of recording ----------------------------------------------------------------
+
+
+def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> Motion:
+    assert recording.poses is not None and recording.transl is not None and recording.betas is not None
+    check_motion.check_angles(recording.poses, valid)
+    poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
+    transl = check_motion.filled(np.asarray(recording.transl, dtype=np.float64), valid)
+    betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
+    quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
+    rotations = roma.unitquat_to_rotmat(resample_rotations(quat, recording.fps)).float()
+    rest = body.rest_joints(betas)
+    # SMPL's root turns about the rest pelvis and is moved by transl after that
+    pelvis = resample_points(torch.from_numpy(transl), recording.fps) + rest[:, 0]
+    joints = body.forward_kinematics(rotations[:, :, 1:], rigid(rotations[:, :, 0], pelvis.float()), betas.float())
+    return Motion(rotations, pelvis, betas, resample_valid(valid, recording.fps), joints)
+
+
+def _fitted(recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, steps: Steps) -> tuple[Motion, str]:
+    assert recording.positions is not None
+    positions = check_motion.filled(np.asarray(recording.positions, dtype=np.float64), valid)
+    points = resample_points(torch.from_numpy(positions), recording.fps)
+    good = resample_valid(valid, recording.fps)
+    check_motion.check_limbs(points.numpy(), recording.joints, good)
+    spread = np.full((*points.shape[:2], BODY_JOINTS, 3), np.nan)
+    spread[:, :, list(recording.joints)] = points.numpy()
+    check_motion.check_up(up, spread, good, chosen=steps.up is not None)
+    spread = spread @ R_WORLD_FILE[up].numpy().T
+    if not steps.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
+        check_motion.check_rate(spread[:, :, check_motion.WALKING], good, recording.fps, FPS)  # before a fit of minutes
+    targets = (points @ R_WORLD_FILE[up].T).float()
+    try:
+        fit = fit_body(targets, recording.joints, body, valid=torch.from_numpy(good), grounded=True, fps=FPS)
+    except ValueError as error:
+        raise DataError(str(error)) from error
+    scene = fit.scene
+    rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
+    off = 100 * fit.residual.numpy()[good]
+    said = f"mean residual {off.mean():.1f} cm, 95 % below {np.percentile(off, 95):.1f} cm"
+    pelvis = scene.T_world_root[0, :, :, :3, 3].double()
+    return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0]), said
+
+
+# -- cutting -----------------------------------------------------------------------------------
+
+
+def stretches(good: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
+    """Runs of True of at least so many frames, as (start, stop). good: (T,) bool"""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
+
+
+def _cut(
+    motion: Motion, jumps: NDArray[np.intp], body: Body, name: str, source: str, split: Split, least: int
+) -> list[Clip]:
+    together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
+    frames = len(together)
+    pieces: list[tuple[int, int]] = []
+    edges = [0, *(int(jump) for jump in jumps), frames]
+    for first, end in pairwise(edges):
+        pieces += [(first + a, first + b) for a, b in stretches(together[first:end], least)]
+    if not pieces:
+        raise DataError(
+            f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "
+            f"{int(together.sum())} of them valid; lower --min_frames to keep shorter ones"
+        )
+    clips = []
+    for start, stop in pieces:
+        label = name if (start, stop) == (0, frames) else f"{name} [{start}:{stop}]"
+        pelvis = motion.pelvis[start:stop]
+        origin = pelvis[0].mean(dim=0) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+        rotations = motion.rotations[start:stop]
+        scene = Scene(
+            body_rot=rotations[None, :, :, 1:],
+            T_world_root=rigid(rotations[:, :, 0], (pelvis - origin).float())[None],
+            betas=motion.betas.float()[None],
+            present=torch.ones(1, len(motion.betas), dtype=torch.bool),
+            fps=FPS,
+            body=body.id,
+            names=(label,),
+        )
+        clips.append(Clip(scene, label, source, split))
+    return clips

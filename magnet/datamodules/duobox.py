@@ -1,0 +1,165 @@
+"""DuoBox (Ready-to-React): two people boxing at 120 fps, as SMPL-X fits or as the bare skeleton they came from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from magnet.datamodules.arrays import one_length
+from magnet.datamodules.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.unpickle import load_object_npy, load_pickle
+from magnet.datamodules.windows import Split
+
+FPS = 120.0
+THINNING, UNIT, SKIPPED = 4, 4, 4
+"""120 to 30 fps; frames that the authors' parts are multiples of; frames before their first, whose speed is unknown."""
+TRAIN, VALIDATION = 0.8, 0.1
+"""Of a take, its first part; of that, its last."""
+PARTS: dict[str, Split] = {"tr": "train", "va": "val", "te": "test"}
+PLACES = ("", "DuoBox", "data/DuoBox")
+FITS, SKELETONS = "fbx_fit_smpl", "fbx_export_joints"
+
+MOTIVE = (
+    "Hips", "Spine", "Spine1", "Neck", "Head", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder",
+    "RightArm", "RightForeArm", "RightHand", "LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase", "RightUpLeg",
+    "RightLeg", "RightFoot", "RightToeBase",
+)  # fmt: skip
+PARENTS = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
+MAP = {
+    0: "Hips", 1: "LeftUpLeg", 2: "RightUpLeg", 3: "Spine", 4: "LeftLeg", 5: "RightLeg", 7: "LeftFoot", 8: "RightFoot",
+    9: "Spine1", 10: "LeftToeBase", 11: "RightToeBase", 12: "Neck", 15: "Head", 16: "LeftArm", 17: "RightArm",
+    18: "LeftForeArm", 19: "RightForeArm", 20: "LeftHand", 21: "RightHand",
+}  # fmt: skip
+"""Our joint: MOTIVE's, by DuoBox's authors: the pelvis and 18 more. Spine2 and the collars have no counterpart."""
+
+
+class DuoBoxReader(Reader):
+    """DuoBox's fbx_fit_smpl/*.npy and fbx_export_joints/*.npy, each file two people by name.
+
+    As the authors do it, a take's first 80 % train and its last 20 % test. The last 10 % of the former validate. One
+    take of a file becomes several here: 000_ma_jab_liu_defense_tr0 to _tr3 (training, four phases of 120 fps thinned
+    to 30), _va0 and _te0 (one phase each, for phases are near copies). No frame of any phase is in two splits.
+
+    Args:
+        root: the folder of the two, or the one above.
+        form: "auto" takes the fit of a take, or its skeleton, to be fitted, where there is no fit.
+        phases: of training, 1 to 4; the authors use 4.
+        validation: False leaves the official training part whole and validation empty.
+
+    Raises:
+        DataError: neither folder is there.
+    """
+
+    name: ClassVar[str] = "duobox"
+    title: ClassVar[str] = "DuoBox"
+    source: ClassVar[str] = "https://github.com/zju3dv/ready_to_react"
+    licence: ClassVar[str] = "by request form, no licence published: research only, no redistribution"
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+
+    def __init__(
+        self,
+        root: str | Path,
+        form: Literal["auto", "fit", "skeleton"] = "auto",
+        phases: int = 4,
+        validation: bool = True,
+    ) -> None:
+        super().__init__(root)
+        if form not in ("auto", "fit", "skeleton"):
+            raise DataError(f"form: got {form!r}, expected 'auto', 'fit' or 'skeleton'")
+        if not 1 <= phases <= THINNING:
+            raise DataError(f"phases: got {phases}, expected 1 to {THINNING}")
+        self.form, self.phases, self.validation = form, phases, validation
+        wanted = {"auto": (FITS, SKELETONS), "fit": (FITS,), "skeleton": (SKELETONS,)}[form]
+        folder = next((found for one in wanted if (found := first_folder(self.root, PLACES, f"{one}/*"))), None)
+        if folder is None:
+            raise DataError(
+                f"DuoBox: no files in {' or '.join(f'{one}/' for one in wanted)} under {self.root}, which holds "
+                f"{listing(self.root)}; give the folder that holds {FITS} and {SKELETONS}"
+            )
+        self.folder = folder
+
+    def takes(self) -> list[Take]:
+        """Every file's parts and phases."""
+        files: dict[str, Path] = {}
+        if self.form != "fit":
+            files |= {path.stem: path for path in sorted((self.folder / SKELETONS).glob("*.npy"))}
+        if self.form != "skeleton":
+            files |= {path.stem: path for ending in ("pkl", "npy") for path in self._fits(ending)}
+        parts = [f"tr{phase}" for phase in range(self.phases)] + ["va0"] * self.validation + ["te0"]
+        return [
+            Take(f"{name}_{part}", (files[name],), PARTS[part[:2]], group=f"{name}_{part[:2]}")
+            for name in sorted(files, key=natural)
+            for part in parts
+        ]
+
+    def _fits(self, ending: str) -> list[Path]:
+        return sorted((self.folder / FITS).glob(f"*.{ending}"))
+
+    def read(self, take: Take) -> Recording:
+        """One part and phase of a take at 120 fps, z up; every fourth frame is the authors'."""
+        path, part = take.files[0], take.name.rsplit("_", 1)[-1]
+        held = mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path))
+        if path.parent.name == SKELETONS:
+            return self._skeleton(path, dict(held), part)
+        if len(held) != 2:
+            raise DataError(f"{path}: holds {', '.join(held) or 'nobody'}, expected two people by name")
+        people = [person(f"{path}, {name}", mapping(f"{path}, {name}", one), name) for name, one in held.items()]
+        whole = side_by_side(path, people, FPS, "+z")
+        assert whole.poses is not None and whole.transl is not None
+        shown = self.frames(path, whole.frames, part)
+        return Recording(
+            fps=FPS,
+            up="+z",
+            poses=whole.poses[shown],
+            transl=whole.transl[shown],
+            betas=whole.betas,
+            persons=whole.persons,
+            notes=whole.notes,
+        )
+
+    def _skeleton(self, path: Path, held: dict[str, Any], part: str) -> Recording:
+        names = tuple(key.removesuffix("_position") for key in held if key.endswith("_position"))
+        if len(names) != 2:
+            raise DataError(f"{path}: has {', '.join(held) or 'nothing'}, expected NAME_position of two people")
+        joints, columns = tuple(MAP), [MOTIVE.index(name) for name in MAP.values()]
+        people = []
+        for name in names:
+            places = rows(path, held, f"{name}_position", 3 * len(MOTIVE))
+            people.append(places.reshape(-1, len(MOTIVE), 3)[:, columns])
+        total = one_length(path, {name: len(places) for name, places in zip(names, people, strict=True)})
+        positions = np.stack(people, axis=1)[self.frames(path, total, part)]
+        return Recording(fps=FPS, up="+z", positions=positions, joints=joints, persons=names)
+
+    def frames(self, where: object, total: int, part: str) -> slice:
+        """Frames of a file that a part such as "tr2" shows.
+
+        Raises:
+            DataError: no such part, or the take is too short to have it.
+        """
+        kind, phase = part[:2], int(part[2:]) if part[2:].isdigit() else -1
+        if kind not in PARTS or not 0 <= phase < THINNING:
+            raise DataError(f"{where}: no part {part!r}, expected tr0 to tr3, va0 or te0")
+
+        def whole(phase: int) -> int:
+            return len(range(phase, total - SKIPPED, THINNING)) // UNIT * UNIT
+
+        def train(phase: int) -> int:
+            return int(whole(phase) * TRAIN) // UNIT * UNIT
+
+        # The last phase is the shortest: up to its end for all, and validation before that.
+        kept = int(train(THINNING - 1) * (1 - VALIDATION)) // UNIT * UNIT if self.validation else train(phase)
+        first, last = {"tr": (0, kept), "va": (kept, train(0)), "te": (train(0), whole(0))}[kind]
+        if last <= first:
+            raise DataError(f"{where}: {total} frames are too few to be split; leave the take out")
+        start = SKIPPED + phase + THINNING * first
+        return slice(start, start + THINNING * (last - first - 1) + 1)
+
+
+class DuoBox(Prepared):
+    """Boxing couples of DuoBox, from a store that `magnet data prepare duobox` made."""
+
+    reader: ClassVar[type[Reader]] = DuoBoxReader

@@ -1,0 +1,239 @@
+"""Embody 3D: conversations and shared tasks of two to four people in SMPL-X, 30 fps, y up."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.datamodules.arrays import (
+    AGAIN,
+    Doubles,
+    floats,
+    hashed_split,
+    one_length,
+    one_shape,
+    open_json,
+    open_npy,
+    require,
+)
+from magnet.datamodules.fields import Person, mapping, side_by_side
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.windows import Split
+
+WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
+FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")
+BETAS = 300
+FIRST = "the first 10 of 300 shape numbers are used: the same basis, slightly another mesh"
+SHARE = 0.1  # of the scenes, for test and again for val
+SOLVABLE = (0.05, 0.2)  # a split by cast is taken if test and val both come to such a share
+
+
+@dataclass(frozen=True)
+class _Scene:
+    section: str
+    capture: str
+    people: tuple[str, ...]  # subject ids, sorted
+
+    @property
+    def session(self) -> str:
+        """DATE--TIME: everything recorded in one go."""
+        parts = self.capture.split("--")
+        return "--".join(parts[1:3]) if len(parts) > 2 else self.capture
+
+
+class Embody3DReader(Reader):
+    """Embody 3D's `datasets/<section>/<capture>/<subject>/<feature>/<capture>.npy`.
+
+    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by scene: people
+    who ever met are kept together where that leaves a tenth or so of the scenes for test and for val, else whole
+    sessions are. They are made over all scenes of the sections, so that models of 2, 3, 4 and 2 to 4 people share
+    their test scenes.
+
+    Args:
+        root: the folder `datasets`, or the one above.
+        sections: such as acting, daylife, aiagent, emotions, icebreakers, location, polyadic. The paper's own choice
+            is not published; acting and daylife come closest to its numbers.
+        people: how many people a scene may have.
+        good: what `missing` holds where tracking is good: 1 by the README, against the name.
+
+    Raises:
+        DataError: a section is not there.
+    """
+
+    name: ClassVar[str] = "embody3d"
+    title: ClassVar[str] = "Embody 3D"
+    source: ClassVar[str] = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
+    licence: ClassVar[str] = "Meta's XRCIA research licence, by form; no redistribution"
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+
+    def __init__(
+        self,
+        root: str | Path,
+        sections: Sequence[str] = ("acting", "daylife"),
+        people: Sequence[int] = (2, 3, 4),
+        good: int = 1,
+    ) -> None:
+        super().__init__(root)
+        if good not in (0, 1):
+            raise ValueError(f"good: got {good}, expected 1 (the README) or 0")
+        self.sections, self.people, self.good = tuple(sections), tuple(people), good
+        self.folder = self.root / "datasets" if (self.root / "datasets").is_dir() else self.root
+        there = sorted(path.parent.name for path in self.folder.glob("*/dataset.json"))
+        if lacking := [section for section in self.sections if section not in there]:
+            raise DataError(
+                f"{self.folder}: no {', '.join(f'{section}/dataset.json' for section in lacking)}; sections with one: "
+                f"{', '.join(there) or 'none'}; give those as `sections`, or get dataset.json from the toolbox"
+            )
+
+    def takes(self) -> list[Take]:
+        scenes = [scene for section in self.sections for scene in self._scenes(section)]
+        groups, splits = _split(scenes)
+        return [
+            Take(
+                name=scene.capture if len(scene.people) > 1 else f"{scene.capture}/{scene.people[0]}",
+                files=tuple(self._file(scene, person, feature) for person in scene.people for feature in FEATURES),
+                split=splits[groups[index]],
+                group=groups[index],
+            )
+            for index, scene in enumerate(scenes)
+            if len(scene.people) in self.people
+        ]
+
+    def read(self, take: Take) -> Recording:
+        """Everybody in a scene, sorted by id, with the frames where everybody's tracking is good."""
+        files = [take.files[start : start + len(FEATURES)] for start in range(0, len(take.files), len(FEATURES))]
+        people = [self._person(dict(zip(FEATURES, of, strict=True))) for of in files]
+        scene = side_by_side(take.name, [person for person, _ in people], 30.0, "+y", notes=[FIRST])
+        return replace(scene, valid=np.stack([valid for _, valid in people], axis=1))
+
+    def _scenes(self, section: str) -> list[_Scene]:
+        """Everybody by capture, and whom they say they met."""
+        path = self.folder / section / "dataset.json"
+        together: dict[str, set[str]] = {}
+        alone: list[_Scene] = []
+        for subject, captures in mapping(path, open_json(path)).items():
+            for capture, said in mapping(f"{path}: {subject}", captures).items():
+                where = f"{path}: {subject}, {capture}"
+                require(where, mapping(where, said), ("multiperson",))
+                others = said["multiperson"]
+                if not others:
+                    alone.append(_Scene(section, capture, (subject,)))
+                    continue
+                if not isinstance(others, list) or not all(isinstance(other, str) for other in others):
+                    raise DataError(f"{where}: multiperson is {others!r:.80}, expected subjects' ids or null")
+                # Whoever is named was there: a partner without files must be missed when the scene is read.
+                together.setdefault(capture, set()).update((subject, *others))
+        scenes = [_Scene(section, capture, tuple(sorted(people))) for capture, people in together.items()]
+        for scene in (*scenes, *alone):
+            for part in (scene.capture, *scene.people):
+                if part in ("", ".", "..") or len(part) > 240 or set("/\\\0") & set(part):
+                    raise DataError(f"{path}: {part!r} is not the name of a folder; get dataset.json anew")
+        return sorted((*scenes, *alone), key=lambda scene: (scene.capture, scene.people))
+
+    def _file(self, scene: _Scene, person: str, feature: str) -> Path:
+        return self.folder / scene.section / scene.capture / person / feature / f"{scene.capture}.npy"
+
+    def _person(self, files: dict[str, Path]) -> tuple[Person, NDArray[np.bool_]]:
+        folder = files["missing"].parents[1]
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder: a partner's files are missing; {AGAIN}")
+        valid = self._valid(files["missing"])
+        widths = {**WIDTHS, "smplx_mesh_betas": BETAS}
+        held = {key: open_npy(files[key]) for key in widths}
+        if held["smplx_mesh_betas"].ndim == 1:
+            held["smplx_mesh_betas"] = np.broadcast_to(
+                held["smplx_mesh_betas"], (len(valid), *held["smplx_mesh_betas"].shape)
+            )
+        arrays = {key: floats(files[key], array, ("T", widths[key]), finite=False) for key, array in held.items()}
+        one_length(folder, {key: len(array) for key, array in arrays.items()} | {"missing": len(valid)})
+        arrays = {key: _held(files[key], array, valid) for key, array in arrays.items()}
+        shape, notes = one_shape(files["smplx_mesh_betas"], arrays["smplx_mesh_betas"])
+        poses = np.concatenate([arrays["smplx_mesh_global_orient"], arrays["smplx_mesh_body_pose"]], axis=1)
+        person = Person(poses.reshape(-1, 22, 3), arrays["smplx_mesh_transl"], shape, folder.name, notes)
+        return person, valid
+
+    def _valid(self, path: Path) -> NDArray[np.bool_]:
+        array = open_npy(path)
+        array = array.astype(np.uint8) if array.dtype == bool else array
+        flags = floats(path, array[:, 0] if array.shape[1:] == (1,) else array, ("T",))
+        if strange := sorted(set(np.unique(flags)) - {0.0, 1.0}):
+            raise DataError(f"{path}: holds {strange[0]:g}, expected only 0 and 1; {AGAIN}")
+        valid = flags == self.good
+        if valid.mean() < 0.5:
+            raise DataError(
+                f"{path}: only {valid.mean():.0%} of {len(valid)} frames hold {self.good}, which means good tracking; "
+                f"if nearly all scenes say so, the meaning is the other way round: give good={1 - self.good}; if only "
+                f"this one does, leave it out"
+            )
+        return valid
+
+
+def _held(path: Path, array: Doubles, valid: NDArray[np.bool_]) -> Doubles:
+    """NaN is refused in good frames; in others, which nothing learns from, the last good number stands in."""
+    bad = ~np.isfinite(array).all(axis=1)
+    if (bad & valid).any():
+        raise DataError(f"{path}: NaN or infinity in {int((bad & valid).sum())} frames of good tracking; {AGAIN}")
+    good = np.flatnonzero(~bad)
+    return array[good[np.searchsorted(good[1:], np.arange(len(array)), side="right")]]
+
+
+def _split(scenes: Sequence[_Scene]) -> tuple[list[str], dict[str, Split]]:
+    """The group of every scene and the split of every group: casts if that works out, else sessions."""
+    casts = _casts(scenes)
+    sizes = Counter(casts)
+    names = sorted(sizes, key=lambda name: hashlib.sha256(name.encode(errors="replace")).hexdigest())
+    splits: dict[str, Split] = dict.fromkeys(names, "train")
+    held: tuple[Split, ...] = ("test", "val")
+    for split in held:
+        taken = 0.0
+        for name in names:
+            share = sizes[name] / len(casts)
+            if splits[name] == "train" and taken < SHARE and taken + share <= SOLVABLE[1]:
+                splits[name] = split
+                taken += share
+        if taken < SOLVABLE[0]:
+            sessions = [scene.session for scene in scenes]
+            return sessions, {session: hashed_split(session, SHARE, SHARE) for session in sessions}
+    return casts, splits
+
+
+def _casts(scenes: Sequence[_Scene]) -> list[str]:
+    """For each scene, the first of all people connected with its own by scenes."""
+    leader: dict[str, str] = {}
+
+    def find(person: str) -> str:
+        while leader.setdefault(person, person) != person:
+            person = leader[person]
+        return person
+
+    for scene in scenes:
+        heads = sorted(find(person) for person in scene.people)
+        for head in heads[1:]:
+            leader[head] = heads[0]
+    return [find(scene.people[0]) for scene in scenes]
+
+
+class Embody3D(Prepared):
+    """Embody 3D from a prepared store: scenes of two to four people.
+
+    A model of two, three or four people trains on a store that was prepared with `people` of that number; the mixed
+    one on a store of all, where `drop_agent` masks people at random (paper 4).
+
+    Args:
+        path: the store's folder.
+        max_agents: slots P of every batch.
+        **kwargs: as for Prepared.
+    """
+
+    reader: ClassVar[type[Reader]] = Embody3DReader
+
+    def __init__(self, path: str = "", max_agents: int = 4, **kwargs: Any) -> None:
+        super().__init__(path=path, max_agents=max_agents, **kwargs)

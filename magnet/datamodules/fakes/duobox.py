@@ -1,0 +1,91 @@
+"""A tiny DuoBox: fbx_fit_smpl/*.npy and fbx_export_joints/*.npy, pickled dicts by person, z up, 120 fps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+
+from magnet.body import PARENTS as OURS
+from magnet.datamodules.duobox import FITS, FPS, PARENTS, SKELETONS, SKIPPED
+from magnet.datamodules.fakes.body import write_body
+from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+
+NAMES = (
+    "000_ma_jab_liu_defense", "001_liu_hook_ma_defense", "002_tian_jab_ma_defense", "003_liu_free_tian_free",
+    "004_ma_hook_tian_defense", "005_tian_free_ma_free",
+)  # fmt: skip
+SHARE = 5
+"""A take's test part is a fifth of it."""
+SOURCE = (0, 3, 9, 12, 15, 13, 16, 18, 20, 14, 17, 19, 21, 1, 4, 7, 10, 2, 5, 8, 11)
+"""Our joint that stands in for each of MOTIVE's."""
+
+
+def name(number: int) -> str:
+    """Of take `number`."""
+    return f"{number:03}{NAMES[number % len(NAMES)][3:]}"
+
+
+def subjects(number: int) -> tuple[str, str]:
+    """The two people of take `number`, in the order of its files."""
+    words = name(number).split("_")
+    return words[1], words[3]
+
+
+def length(frames: int) -> int:
+    """Frames at 120 fps of a file whose test part has `frames` at 30 fps."""
+    return SKIPPED + SHARE * frames * round(FPS / 30.0)
+
+
+def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
+    """What take `number` shows, z up at 120 fps."""
+    return turned(people(length(frames), 2, FPS, seed + number), "+z")
+
+
+def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Write the fake, and out/body.npz; every take has all three splits.
+
+    Args:
+        out: root of the fake.
+        takes: files of each kind.
+        frames: of a take's test part at 30 fps; the take is five times as long.
+        seed: of the motion.
+    """
+    for folder in (FITS, SKELETONS):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    write_body(out / "body.npz")
+    for number in range(takes):
+        shown = motion(number, frames, seed)
+        fits, skeletons = {}, {}
+        for person, subject in enumerate(subjects(number)):
+            fits[subject] = {
+                "transl": shown.transl[:, person].astype(np.float32),
+                "global_orient": shown.poses[:, person, 0].astype(np.float32),
+                "body_pose": shown.poses[:, person, 1:].reshape(-1, 63).astype(np.float32),
+                "betas": np.tile(shown.betas[person], (shown.frames, 1)).astype(np.float32),
+            }
+            skeletons[f"{subject}_position"] = shown.positions[:, person, list(SOURCE)].astype(np.float32)
+            skeletons[f"{subject}_rotation"] = _local(shown.poses[:, person]).astype(np.float32)
+        np.save(out / FITS / f"{name(number)}.npy", fits, allow_pickle=True)  # type: ignore[arg-type]
+        np.save(out / SKELETONS / f"{name(number)}.npy", skeletons, allow_pickle=True)  # type: ignore[arg-type]
+
+
+def _local(poses: np.ndarray) -> np.ndarray:
+    """MOTIVE's rotations, the root's in the world, others relative to their parents. (T, 22, 3) -> (T, 21, 3, 3)"""
+    world = world_rotations(poses)[:, list(SOURCE)]
+    local = world.copy()
+    for k, parent in enumerate(PARENTS):
+        if parent >= 0:
+            local[:, k] = np.swapaxes(world[:, parent], -1, -2) @ world[:, k]
+    return local
+
+
+def world_rotations(poses: np.ndarray) -> np.ndarray:
+    """World rotations of our joints. (T, 22, 3) axis-angle -> (T, 22, 3, 3)"""
+    world = roma.rotvec_to_rotmat(torch.from_numpy(poses)).numpy()
+    for k, parent in enumerate(OURS):
+        if parent >= 0:
+            world[:, k] = world[:, parent] @ world[:, k]
+    return world

@@ -1,0 +1,47 @@
+"""A tiny InterHuman: made-up couples in its pickles, 59.94 fps and z up."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magnet.datamodules.fakes.body import write_body
+from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+
+FPS = 59.94
+SPLITS = ("train", "val", "test", "train")
+
+
+def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Takes 1, 2 and so on, with split lists and a line of text each."""
+    write_body(out / "body.npz", "smpl")
+    for folder in ("motions", "annots", "split"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    lists: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for index, (name, motion) in enumerate(scenes(takes, frames, seed).items()):
+        held: dict[str, Any] = {"mocap_framerate": FPS, "frames": frames}
+        held |= {f"person{p + 1}": _person(motion, p) for p in range(2)}
+        (out / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(held))
+        (out / "annots" / f"{name}.txt").write_text("one person walks behind the other\n")
+        lists[SPLITS[index % len(SPLITS)]].append(name)
+    for split, names in lists.items():
+        (out / "split" / f"{split}.txt").write_text("".join(f"{name}\n" for name in names))
+    (out / "split" / "ignore_list.txt").write_text("")
+
+
+def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
+    """What is written, by take."""
+    return {str(index + 1): turned(people(frames, 2, FPS, seed + index, kind="smpl"), "+z") for index in range(takes)}
+
+
+def _person(motion: FakeMotion, p: int) -> dict[str, np.ndarray | str]:
+    return {
+        "trans": motion.transl[:, p].astype(np.float32),
+        "root_orient": motion.poses[:, p, 0].astype(np.float32),
+        "pose_body": motion.poses[:, p, 1:].reshape(-1, 63).astype(np.float32),
+        "betas": motion.betas[p].astype(np.float32),
+        "gender": "male",
+    }

@@ -1,0 +1,66 @@
+"""A tiny Inter-X: motions/G001T000A000R000/{P1,P2}.npz, splits/*.txt, annots/, y up, 120 fps."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+
+from magnet.datamodules.fakes.body import write_body
+from magnet.datamodules.fakes.motion import FakeMotion, people
+from magnet.datamodules.interx import FPS
+
+SPLITS = ("train", "val", "test")
+GENDERS = ("female", "male")
+
+
+def name(number: int) -> str:
+    """Of clip `number`."""
+    return f"G{1 + number // 8:03}T000A{number % 8:03}R{number:03}"
+
+
+def length(frames: int) -> int:
+    """Frames of a file at 120 fps."""
+    return frames * round(FPS / 30.0)
+
+
+def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
+    """What clip `number` shows, y up at 120 fps."""
+    return people(length(frames), 2, FPS, seed + number)
+
+
+def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Write the fake, and out/body.npz; clips are in training, validation and test in turn.
+
+    Args:
+        out: root of the fake.
+        takes: clips.
+        frames: of a clip at 30 fps.
+        seed: of the motion.
+    """
+    write_body(out / "body.npz")
+    for part in ("splits", "annots"):
+        (out / part).mkdir(parents=True, exist_ok=True)
+    listed = [name(number) for number in range(takes)]
+    for k, split in enumerate(SPLITS):
+        (out / "splits" / f"{split}.txt").write_text("".join(f"{clip}\n" for clip in listed[k::3]))
+    (out / "splits" / "all.txt").write_text("".join(f"{clip}\n" for clip in listed))
+    (out / "annots" / "interaction_order.pkl").write_bytes(pickle.dumps({c: k % 2 for k, c in enumerate(listed)}))
+    generator = np.random.default_rng(seed)
+    for number, clip in enumerate(listed):
+        shown = motion(number, frames, seed)
+        folder = out / "motions" / clip
+        folder.mkdir(parents=True, exist_ok=True)
+        for person, gender in enumerate(GENDERS):
+            hands = generator.normal(0.0, 0.1, (2, shown.frames, 15, 3)).astype(np.float32)
+            np.savez(
+                folder / f"P{person + 1}.npz",
+                pose_body=shown.poses[:, person, 1:].astype(np.float32),
+                pose_lhand=hands[0],
+                pose_rhand=hands[1],
+                root_orient=shown.poses[:, person, 0].astype(np.float32),
+                trans=shown.transl[:, person].astype(np.float32),
+                betas=shown.betas[person : person + 1].astype(np.float32),
+                gender=np.array(gender),
+            )

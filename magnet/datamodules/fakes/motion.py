@@ -1,0 +1,148 @@
+"""People who walk, as the numbers that data sets' files hold: what every fake writes in its own layout."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from magnet.body import Body, load_body
+from magnet.datamodules.fakes.body import Kind, write_body
+from magnet.datamodules.recording import Axis
+from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
+from magnet.synthesis.generate import FEWEST_FRAMES
+from magnet.synthesis.people import FPS
+
+Array = NDArray[np.float64]
+
+UP: dict[Axis, Array] = {
+    "+y": np.eye(3),
+    "-y": np.diag([1.0, -1.0, -1.0]),
+    "+z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "-z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "+x": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+    "-x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+}
+"""Rotation that takes +y to each axis: R_file_world of a file whose up axis it is."""
+
+
+@dataclass(frozen=True)
+class FakeMotion:
+    """T frames of P people: y up unless turned, metres, radians, float64; of the made-up body of `kind`."""
+
+    fps: float
+    up: Axis
+    poses: Array  # (T, P, 22, 3) axis-angle, pelvis first
+    transl: Array  # (T, P, 3) SMPL's transl, not the pelvis
+    betas: Array  # (P, 10)
+    positions: Array  # (T, P, 22, 3) world joints
+    kind: Kind = "smplx"
+
+    @property
+    def frames(self) -> int:
+        return len(self.poses)
+
+    @property
+    def pelvis(self) -> Array:
+        """(P, 3) rest pelvis J0(beta)."""
+        return rest_joints(self.betas, self.kind)[:, 0]
+
+
+@lru_cache(maxsize=2)
+def made_up_body(kind: Kind = "smplx") -> Body:
+    """The body that `write_body` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        return load_body(write_body(Path(folder) / "body.npz", kind))
+
+
+def rest_joints(betas: Array, kind: Kind = "smplx") -> Array:
+    """Rest joints of the made-up body. (P, 10) -> (P, 22, 3) metres"""
+    return made_up_body(kind).rest_joints(torch.from_numpy(betas)).numpy()
+
+
+def people(frames: int, persons: int, fps: float = 30.0, seed: int = 0, kind: Kind = "smplx") -> FakeMotion:
+    """People walking one behind the other or round in a circle, feet on the floor at height 0.
+
+    Args:
+        frames: T, at least 1.
+        persons: P, 1 to 8.
+        fps: frame rate; frame t shows time t / fps whatever the rate.
+        seed: the same seed, the same motion.
+        kind: whose body.
+
+    Raises:
+        ValueError: no frames, or more people than a circle holds.
+    """
+    if frames < 1 or not 1 <= persons <= 8:
+        raise ValueError(f"got {frames} frames of {persons} people, expected at least 1 frame and 1 to 8 people")
+    needed = max(FEWEST_FRAMES, math.ceil(frames * FPS / fps) + 2)
+    scene = _scene(needed, persons, seed, kind)
+    time = torch.arange(frames, dtype=torch.float64) * (FPS / fps)
+    before = time.long()
+    share = time - before
+    world = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2).double()
+    quat = roma.rotmat_to_unitquat(world)
+    step = share[:, None, None].expand(frames, persons, 22)
+    # roma's slerp takes one list of steps for all: each frame has its own, so the relative rotation is scaled instead
+    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(quat[before]), quat[before + 1]))
+    between = roma.quat_product(quat[before], roma.rotvec_to_unitquat(turn * step[..., None]))
+    root = scene.T_world_root[0, :, :, :3, 3].double()
+    pelvis = torch.lerp(root[before], root[before + 1], share[:, None, None])
+    betas = scene.betas[0].double().numpy()
+    motion = FakeMotion(
+        fps=float(fps),
+        up="+y",
+        poses=roma.unitquat_to_rotvec(between).numpy(),
+        transl=pelvis.numpy() - rest_joints(betas, kind)[:, 0],
+        betas=betas,
+        positions=np.zeros((frames, persons, 22, 3)),
+        kind=kind,
+    )
+    return _with_positions(motion)
+
+
+def turned(motion: FakeMotion, up: Axis) -> FakeMotion:
+    """The same motion in a world whose up axis is another.
+
+    The body turns about its pelvis J0, not about the origin: transl' = R (transl + J0) - J0.
+    """
+    R_new_old = UP[up] @ UP[motion.up].T
+    first = roma.rotvec_to_rotmat(torch.from_numpy(motion.poses[:, :, 0]))
+    poses = motion.poses.copy()
+    poses[:, :, 0] = roma.rotmat_to_rotvec(torch.from_numpy(R_new_old) @ first).numpy()
+    J0 = motion.pelvis
+    return FakeMotion(
+        fps=motion.fps,
+        up=up,
+        poses=poses,
+        transl=(motion.transl + J0) @ R_new_old.T - J0,
+        betas=motion.betas,
+        positions=motion.positions @ R_new_old.T,
+        kind=motion.kind,
+    )
+
+
+@lru_cache(maxsize=32)
+def _scene(frames: int, persons: int, seed: int, kind: Kind) -> Scene:
+    coupling = "follow" if persons <= 6 else "circle"
+    generator = torch.Generator().manual_seed(seed)
+    return synthesize(coupling, persons, frames, generator, made_up_body(kind)).scene
+
+
+def _with_positions(motion: FakeMotion) -> FakeMotion:
+    body = made_up_body(motion.kind)
+    rotations = roma.rotvec_to_rotmat(torch.from_numpy(motion.poses))
+    T_world_root = torch.zeros(*rotations.shape[:2], 4, 4, dtype=torch.float64)
+    T_world_root[..., :3, :3] = rotations[:, :, 0]
+    T_world_root[..., :3, 3] = torch.from_numpy(motion.transl + motion.pelvis)
+    T_world_root[..., 3, 3] = 1.0
+    joints = body.forward_kinematics(rotations[:, :, 1:], T_world_root, torch.from_numpy(motion.betas))
+    return FakeMotion(**{**motion.__dict__, "positions": joints.numpy()})

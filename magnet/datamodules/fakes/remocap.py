@@ -1,0 +1,197 @@
+"""A tiny ReMoCap: ReMoCap/LindyHop/{train,test}/SEQUENCE/{0,1}/ with BVH, csv and offsets, millimetres, y up, 50 fps.
+
+The 69 joints hang on ours: the skeleton's rotations and offsets lead exactly to its positions.
+"""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+
+from magnet.datamodules.fakes.body import write_body
+from magnet.datamodules.fakes.duobox import world_rotations
+from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
+from magnet.datamodules.remocap_track import FPS
+
+SEQUENCES = (3, 8, 6, 5, 7, 9, 10, 16)
+TESTED = (6,)
+MILLIMETRES = 1000.0
+CHANNELS = "ZXY"
+"""Rotations in the order of the BVH; the csv lists X, Y and Z all the same."""
+
+
+@dataclass
+class Joint:
+    """One joint of theirs, the joint of ours that it turns with, and its children."""
+
+    name: str
+    turns: int
+    rest: np.ndarray  # (3,) metres
+    children: list[Joint] = field(default_factory=list)
+
+    @property
+    def end(self) -> bool:
+        return not self.children and self.name.endswith("End")
+
+    def declared(self) -> Iterator[Joint]:
+        """Depth first, as the BVH declares them."""
+        yield self
+        for child in self.children:
+            yield from child.declared()
+
+    def listed(self) -> Iterator[Joint]:
+        """Depth first, the last child first, as bvh-converter's csv lists them."""
+        yield self
+        for child in reversed(self.children):
+            yield from child.listed()
+
+
+def skeleton(rest: np.ndarray) -> Joint:
+    """The 69 joints of a person whose rest joints are (22, 3)."""
+
+    def chain(names: list[str], joints: list[int], places: list[np.ndarray]) -> tuple[Joint, Joint]:
+        made = [Joint(*each) for each in zip(names, joints, places, strict=True)]
+        for above, below in itertools.pairwise(made):
+            above.children.append(below)
+        return made[0], made[-1]
+
+    def beyond(joint: int, dx: float, dy: float = 0.0, dz: float = 0.0) -> np.ndarray:
+        return rest[joint] + np.array([dx, dy, dz])
+
+    def leg(side: str, first: int) -> Joint:
+        joints = [first, first + 3, first + 6, first + 9]
+        names = [f"{side}{part}" for part in ("UpLeg", "Leg", "Foot", "ToeBase", "ToeBaseEnd")]
+        places = [*(rest[j] for j in joints), beyond(joints[-1], 0, 0, 0.06)]
+        return chain(names, [*joints, joints[-1]], places)[0]
+
+    def arm(side: str, collar: int, out: float) -> Joint:
+        joints = [collar, collar + 3, collar + 5, collar + 7]
+        names = [f"{side}{part}" for part in ("Shoulder", "Arm", "ForeArm", "Hand")]
+        top, hand = chain(names, joints, [rest[j] for j in joints])
+        wrist = joints[-1]
+        for spread, finger in enumerate(("Thumb", "Index", "Middle", "Ring", "Pinky")):
+            names = [f"{side}Hand{finger}{part}" for part in ("1", "2", "3", "3End")]
+            places = [beyond(wrist, out * (0.08 + 0.025 * k), 0, 0.04 - 0.02 * spread) for k in range(4)]
+            hand.children.append(chain(names, [wrist] * 4, places)[0])
+        hand.children.append(Joint(f"{side}HandEnd", wrist, beyond(wrist, out * 0.08)))
+        return top
+
+    between, above = (rest[3] + rest[6]) / 2, (rest[9] + rest[12]) / 2
+    spine, chest = chain(["Spine", "Spine1", "Spine2", "Spine3"], [3, 3, 6, 9], [rest[3], between, rest[6], rest[9]])
+    head = chain(
+        ["Spine4", "Neck", "Head", "HeadEnd"], [9, 12, 15, 15], [above, rest[12], rest[15], beyond(15, 0, 0.2)]
+    )
+    chest.children += [head[0], arm("Left", 13, 1.0), arm("Right", 14, -1.0)]
+    return Joint("Hips", 0, rest[0], [spine, leg("Left", 1), leg("Right", 2)])
+
+
+def length(frames: int) -> int:
+    """Frames of a file at 50 fps."""
+    return round(frames * FPS / 30.0)
+
+
+def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
+    """What the take `number` shows, y up at 50 fps."""
+    return people(length(frames), 2, FPS, seed + number)
+
+
+def sequence(number: int) -> int:
+    """Number of the take `number` in its data set."""
+    return SEQUENCES[number] if number < len(SEQUENCES) else number + 10
+
+
+def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Write the fake, and out/body.npz; of four takes two train, one validates and one tests, by either split.
+
+    Args:
+        out: root of the fake.
+        takes: sequences.
+        frames: of a sequence at 30 fps.
+        seed: of the motion.
+    """
+    write_body(out / "body.npz")
+    for number in range(takes):
+        shown = motion(number, frames, seed)
+        half = "test" if sequence(number) in TESTED else "train"
+        for person in range(2):
+            folder = out / "ReMoCap/LindyHop" / half / str(sequence(number)) / str(person)
+            folder.mkdir(parents=True, exist_ok=True)
+            _write_person(folder, shown, person)
+
+
+def write_fits(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Write ready fits of the same takes: NUMBER.npz with arrays (2, T, ..)."""
+    out.mkdir(parents=True, exist_ok=True)
+    for number in range(takes):
+        shown = motion(number, frames, seed)
+        body = shown.poses[:, :, 1:].reshape(shown.frames, 2, 63).swapaxes(0, 1)
+        np.savez(
+            out / f"{sequence(number)}.npz",
+            body_pose=np.concatenate([body, np.zeros((2, shown.frames, 90))], axis=2).astype(np.float32),
+            orient=shown.poses[:, :, 0].swapaxes(0, 1).astype(np.float32),
+            trans=shown.transl.swapaxes(0, 1).astype(np.float32),
+            betas=np.repeat(shown.betas[:, None], shown.frames, axis=1).astype(np.float32),
+        )
+
+
+def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
+    rest = rest_joints(shown.betas, shown.kind)[person]
+    root = skeleton(rest)
+    declared, listed = list(root.declared()), list(root.listed())
+    above = {child.name: joint for joint in declared for child in joint.children}
+    world = world_rotations(shown.poses[:, person])
+    offset = {j.name: j.rest - above[j.name].rest if j.name in above else np.zeros(3) for j in declared}
+    place, turn = {}, {}
+    for joint in declared:
+        if joint is root:
+            place[joint.name], local = shown.positions[:, person, 0], world[:, 0]
+        else:
+            parent = above[joint.name]
+            place[joint.name] = place[parent.name] + world[:, parent.turns] @ offset[joint.name]
+            local = np.swapaxes(world[:, parent.turns], -1, -2) @ world[:, joint.turns]
+        degrees = roma.rotmat_to_euler(CHANNELS, torch.from_numpy(local), degrees=True).numpy()
+        turn[joint.name] = degrees[:, [CHANNELS.index(axis) for axis in "XYZ"]]
+    millimetres = {name: MILLIMETRES * at for name, at in place.items()}
+    _write_csv(folder / "motion_worldpos.csv", [j.name for j in listed], millimetres)
+    _write_csv(folder / "motion_rotations.csv", [j.name for j in listed], turn)
+    offsets = {name: MILLIMETRES * at for name, at in offset.items()}
+    (folder / "motion_offsets.pkl").write_bytes(pickle.dumps(offsets))
+    columns = [np.round(millimetres[root.name], 6)]
+    columns += [turn[j.name][:, ["XYZ".index(axis) for axis in CHANNELS]] for j in declared if not j.end]
+    rows = [" ".join(f"{x:.6f}" for x in row) for row in np.concatenate(columns, axis=1)]
+    header = [
+        "HIERARCHY",
+        *_hierarchy(root, offsets, 0),
+        "MOTION",
+        f"Frames: {len(rows)}",
+        f"Frame Time: {1 / FPS:.6f}",
+    ]
+    (folder / "motion.bvh").write_text("\n".join([*header, *rows]) + "\n")
+
+
+def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> None:
+    values = np.stack([columns[name] for name in names], axis=1).reshape(len(columns[names[0]]), -1)
+    lines = [",".join(["Time", *(f"{name}.{axis}" for name in names for axis in "XYZ")])]
+    lines += [",".join([f"{t / FPS:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _hierarchy(joint: Joint, offsets: dict[str, np.ndarray], depth: int) -> Iterator[str]:
+    indent = "\t" * depth
+    yield indent + ("End Site" if joint.end else f"{'JOINT' if depth else 'ROOT'} {joint.name}")
+    yield indent + "{"
+    yield f"{indent}\tOFFSET " + " ".join(f"{x:.6f}" for x in offsets[joint.name])
+    if not joint.end:
+        turns = [f"{axis}rotation" for axis in CHANNELS]
+        places = [] if depth else [f"{axis}position" for axis in "XYZ"]
+        yield f"{indent}\tCHANNELS {len(places) + 3} " + " ".join([*places, *turns])
+        for child in joint.children:
+            yield from _hierarchy(child, offsets, depth + 1)
+    yield indent + "}"

@@ -1,0 +1,100 @@
+"""InterHuman: two people interacting, SMPL-H fits at 59.94 fps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from magnet.datamodules.arrays import AGAIN, floats, listed_splits, open_names
+from magnet.datamodules.fields import listing, mapping, natural, person, side_by_side
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.unpickle import load_pickle
+from magnet.datamodules.windows import Split
+
+FPS = 59.94
+PEOPLE = ("person1", "person2")
+LISTS: tuple[Split, ...] = ("train", "val", "test")
+BASIS = "shape numbers are SMPL-H's, another basis than SMPL-X's: limbs differ by centimetres"
+
+
+class InterHumanReader(Reader):
+    """InterHuman's `motions/<id>.pkl` with the split lists `split/{train,val,test,ignore_list}.txt`.
+
+    Each pickle holds frames, mocap_framerate and two people's trans (T, 3), root_orient (T, 3), pose_body (T, 63) and
+    betas (10). The processed person1 and person2 npy (T, 492) are not read: they have no root rotation and no shape.
+
+    Args:
+        root: the folder with `motions`.
+        fps: frame rate of the recordings, which files that name another one are refused for.
+
+    Raises:
+        DataError: no motions or no lists; says what was found.
+    """
+
+    name: ClassVar[str] = "interhuman"
+    title: ClassVar[str] = "InterHuman"
+    source: ClassVar[str] = "https://github.com/tr3e/InterGen"
+    licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+
+    def __init__(self, root: str | Path, fps: float = FPS) -> None:
+        super().__init__(root)
+        self.fps = float(fps)
+        if not (self.root / "motions").is_dir():
+            raise DataError(
+                f"{self.root}: no folder motions with pickles; it holds {listing(self.root)}; unpack motions.zip there "
+                "(motions_processed lacks root rotations and shapes and is not read)"
+            )
+
+    def takes(self) -> list[Take]:
+        splits = self._splits()
+        paths = sorted((self.root / "motions").glob("*.pkl"), key=lambda path: natural(path.stem))
+        return [Take(path.stem, (path,), splits.get(path.stem), path.stem) for path in paths]
+
+    def read(self, take: Take) -> Recording:
+        """Both people at 59.94 fps, z up."""
+        (path,) = take.files
+        said = mapping(path, load_pickle(path))
+        if lacking := [name for name in PEOPLE if said.get(name) is None]:
+            raise DataError(
+                f"{path}: the partner {' and '.join(lacking)} is missing; it has {', '.join(said)}; {AGAIN}"
+            )
+        notes = [*self._rate(path, said), BASIS]
+        keys = {"orient": "root_orient", "body": "pose_body", "transl": "trans"}
+        people = [person(f"{path}, {name}", mapping(f"{path}, {name}", said[name]), name, **keys) for name in PEOPLE]
+        scene = side_by_side(path, people, self.fps, "+z", notes=notes)
+        frames = said.get("frames")
+        if isinstance(frames, int | np.integer) and frames != scene.frames:
+            raise DataError(f"{path}: says {frames} frames, but people have {scene.frames}; {AGAIN}")
+        return scene
+
+    def _splits(self) -> dict[str, Split]:
+        folder = next((at for at in (self.root / "split", self.root) if (at / "train.txt").is_file()), None)
+        if folder is None:
+            raise DataError(f"{self.root / 'split'}: no train.txt; put the download's lists train, val and test there")
+        splits = listed_splits({split: folder / f"{split}.txt" for split in LISTS})
+        ignored = folder / "ignore_list.txt"
+        for name in open_names(ignored) if ignored.is_file() else ():
+            splits.pop(name, None)
+        return splits
+
+    def _rate(self, path: Path, said: Mapping[str, Any]) -> list[str]:
+        if "mocap_framerate" not in said:
+            return [f"no frame rate in the file, {self.fps:g} is taken"]
+        rate = float(floats(f"{path}: mocap_framerate", np.ravel(said["mocap_framerate"]), (1,))[0])
+        if abs(rate - self.fps) > 0.01 * self.fps:
+            raise DataError(
+                f"{path}: mocap_framerate is {rate:g}, expected {self.fps:g}; if the recordings really are of "
+                f"{rate:g} frames a second, give fps={rate:g}"
+            )
+        return []
+
+
+class InterHuman(Prepared):
+    """InterHuman from a store that `magnet data prepare interhuman` made: scenes of two people."""
+
+    reader: ClassVar[type[Reader]] = InterHumanReader

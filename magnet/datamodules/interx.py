@@ -1,0 +1,155 @@
+"""Inter-X: pairs of people in forty kinds of interaction, SMPL-X at 120 fps."""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
+
+from magnet.datamodules.arrays import open_names, open_npz
+from magnet.datamodules.fields import Person, first_folder, listing, person, side_by_side
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.unpickle import load_pickle
+from magnet.datamodules.windows import Split
+
+FPS = 120.0
+FILES = ("P1.npz", "P2.npz")
+PLACES = ("motions", "Inter-X_Dataset/motions", "Inter-X/motions", "")
+LISTS = ("splits", "../splits", "../datasets", "datasets")
+"""Where the split lists lie, from the folder of the motions; its repository has them in datasets/."""
+CLIP = re.compile(r"(G\d{3}T\d{3}A\d{3}R\d{3})(_.*)?")
+KEYS = ("pose_body", "root_orient", "trans", "betas")
+PROCESSED = (
+    "its processed .h5 is not read: there the floor is each person's own, the translation relative to one of them and "
+    "the body shapes are gone; unpack motions.zip and give the folder above motions/"
+)
+
+
+class InterXReader(Reader):
+    """Inter-X's motions/G001T000A000R000/{P1,P2}.npz, whose folders may carry the action's name (.._Hug).
+
+    Args:
+        root: the folder of motions/, splits/ and annots/.
+        split: "official" reads splits/{train,val,test}.txt; "paper" reads `lists`, since the paper's authors split
+            anew (9074, 1157 and 1157 clips).
+        lists: folder of the lists for "paper": {train,val,test}.txt, .csv or _data.csv, one clip a line.
+
+    Raises:
+        DataError: no motions, the processed .h5 alone, no lists, or a clip in two of them.
+    """
+
+    name: ClassVar[str] = "interx"
+    title: ClassVar[str] = "Inter-X"
+    source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
+    licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+
+    def __init__(
+        self, root: str | Path, split: Literal["official", "paper"] = "official", lists: str | None = None
+    ) -> None:
+        super().__init__(root)
+        folder = first_folder(self.root, PLACES, "G[0-9]*T[0-9]*A[0-9]*R[0-9]*")
+        if folder is None:
+            processed = any(self.root.rglob("*.h5"))
+            hint = PROCESSED if processed else "unpack motions.zip and give the folder above motions/"
+            raise DataError(
+                f"Inter-X: no clips such as motions/G001T000A000R000 in {self.root}, which holds {listing(self.root)}; "
+                f"{hint}"
+            )
+        self.folder = folder
+        self.splits = self._splits(split, lists)
+
+    def _splits(self, split: str, lists: str | None) -> dict[str, Split]:
+        """Split by a clip's number, from the lists."""
+        if split == "official":
+            where = next(
+                (self.folder / place for place in LISTS if (self.folder / place / "train.txt").is_file()), None
+            )
+            if where is None:
+                raise DataError(
+                    f"Inter-X: no splits/train.txt beside {self.folder}; unpack the data set's splits there, or take "
+                    "datasets/{train,val,test}.txt of its repository"
+                )
+        elif split == "paper":
+            if lists is None:
+                raise DataError(
+                    "split=paper needs lists=FOLDER with train, val and test lists (.txt or .csv); the paper's are "
+                    "data/data_split/interx_data_split of its authors' repository"
+                )
+            where = Path(lists)
+        else:
+            raise DataError(f"split: got {split!r}, expected 'official' or 'paper'")
+        found: dict[str, Split] = {}
+        for name in get_args(Split):
+            for clip in self._listed(where, name):
+                if found.setdefault(clip, name) != name:
+                    raise DataError(f"{where}: clip {clip} is in both {found[clip]} and {name}; make the lists anew")
+        if not found:
+            raise DataError(f"{where}: all lists are empty; copy them again")
+        return found
+
+    def _listed(self, where: Path, name: Split) -> list[str]:
+        files = [where / f"{name}{ending}" for ending in (".txt", ".csv", "_data.csv")]
+        path = next((file for file in files if file.is_file()), None)
+        if path is None:
+            raise DataError(f"{where}: no {', '.join(file.name for file in files)}; the lists are incomplete")
+        lines = [line.split(",")[0].strip() for line in open_names(path)]
+        clips = [match[1] for line in lines if (match := CLIP.fullmatch(line))]
+        if len(clips) < len(lines) - 1 or (lines and not clips):  # a heading is allowed
+            raise DataError(
+                f"{path}: {len(clips)} of {len(lines)} lines name a clip such as G001T000A000R000; is it another list?"
+            )
+        return clips
+
+    def takes(self) -> list[Take]:
+        """One take a folder; a file that is missing in it is found out by `read`."""
+        found: dict[str, Path] = {}
+        for folder in sorted(self.folder.iterdir()):
+            if (match := CLIP.fullmatch(folder.name)) and folder.is_dir():
+                if match[1] in found:
+                    raise DataError(f"{folder}: the same clip as {found[match[1]]}; leave one out")
+                found[match[1]] = folder
+        return [
+            Take(folder.name, tuple(folder / name for name in FILES), self.splits.get(clip), group=clip)
+            for clip, folder in found.items()
+        ]
+
+    @cached_property
+    def _order(self) -> dict[str, Any] | DataError | None:
+        """Who acts, by clip: 0 is P1, 1 is P2. Without the file, or with a damaged one, roles stay unknown."""
+        for place in ("../annots", "annots"):
+            path = self.folder / place / "interaction_order.pkl"
+            if path.is_file():
+                try:
+                    held = load_pickle(path)
+                except DataError as error:
+                    return error
+                return {str(key)[:16]: role for key, role in held.items()} if isinstance(held, dict) else None
+        return None
+
+    def read(self, take: Take) -> Recording:
+        """P1 and P2 at 120 fps, y up; `persons` are their roles where interaction_order.pkl tells."""
+        held = [open_npz(path, KEYS, ("gender",)) for path in take.files]
+        notes = [
+            f"{path.stem}: {one['gender']}; the shape is used with the body model given"
+            for path, one in zip(take.files, held, strict=True)
+            if "gender" in one
+        ]
+        names = ("P1", "P2")
+        if isinstance(self._order, DataError):
+            notes.append(f"roles are unknown: {self._order}")
+        elif self._order is not None and (actor := self._order.get(take.name[:16])) in (0, 1):
+            names = ("P1, actor", "P2, reactor") if actor == 0 else ("P1, reactor", "P2, actor")
+        people: list[Person] = [
+            person(path, one, name, orient="root_orient", body="pose_body", transl="trans")
+            for path, one, name in zip(take.files, held, names, strict=True)
+        ]
+        return side_by_side(take.files[0].parent, people, FPS, "+y", notes=notes)
+
+
+class InterX(Prepared):
+    """Pairs of Inter-X, from a store that `magnet data prepare interx` made."""
+
+    reader: ClassVar[type[Reader]] = InterXReader

@@ -1,0 +1,96 @@
+"""Data sets that were prepared once by `magnet data prepare` and are trained from by memory map."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, ClassVar
+
+from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.recording import Reader
+from magnet.datamodules.store import Folder, StoreError, body_hash
+from magnet.datamodules.store_mapped import MappedStore
+from magnet.datamodules.windows import Store
+
+
+class Prepared(MotionDataModule):
+    """Random windows of a prepared store of any size; memory stays flat.
+
+    Several processes read different lengths of the store where it has enough clips: sample k of process r is sample
+    k * world + r of an epoch and depends only on (seed, epoch, k, r, world). Each process draws from its own length
+    alone; as lengths are equally likely, a step over all processes is as one over the whole store.
+
+    Args:
+        path: the store's folder, as `magnet data prepare` wrote it.
+        spread: let each process read a length of its own, where there are enough clips; False: all draw from all.
+        device_resident: keep all frames decoded in memory, on the trainer's device; for stores that fit there.
+        body_model: "open", or the path of the body file that the store was prepared with.
+        max_agents: slots P of every batch; at least the store's largest group.
+        **kwargs: as for MotionDataModule.
+
+    Raises:
+        ValueError: no path; the folder is no store or another data set's; the body is not the store's. When the
+            data are first used.
+    """
+
+    reader: ClassVar[type[Reader] | None] = None
+    """Whose stores these are; None: anybody's."""
+
+    def __init__(
+        self,
+        path: str = "",
+        spread: bool = True,
+        device_resident: bool = False,
+        body_model: str = "open",
+        max_agents: int = 2,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(device_resident=device_resident, body_model=body_model, max_agents=max_agents, **kwargs)
+        self.path, self.spread = path, spread
+
+    @property
+    def maps_files(self) -> bool:  # type: ignore[override]
+        return not self.device_resident
+
+    @cached_property
+    def folder(self) -> Folder:
+        """The opened store.
+
+        Raises:
+            ValueError: as for the class.
+        """
+        name = self.reader.name if self.reader else "NAME"
+        command = f"magnet data prepare {name} --root DOWNLOAD --out STORE, then --data.path STORE"
+        if not self.path:
+            raise ValueError(f"{type(self).__name__}: no store was given; {command}")
+        try:
+            folder = Folder(self.path)
+        except StoreError as error:
+            raise StoreError(f"{error} ({type(self).__name__}: {command})") from error
+        if self.reader and folder.manifest["name"] != self.reader.name:
+            raise ValueError(
+                f"{self.path} is a store of {folder.manifest['title']}, not of {self.reader.title}; choose the data "
+                f"set's own class, or Prepared for any store"
+            )
+        wanted = folder.manifest["body"]
+        if body_hash(self.body) != wanted["sha256"]:
+            raise ValueError(
+                f"{self.path} was prepared with body {wanted['id']!r} ({wanted['sha256'][:8]}), but body_model "
+                f"{self.body_model!r} is {self.body.id!r} ({body_hash(self.body)[:8]}): give the same file with "
+                f"--data.body_model FILE, or prepare again with this one"
+            )
+        folder.body = self.body.id  # the same joints, whatever the file is called now
+        return folder
+
+    def prepare_data(self) -> None:
+        """Look whether the store is there and is of this body."""
+        assert self.folder
+
+    def clips(self, split: Split) -> list[Clip]:
+        """All clips of a split in memory, of `self.body`."""
+        return self.folder.clips(split)
+
+    def open_store(self, split: Split) -> Store:
+        """The split by memory map; in memory if `device_resident`."""
+        if self.device_resident and self.folder.split(split).name:
+            return super().open_store(split)
+        return MappedStore(self.folder, split, self.max_agents, self.spread)

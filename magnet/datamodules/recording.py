@@ -1,0 +1,118 @@
+"""What a data set's reader gives: takes as its files hold them, before the common steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.datamodules.windows import Split
+
+Floats = NDArray[np.floating]
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class DataError(ValueError):
+    """A file that is not what its data set's layout says; names the file, what was found and what to do."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """One scene of a download, found by its file names alone.
+
+    Args:
+        name: unique within the data set, such as "Jive_005_001".
+        files: what `read` will open; their sizes and times decide whether a prepared clip is still good.
+        split: by the data set's official rule; None: the rule leaves it out.
+        group: takes of one group never stand in different splits.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    split: Split | None
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One take of P people at its native rate, axes and units already in metres and radians.
+
+    Either rotations (`poses`, `transl`, `betas`) of SMPL's family or world positions (`positions`, `joints`) to be
+    fitted. Shapes are checked when built.
+
+    Raises:
+        DataError: shapes do not fit, or neither kind of motion is there.
+    """
+
+    fps: float
+    up: Axis  # as the data set declares it; the common steps check it against the motion
+    poses: Floats | None = None  # (T, P, 22, 3) axis-angle, pelvis first
+    transl: Floats | None = None  # (T, P, 3) SMPL's transl, not the pelvis
+    betas: Floats | None = None  # (P, 10)
+    positions: Floats | None = None  # (T, P, M, 3) world
+    joints: tuple[int, ...] = ()  # (M,) which of the 22 joints `positions` are of
+    valid: NDArray[np.bool_] | None = None  # (T, P), False where tracking failed
+    persons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt
+
+    def __post_init__(self) -> None:
+        if self.poses is not None and self.transl is not None and self.betas is not None:
+            T, P = self.poses.shape[:2]
+            expected = {"poses": (T, P, 22, 3), "transl": (T, P, 3), "betas": (P, 10)}
+        elif self.positions is not None and self.joints:
+            T, P = self.positions.shape[:2]
+            expected = {"positions": (T, P, len(self.joints), 3)}
+        else:
+            raise DataError("a recording needs poses, transl and betas, or positions and joints")
+        if self.valid is not None:
+            expected["valid"] = (T, P)
+        for name, want in expected.items():
+            if (got := np.shape(getattr(self, name))) != want:
+                raise DataError(f"{name}: got {got}, expected {want} for {T} frames of {P} people")
+        if not T or not P:
+            raise DataError(f"a recording of {T} frames and {P} people")
+
+    @property
+    def frames(self) -> int:
+        motion = self.poses if self.poses is not None else self.positions
+        assert motion is not None
+        return len(motion)
+
+
+class Reader(ABC):
+    """How one data set lies on disk. A subclass also has a `fake` that writes a tiny one in the same layout.
+
+    Args:
+        root: the folder of the download.
+
+    Raises:
+        DataError: nothing of the data set's layout is under `root`; says what was looked for and found.
+    """
+
+    name: ClassVar[str]  # on the command line, such as "duobox"
+    title: ClassVar[str]  # as its authors write it
+    source: ClassVar[str]  # address where to ask for it
+    licence: ClassVar[str]  # in one line
+    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise DataError(f"{self.title}: {self.root} is not a folder; ask for the data at {self.source}")
+
+    @abstractmethod
+    def takes(self) -> list[Take]:
+        """All takes in a fixed order, from file names and split lists alone; opens no motion."""
+
+    @abstractmethod
+    def read(self, take: Take) -> Recording:
+        """Open a take's files.
+
+        Raises:
+            DataError: a file is truncated, lacks a key, has another shape or holds NaN; never a bare numpy error.
+        """

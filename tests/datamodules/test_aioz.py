@@ -1,0 +1,131 @@
+"""AIOZ-GDANCE's files to recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnet.datamodules.aioz import AIOZ, AIOZReader
+from magnet.datamodules.common import to_clips
+from magnet.datamodules.fakes.aioz import write
+from magnet.datamodules.fakes.motion import made_up_body
+from magnet.datamodules.recording import DataError
+
+from .reading import Foreign, check_round_trip, check_splits, check_wrong_units, cut, refused, rewritten
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write(tmp_path, 2, 12)
+    return tmp_path
+
+
+def test_reading_gives_what_was_written(tmp_path: Path) -> None:
+    recordings = check_round_trip("aioz", tmp_path)
+    assert [len(recording.persons) for recording in recordings] == [2, 3, 5, 7, 2]
+    assert not np.asarray(recordings[0].betas).any() and "mean shape" in recordings[0].notes[0]
+
+
+def test_splits_are_the_lists(tmp_path: Path) -> None:
+    check_splits("aioz", tmp_path)
+
+
+def test_without_lists_a_video_is_in_one_split(tmp_path: Path) -> None:
+    (tmp_path / "motions_smpl").mkdir()
+    for video in range(60):
+        for start in (0, 100):
+            (tmp_path / "motions_smpl" / f"v{video}_{start}_{start + 90}.pkl").touch()
+    takes = AIOZReader(tmp_path).takes()
+    assert {take.split for take in takes} == {"train", "val", "test"}
+    assert len({(take.group, take.split) for take in takes}) == 60
+    (tmp_path / "split_sequence_names.txt").write_text("v1_0_90,7\nv2_100_190.pkl\n")
+    listed = {take.name: take.split for take in AIOZReader(tmp_path).takes() if take.split}
+    assert set(listed) == {"v1_0_90", "v2_100_190"}
+    assert all(take.split == listed[take.name] for take in takes if take.name in listed)
+
+
+def test_a_folder_without_motions_says_what_it_holds(root: Path) -> None:
+    with pytest.raises(DataError, match=r"no folder motions_smpl; it holds video0"):
+        AIOZReader(root / "motions_smpl")
+
+
+def change(what: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    return lambda path: rewritten(path, what)
+
+
+DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated": (cut, r"video000"),
+    "empty": (lambda path: path.write_bytes(b""), r"video000"),
+    "gone": (lambda path: path.unlink(), r"no such file"),
+    "foreign code": (change(lambda held: {**held, "meta": Foreign()}), r"names (builtins|__builtin__)\.print"),
+    "an array": (change(lambda held: held["smpl_poses"]), r"expected a dict"),
+    "no poses": (change(lambda held: held.__delitem__("smpl_poses")), r"lacks smpl_poses"),
+    "no trans": (change(lambda held: held.__delitem__("root_trans")), r"lacks root_trans"),
+    "missing partner": (
+        change(lambda held: held.update(smpl_poses=held["smpl_poses"][:1])),
+        r"\(1, 12\) of smpl_poses",
+    ),
+    "unequal lengths": (
+        change(lambda held: held.update(root_trans=held["root_trans"][:, :5])),
+        r"\(2, 5\) of root_trans",
+    ),
+    "frames first": (
+        change(lambda held: held.update({k: held[k].swapaxes(0, 1) for k in ("smpl_poses", "root_trans")})),
+        r"would be 12 people, expected up to 7",
+    ),
+    "NaN": (change(lambda held: held["smpl_poses"].__setitem__((0, 3, 5), np.inf)), r"smpl_poses: 1 of .* infinite"),
+    "zero frames": (change(lambda held: held.update(root_trans=np.zeros((2, 0, 3)))), r"no frames"),
+    "flat": (change(lambda held: held.update(smpl_poses=np.zeros((12, 72)))), r"smpl_poses: got shape \(12, 72\)"),
+    "odd width": (
+        change(lambda held: held.update(smpl_poses=np.zeros((2, 12, 70)))),
+        r"expected \(people, frames, 72\)",
+    ),
+    "odd roots": (
+        change(lambda held: held.update(smpl_poses=np.zeros((2, 12, 63)), smpl_orients=np.zeros((2, 11, 3)))),
+        r"smpl_orients: got shape \(2, 11, 3\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGED)
+def test_damaged_takes_are_refused_and_others_read(how: str, root: Path) -> None:
+    damage, match = DAMAGED[how]
+    reader = AIOZReader(root)
+    one, two = reader.takes()
+    damage(one.files[0])
+    refused(reader, match, one)
+    assert reader.read(two).frames == 12
+
+
+@pytest.mark.parametrize("hands", [0, 6])
+def test_roots_apart_from_poses_are_put_together(hands: int, root: Path) -> None:
+    reader = AIOZReader(root)
+    before = reader.read(reader.takes()[0])
+
+    def apart(held: dict[str, Any]) -> None:
+        poses = held["smpl_poses"]
+        held.update(smpl_orients=poses[..., :3], smpl_poses=poses[..., 3 : 66 + hands])
+
+    rewritten(reader.takes()[0].files[0], apart)
+    np.testing.assert_array_equal(reader.read(reader.takes()[0]).poses, before.poses)  # type: ignore[arg-type]
+
+
+def test_seven_people_become_one_clip(tmp_path: Path) -> None:
+    write(tmp_path, 4, 70)
+    reader = AIOZReader(tmp_path)
+    take = reader.takes()[3]
+    (clip,) = to_clips(reader.read(take), made_up_body("smpl"), take.name, reader.name, "train", reader.family).clips
+    assert (clip.agents, clip.frames) == (7, 70)
+
+
+def test_a_wrong_axis_unit_or_rate_is_named(tmp_path: Path) -> None:
+    check_wrong_units("aioz", tmp_path)
+
+
+def test_its_data_module_has_seven_slots() -> None:
+    assert AIOZ().max_agents == 7
+    assert AIOZ(max_agents=3, batch_size=8).max_agents == 3

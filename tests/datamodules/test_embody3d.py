@@ -1,0 +1,256 @@
+"""Embody 3D's files to recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnet.datamodules.common import to_clips
+from magnet.datamodules.embody3d import Embody3D, Embody3DReader
+from magnet.datamodules.fakes.embody3d import write
+from magnet.datamodules.fakes.motion import made_up_body
+from magnet.datamodules.recording import DataError, Take
+
+from .reading import Foreign, check_round_trip, check_splits, check_wrong_units, cut, refused
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write(tmp_path, 4, 12)
+    return tmp_path
+
+
+def named(reader: Embody3DReader, people: int) -> Take:
+    return next(take for take in reader.takes() if len(take.files) == 5 * people)
+
+
+def test_reading_gives_what_was_written(tmp_path: Path) -> None:
+    recordings = check_round_trip("embody3d", tmp_path)
+    assert sorted(len(recording.persons) for recording in recordings) == [2, 2, 3, 3, 4]
+    assert all(recording.persons == tuple(sorted(recording.persons)) for recording in recordings)
+
+
+def test_bad_tracking_is_marked(root: Path) -> None:
+    recording = Embody3DReader(root).read(named(Embody3DReader(root), 3))
+    assert recording.valid is not None
+    np.testing.assert_array_equal(recording.valid.sum(axis=0), [9, 12, 12])
+
+
+def test_people_chooses_scenes_and_leaves_their_splits(tmp_path: Path) -> None:
+    takes = check_splits("embody3d", tmp_path)
+    both = Embody3DReader(tmp_path, people=(2,)).takes() + Embody3DReader(tmp_path, people=[3, 4]).takes()
+    assert sorted(both, key=lambda take: take.name) == sorted(takes, key=lambda take: take.name)
+
+
+def test_sections_choose_scenes(root: Path) -> None:
+    acting, daylife = (Embody3DReader(root, sections=(name,)).takes() for name in ("acting", "daylife"))
+    assert len(acting) == len(daylife) == 2
+    assert all("ACTING" in take.name for take in acting) and all("DAYLIFE" in take.name for take in daylife)
+    with pytest.raises(DataError, match=r"no polyadic/dataset.json; sections with one: acting, daylife"):
+        Embody3DReader(root / "datasets", sections=("acting", "polyadic"))
+
+
+# -- splits ------------------------------------------------------------------------------------
+
+
+def listed(root: Path, scenes: list[tuple[str, list[str]]]) -> Embody3DReader:
+    """A download of which only dataset.json is there: (session, people) of each scene."""
+    subjects: dict[str, dict[str, Any]] = {}
+    for number, (session, people) in enumerate(scenes):
+        capture = f"c--{session}--{'--'.join(people)}--pilot--MotionPrior--ACTING_x--{number:06}-{number + 9:06}"
+        for person in people:
+            others = [other for other in people if other != person] or None
+            subjects.setdefault(person, {})[capture] = {"length": 10, "id": number, "multiperson": others}
+    (root / "acting").mkdir(parents=True)
+    (root / "acting" / "dataset.json").write_text(json.dumps(subjects))
+    return Embody3DReader(root, sections=("acting",))
+
+
+def people_of(take: Take) -> set[str]:
+    return {path.parent.parent.name for path in take.files}
+
+
+def shares(takes: list[Take]) -> dict[str | None, float]:
+    return {split: sum(take.split == split for take in takes) / len(takes) for split in ("train", "val", "test")}
+
+
+def test_nobody_is_in_two_splits_where_casts_allow_it(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    scenes = []
+    for number in range(300):
+        troupe = int(random.integers(25))
+        people = random.choice([f"{letter}XY{troupe:03}" for letter in "ABCDEF"], 2 + number % 3, replace=False)
+        scenes.append((f"202501{1 + number % 28:02}--{number % 24:02}00", people.tolist()))
+    takes = listed(tmp_path, scenes).takes()
+    where: dict[str, set[str | None]] = {}
+    for take in takes:
+        for person in people_of(take):
+            where.setdefault(person, set()).add(take.split)
+    assert all(len(splits) == 1 for splits in where.values())
+    assert 0.05 <= shares(takes)["val"] <= 0.2 and 0.05 <= shares(takes)["test"] <= 0.2
+    assert takes == Embody3DReader(tmp_path, sections=("acting",)).takes()
+
+
+def test_sessions_stay_whole_where_everybody_met(tmp_path: Path) -> None:
+    scenes = [(f"202501{1 + n % 28:02}--{n % 240 // 10:02}00", [f"AAA{n:03}", f"AAA{n + 1:03}"]) for n in range(400)]
+    takes = listed(tmp_path, scenes).takes()
+    assert {take.group for take in takes} == {session for session, _ in scenes}
+    assert len({(take.group, take.split) for take in takes}) == len({take.group for take in takes})
+    assert 0.03 <= shares(takes)["val"] <= 0.2 and 0.03 <= shares(takes)["test"] <= 0.2
+
+
+def test_solo_captures_are_scenes_of_one(tmp_path: Path) -> None:
+    reader = listed(tmp_path, [("20250101--0900", ["AAA001"]), ("20250101--0910", ["AAA001", "BBB002"])])
+    assert [len(people_of(take)) for take in reader.takes()] == [2]
+    alone = Embody3DReader(tmp_path, sections=("acting",), people=(1, 2)).takes()
+    assert sorted(len(people_of(take)) for take in alone) == [1, 2]
+
+
+def test_a_partner_whom_the_list_forgot_is_missed_when_read(root: Path) -> None:
+    path = root / "datasets" / "acting" / "dataset.json"
+    held = json.loads(path.read_text())
+    held.pop("AAA100")
+    path.write_text(json.dumps(held))
+    reader = Embody3DReader(root)
+    assert len(reader.takes()) == 4 and reader.read(named(reader, 2)).persons == ("AAA100", "BAA100")
+
+
+# -- bad input ---------------------------------------------------------------------------------
+
+
+def saved(feature: str, change: Callable[[np.ndarray], Any]) -> Callable[[Path], None]:
+    def damage(person: Path) -> None:
+        (path,) = (person / feature).iterdir()
+        np.save(path, change(np.load(path)), allow_pickle=True)
+
+    return damage
+
+
+def touched(feature: str, change: Callable[[Path], Any]) -> Callable[[Path], None]:
+    return lambda person: change(next((person / feature).iterdir()))
+
+
+TRANSL, POSE, BETAS = "smplx_mesh_transl", "smplx_mesh_body_pose", "smplx_mesh_betas"
+
+
+def nan_at(*place: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(array: np.ndarray) -> np.ndarray:
+        array[place] = np.nan
+        return array
+
+    return change
+
+
+DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated": (touched(TRANSL, cut), r"npy: cut short, \d+ of 144 bytes"),
+    "header cut": (touched(TRANSL, lambda path: cut(path, 0.1)), r"not an npy file"),
+    "empty": (touched(TRANSL, lambda path: path.write_bytes(b"")), r"not an npy file"),
+    "gone": (touched(TRANSL, lambda path: path.unlink()), r"no such file"),
+    "huge header": (
+        touched(TRANSL, lambda path: path.write_bytes(path.read_bytes().replace(b"(12, 3)", b"(9999999999, 3)", 1))),
+        r"not an npy file|cut short",
+    ),
+    "foreign code": (saved(TRANSL, lambda a: np.array(Foreign(), dtype=object)), r"holds pickled objects"),
+    "no partner": (lambda person: person.rename(person.with_name("gone")), r"a partner's files are missing"),
+    "unequal people": (
+        lambda person: [saved(feature.name, lambda a: a[:-2])(person) for feature in person.iterdir()],
+        r"unequal numbers of frames: AAA100 10, BAA100 12",
+    ),
+    "unequal features": (saved(TRANSL, lambda a: a[:-1]), r"unequal numbers of frames: .*smplx_mesh_transl 11"),
+    "unequal mask": (saved("missing", lambda a: a[:-1]), r"unequal numbers of frames: .*missing 11"),
+    "NaN": (saved(TRANSL, nan_at(3, 1)), r"NaN or infinity in 1 frames of good tracking"),
+    "NaN shape": (saved(BETAS, nan_at(0, 0)), r"smplx_mesh_betas.*NaN"),
+    "zero frames": (saved("missing", lambda a: a[:0]), r"no frames"),
+    "no betas": (touched(BETAS, lambda path: path.unlink()), r"smplx_mesh_betas.*no such file"),
+    "ten betas": (saved(BETAS, lambda a: a[:, :10]), r"got shape \(12, 10\), expected \(T, 300\)"),
+    "wrong shape": (saved(POSE, lambda a: a[:, :60]), r"got shape \(12, 60\), expected \(T, 63\)"),
+    "text": (saved(TRANSL, lambda a: a.astype(str)), r"expected numbers"),
+    "odd mask": (saved("missing", lambda a: a + 1), r"holds 2, expected only 0 and 1"),
+    "reversed mask": (saved("missing", lambda a: 1 - a), r"only 0% of 12 frames hold 1, .* give good=0"),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGED)
+def test_damaged_takes_are_refused_and_others_read(how: str, root: Path) -> None:
+    damage, match = DAMAGED[how]
+    reader = Embody3DReader(root)
+    takes = [take for take in reader.takes() if len(take.files) == 10]
+    one, two = sorted(takes, key=lambda take: "AAA100" not in people_of(take))
+    damage(one.files[0].parent.parent)
+    if how == "unequal people":
+        with pytest.raises(DataError, match=match):
+            reader.read(one)
+    else:
+        refused(reader, match, one)
+    assert reader.read(two).frames == 12
+
+
+LISTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated": (cut, r"not a json file"),
+    "a list": (lambda path: path.write_text("[]"), r"holds a list"),
+    "subject a list": (lambda path: path.write_text('{"AAA000": []}'), r"AAA000: holds a list"),
+    "no multiperson": (lambda path: path.write_text('{"AAA000": {"c": {}}}'), r"AAA000, c: lacks multiperson"),
+    "odd multiperson": (lambda path: path.write_text('{"A": {"c": {"multiperson": 3}}}'), r"multiperson is 3"),
+    "way out": (
+        lambda path: path.write_text('{"A": {"../../c": {"multiperson": ["B"]}}}'),
+        r"not the name of a folder",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", LISTS)
+def test_a_damaged_list_is_refused(how: str, root: Path) -> None:
+    damage, match = LISTS[how]
+    damage(root / "datasets" / "acting" / "dataset.json")
+    with pytest.raises(DataError, match=match):
+        Embody3DReader(root).takes()
+
+
+def test_a_reversed_mask_is_read_when_the_user_says_so(root: Path) -> None:
+    for path in root.glob("datasets/*/*/*/missing/*.npy"):
+        np.save(path, 1 - np.load(path))
+    reader = Embody3DReader(root, good=0)
+    assert sum(int(np.asarray(reader.read(take).valid).all()) for take in reader.takes()) == 3
+    with pytest.raises(ValueError, match=r"good: got 2"):
+        Embody3DReader(root, good=2)
+
+
+def test_nan_where_tracking_is_bad_is_no_harm(root: Path) -> None:
+    take = named(Embody3DReader(root), 3)
+    saved(TRANSL, nan_at(11))(take.files[0].parent.parent)
+    recording = Embody3DReader(root).read(take)
+    assert recording.transl is not None
+    np.testing.assert_array_equal(recording.transl[11, 0], recording.transl[10, 0])
+
+
+@pytest.mark.parametrize("change", [lambda a: a[0], lambda a: a.astype(np.float64)], ids=["once", "float64"])
+def test_harmless_differences_are_read(change: Callable[[np.ndarray], np.ndarray], root: Path) -> None:
+    take = named(Embody3DReader(root), 2)
+    before = Embody3DReader(root).read(take)
+    saved(BETAS, change)(take.files[0].parent.parent)
+    saved("missing", lambda a: a[:, None].astype(bool))(take.files[0].parent.parent)
+    after = Embody3DReader(root).read(take)
+    np.testing.assert_array_equal(after.betas, before.betas)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(after.valid, before.valid)  # type: ignore[arg-type]
+
+
+def test_clips_hold_only_good_frames(tmp_path: Path) -> None:
+    write(tmp_path, 2, 80)
+    reader = Embody3DReader(tmp_path)
+    take = named(reader, 3)
+    (clip,) = to_clips(reader.read(take), made_up_body(), take.name, reader.name, "train", reader.family).clips
+    assert (clip.agents, clip.frames) == (3, 77)
+
+
+def test_a_wrong_axis_unit_or_rate_is_named(tmp_path: Path) -> None:
+    check_wrong_units("embody3d", tmp_path)
+
+
+def test_its_data_module_has_four_slots() -> None:
+    assert Embody3D().max_agents == 4
+    assert Embody3D(max_agents=2).max_agents == 2

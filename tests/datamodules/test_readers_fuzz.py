@@ -1,0 +1,162 @@
+"""Whatever happens to a data set's files, its reader reads them or says what is wrong, in one kind of error."""
+
+from __future__ import annotations
+
+import importlib.util
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules.recording import DataError, Reader, Recording
+
+Damage = Callable[[bytes, np.random.Generator], bytes]
+TAKES, FRAMES, ROUNDS, FILES = 3, 4, 2, 7
+
+
+def known() -> list[str]:
+    """Data sets whose reader and fake are there."""
+    return [
+        name
+        for name, entry in NAMES.items()
+        if all(importlib.util.find_spec(part.split(":")[0]) for part in (entry.reader, entry.fake))
+    ]
+
+
+def flipped(data: bytes, random: np.random.Generator) -> bytes:
+    array = np.frombuffer(data, dtype=np.uint8).copy()
+    at = random.integers(len(array), size=int(random.integers(1, 6)))
+    array[at] ^= random.integers(1, 256, size=len(at), dtype=np.uint8)
+    return array.tobytes()
+
+
+def flipped_early(data: bytes, random: np.random.Generator) -> bytes:
+    """Where headers are."""
+    return flipped(data[:200], random) + data[200:]
+
+
+def cut(data: bytes, random: np.random.Generator) -> bytes:
+    return data[: int(random.integers(len(data)))]
+
+
+def holed(data: bytes, random: np.random.Generator) -> bytes:
+    start, stop = np.sort(random.integers(len(data) + 1, size=2))
+    return data[:start] + data[stop:]
+
+
+def stuffed(data: bytes, random: np.random.Generator) -> bytes:
+    at = int(random.integers(len(data)))
+    return data[:at] + random.bytes(int(random.integers(1, 40))) + data[at:]
+
+
+def digits(data: bytes, random: np.random.Generator) -> bytes:
+    """Other numbers in text, whole to the eye."""
+    array = np.frombuffer(data, dtype=np.uint8).copy()
+    places = np.flatnonzero((array >= ord("0")) & (array <= ord("9")))
+    if len(places):
+        array[random.choice(places, size=3)] = random.integers(ord("0"), ord("9") + 1, size=3)
+    return array.tobytes()
+
+
+DAMAGES: dict[str, Damage] = {
+    "flipped": flipped,
+    "flipped early": flipped_early,
+    "cut": cut,
+    "holed": holed,
+    "stuffed": stuffed,
+    "digits": digits,
+    "emptied": lambda data, random: b"",
+    "of noise": lambda data, random: random.bytes(300),
+}
+
+
+@pytest.fixture(scope="module")
+def fakes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    roots: dict[str, Path] = {}
+
+    def of(name: str) -> Path:
+        if name not in roots:
+            roots[name] = tmp_path_factory.mktemp(name)
+            NAMES[name].load_fake()(roots[name], takes=TAKES, frames=FRAMES)
+        return roots[name]
+
+    return of
+
+
+def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
+    """Read the takes that use a file, or all; how many could be. Raises anything but `DataError`."""
+    done = 0
+    try:
+        opened = reader(root)
+        takes = opened.takes()
+    except DataError as error:
+        assert len(str(error)) > 20
+        return 0
+    using = [take for take in takes if touched in take.files]
+    for take in (using or takes)[:3]:
+        try:
+            recording = opened.read(take)
+        except DataError as error:
+            assert len(str(error)) > 20
+            continue
+        assert isinstance(recording, Recording)
+        valid = np.True_ if recording.valid is None else recording.valid[..., None, None]
+        for part in (recording.poses, recording.positions):
+            assert part is None or (np.isfinite(part) | ~valid).all()
+        done += 1
+    return done
+
+
+def sample(root: Path) -> list[Path]:
+    """Files of a fake but its body: of each ending and folder name a few, then others."""
+    paths = sorted(path for path in root.rglob("*") if path.is_file() and path.name != "body.npz")
+    kinds: dict[str, list[Path]] = {}
+    for path in paths:
+        kinds.setdefault(path.suffix + path.parent.name, []).append(path)
+    turns = [list(group) for group in kinds.values()]
+    chosen: list[Path] = []
+    while turns and len(chosen) < FILES:
+        chosen += [group.pop(0) for group in turns]
+        turns = [group for group in turns if group]
+    return chosen[: max(FILES, len(kinds))] if len(paths) > FILES else paths
+
+
+@pytest.mark.parametrize("name", known())
+def test_damaged_files_are_read_or_refused(name: str, fakes: Callable[[str], Path]) -> None:
+    root, reader = fakes(name), NAMES[name].load_reader()
+    assert read(reader, root) > 0
+    for path in sample(root):
+        whole = path.read_bytes()
+        for label, damage in DAMAGES.items() if whole else ():
+            for turn in range(ROUNDS):
+                random = np.random.default_rng([zlib.crc32(f"{path.relative_to(root)} {label}".encode()), turn])
+                path.write_bytes(damage(whole, random))
+                try:
+                    read(reader, root, path)
+                except Exception as error:
+                    pytest.fail(f"{path.relative_to(root)} {label} ({turn}): {type(error).__name__}: {error}")
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", known())
+def test_missing_files_and_folders_are_read_or_refused(name: str, fakes: Callable[[str], Path], tmp_path: Path) -> None:
+    root, reader = fakes(name), NAMES[name].load_reader()
+    for path in sample(root):
+        for gone in (path, path.parent):
+            if gone != root:
+                gone.rename(tmp_path / "away")
+                read(reader, root, path)
+                (tmp_path / "away").rename(gone)
+
+
+@pytest.mark.parametrize("name", known())
+def test_a_folder_of_something_else_is_refused_with_where_to_ask(name: str, tmp_path: Path) -> None:
+    reader = NAMES[name].load_reader()
+    (tmp_path / "holiday.txt").write_text("photographs")
+    with pytest.raises(DataError, match=r"holiday|json|list|takes|motions"):
+        reader(tmp_path).takes()
+    with pytest.raises(DataError, match="http"):
+        reader(tmp_path / "nowhere")

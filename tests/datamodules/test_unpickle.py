@@ -1,0 +1,161 @@
+"""The restricted unpickler: plain data comes through, nothing else does, and no damage ends in a bare error."""
+
+from __future__ import annotations
+
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnet.datamodules.recording import DataError
+from magnet.datamodules.unpickle import load_object_npy, load_pickle
+
+PLAIN: dict[str, Any] = {
+    "floats": np.linspace(0.0, 1.0, 6).reshape(2, 3),
+    "fortran": np.asfortranarray(np.arange(6).reshape(2, 3)),
+    "big endian": np.arange(3, dtype=">f4"),
+    "half": np.arange(3, dtype=np.float16),
+    "flags": np.array([True, False]),
+    "text": np.array(["one", "three"]),
+    "bytes": np.array([b"one", b"three"]),
+    "empty": np.zeros((0, 3)),
+    "one number": np.array(2.5),
+    "objects": np.array([{"inner": np.arange(2)}, None, "x"], dtype=object),
+    "scalar": np.float32(1.5),
+    "integer": np.int64(4),
+    "nested": [1, (2.0, {"three": None}), {4, 5}, frozenset({6}), b"seven", True, 1 + 2j],
+    "ordered": OrderedDict(a=1),
+}
+
+
+def same(got: Any, want: Any) -> bool:
+    if isinstance(want, np.ndarray):
+        alike = type(got) is np.ndarray and got.shape == want.shape and got.dtype == want.dtype
+        return alike and all(same(a, b) for a, b in zip(got.ravel().tolist(), want.ravel().tolist(), strict=True))
+    if isinstance(want, dict):
+        return isinstance(got, dict) and list(got) == list(want) and all(same(got[k], want[k]) for k in want)
+    if isinstance(want, list | tuple):
+        return type(got) is type(want) and all(same(a, b) for a, b in zip(got, want, strict=True))
+    return type(got) is type(want) and got == want
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("key", PLAIN)
+def test_plain_data_comes_back_as_it_was(key: str, protocol: int, tmp_path: Path) -> None:
+    path = tmp_path / "file.pkl"
+    path.write_bytes(pickle.dumps({key: PLAIN[key]}, protocol=protocol))
+    assert same(load_pickle(path)[key], PLAIN[key])
+
+
+def test_an_npy_file_of_a_dict_comes_back_as_the_dict(tmp_path: Path) -> None:
+    np.save(tmp_path / "file.npy", PLAIN, allow_pickle=True)  # type: ignore[arg-type]
+    assert same(load_object_npy(tmp_path / "file.npy"), PLAIN)
+
+
+def test_bytes_keys_become_text(tmp_path: Path) -> None:
+    (tmp_path / "file.pkl").write_bytes(pickle.dumps({b"poses": {b"inner": 1}}))
+    assert load_pickle(tmp_path / "file.pkl") == {"poses": {"inner": 1}}
+
+
+def test_a_pickle_of_python_2_is_read(tmp_path: Path) -> None:
+    # {'poses': numpy.arange(2.0)} as Python 2.7 with numpy 1.16 wrote it, protocol 2.
+    data = (
+        b"\x80\x02}q\x00U\x05posesq\x01cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85U\x01b"
+        b"\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\nq\x05U\x02f8K\x00K\x01\x87Rq\x06(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff"
+        b"\xff\xff\xffK\x00tb\x89U\x10" + np.arange(2.0).tobytes() + b"tbs."
+    )
+    (tmp_path / "file.pkl").write_bytes(data)
+    assert load_pickle(tmp_path / "file.pkl")["poses"].tolist() == [0.0, 1.0]
+
+
+class Spy:
+    """Reduces to whatever it is made with."""
+
+    def __init__(self, call: Any, *arguments: Any) -> None:
+        self.reduced = (call, arguments)
+
+    def __reduce__(self) -> Any:
+        return self.reduced
+
+
+def ran(path: str) -> None:
+    Path(path).write_text("ran")
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "named"),
+    [
+        (eval, ("1",), "eval"),
+        (getattr, ("", "join"), "getattr"),
+        (np.load, ("file",), "load"),
+        (np.frombuffer, (b"12345678",), "frombuffer"),
+        (Path, ("x",), "Path"),
+        (bytearray, (10,), "bytearray"),
+    ],
+)
+def test_foreign_code_is_refused_by_name(call: Any, arguments: tuple[Any, ...], named: str, tmp_path: Path) -> None:
+    (tmp_path / "file.pkl").write_bytes(pickle.dumps([Spy(call, *arguments)]))
+    with pytest.raises(DataError, match=rf"file\.pkl: the pickle names .*{named}"):
+        load_pickle(tmp_path / "file.pkl")
+    np.save(tmp_path / "file.npy", np.array(Spy(call, *arguments), dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match=rf"file\.npy: the pickle names .*{named}"):
+        load_object_npy(tmp_path / "file.npy")
+
+
+def test_refused_code_has_not_run(tmp_path: Path) -> None:
+    (tmp_path / "file.pkl").write_bytes(pickle.dumps(Spy(ran, str(tmp_path / "proof"))))
+    with pytest.raises(DataError, match="ran"):
+        load_pickle(tmp_path / "file.pkl")
+    assert not (tmp_path / "proof").exists()
+
+
+def test_records_and_wild_sizes_are_refused_without_reserving_them(tmp_path: Path) -> None:
+    path = tmp_path / "file.pkl"
+    path.write_bytes(pickle.dumps(np.zeros(2, dtype=[("a", "f4")])))
+    with pytest.raises(DataError, match="records"):
+        load_pickle(path)
+    whole = pickle.dumps(np.zeros(70000, dtype=np.uint8), protocol=2)
+    path.write_bytes(whole.replace((70000).to_bytes(4, "little"), (2**31 - 1).to_bytes(4, "little"), 1))
+    with pytest.raises(DataError, match="2147483647"):
+        load_pickle(path)
+    path.write_bytes(b"\x80\x02]r\xff\xff\xff\xff.")  # a memo of four thousand million entries
+    with pytest.raises(DataError, match="not a whole pickle"):
+        load_pickle(path)
+
+
+def test_deep_nesting_and_shared_parts_end(tmp_path: Path) -> None:
+    path, shared, deep = tmp_path / "file.pkl", [0], []
+    for _ in range(60):
+        shared = [shared, shared]  # 2^60 if every reference were followed
+    for _ in range(200):
+        deep = [deep]
+    path.write_bytes(pickle.dumps(shared))
+    load_pickle(path)
+    path.write_bytes(pickle.dumps(deep))
+    with pytest.raises(DataError, match="deep"):
+        load_pickle(path)
+
+
+@pytest.mark.parametrize("load", [load_pickle, load_object_npy])
+def test_every_truncation_is_a_data_error(load: Any, tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    if load is load_pickle:
+        whole = pickle.dumps({"a": np.arange(4.0), "b": [1, "two"]})
+    else:
+        with path.open("wb") as file:
+            np.save(file, {"a": np.arange(4.0)}, allow_pickle=True)  # type: ignore[arg-type]
+        whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        with pytest.raises(DataError, match=r"file: "):
+            load(path)
+
+
+def test_a_missing_file_and_a_folder_are_data_errors(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        load_pickle(tmp_path / "none.pkl")
+    with pytest.raises(DataError, match="cannot be read"):
+        load_object_npy(tmp_path)

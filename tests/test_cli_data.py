@@ -1,0 +1,147 @@
+"""`magnet data`: what it says, and its exit codes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnet import cli, cli_data
+from magnet.datamodules import catalogue
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with a fake download, dl, and its store."""
+    folder = tmp_path_factory.mktemp("data")
+    assert cli.main(["data", "fake", "dd100", str(folder / "dl"), "--frames", "90"]) == 0
+    words = ["--root", str(folder / "dl"), "--out", str(folder / "store"), "--body", str(folder / "dl/body.npz")]
+    assert cli.main(["data", "prepare", "dd100", *words, "--workers", "1"]) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(made, tmp_path, monkeypatch) -> Path:
+    """A copy to spoil, and the folder to work in."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_list_names_every_data_set_with_its_licence_and_address(capsys):
+    assert cli.main(["data", "list"]) == 0
+    said = capsys.readouterr().out
+    for name, entry in catalogue.NAMES.items():
+        reader = entry.load_reader()
+        assert name in said and reader.licence in said and reader.source in said
+
+
+def test_a_store_is_described(made, capsys):
+    assert cli.main(["data", "info", str(made / "store")]) == 0
+    said = capsys.readouterr().out
+    for part in ("DD100", "made-up-smplx", "30 fps", "train", "of 2", "frames of one person"):
+        assert part in said
+
+
+def test_a_download_is_recognised_checked_and_drawn(copy, capsys):
+    assert cli.main(["data", "check", "dl", "--body", "dl/body.npz", "--workers", "1", "--limit", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "DD100" in said and "all assertions hold" in said
+    assert (copy / "dd100_check.png").stat().st_size > 10_000
+
+
+def test_a_check_is_drawn_with_the_open_body_where_the_own_is_not_given(copy, capsys):
+    assert cli.main(["data", "check", "store", "--picture", "seen.png"]) == 0
+    assert "picture: seen.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("which", ["train-*", "clips-*", "betas-*"])
+def test_a_check_finds_one_changed_byte(copy, capsys, which):
+    file = next((copy / "store").glob(which))
+    content = bytearray(file.read_bytes())
+    content[-5] ^= 1
+    file.write_bytes(content)
+    assert cli.main(["data", "check", "store", "--picture", "none"]) == 1
+    said = capsys.readouterr()
+    assert f"{file.name} is damaged: its checksum" in said.err and "1 problems" in said.out
+
+
+def test_a_check_finds_another_body(copy, capsys):
+    from magnet.datamodules.fakes.body import arrays
+
+    other = {**arrays(), "v_template": 1.1 * arrays()["v_template"]}
+    np.savez(copy / "other.npz", **other)
+    assert cli.main(["data", "check", "store", "--picture", "none", "--body", "other.npz"]) == 1
+    assert "has other joints at rest" in capsys.readouterr().err
+    assert cli.main(["data", "check", "store", "--picture", "none", "--body", "dl/body.npz"]) == 0
+
+
+def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(copy, capsys):
+    files = sorted((copy / "dl").rglob("*_00.npy"))
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    words = ["prepare", "dd100", "--root", "dl", "--out", "store", "--body", "dl/body.npz", "--workers", "1"]
+    assert cli.main(["data", *words]) == 0
+    said = capsys.readouterr().out
+    assert "skipped 1 takes:" in said and files[0].name in said and "1 were skipped" in said
+    for file in files:
+        file.write_bytes(b"")
+    assert cli.main(["data", *words]) == 2
+    assert "DD100: none of 4 takes could be used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("prepare", "name is missing"),
+        ("prepare interX --root dl --out o", "did you mean interx"),
+        ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
+        ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --reader.wrong 1", "its options are"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --workers 0", "workers: got 0"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --up=up", "up: got 'up'"),
+        ("info dl", "is not a prepared store"),
+        ("check nowhere", "is not a folder"),
+        ("check empty", "neither a prepared store nor a download"),
+        ("fake dd100 dl", "is not empty"),
+        ("fake dd100", "out is missing"),
+        ("download dd100", "given out by its authors alone"),
+        ("download cmu", "out is missing"),
+    ],
+)
+def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message):
+    (copy / "empty").mkdir()
+    assert cli.main(["data", *words.split()]) == 2
+    said = capsys.readouterr().err
+    assert message in said and "Traceback" not in said
+
+
+def test_help_shows_a_data_sets_own_options(capsys):
+    assert cli.main(["data", "prepare", "interx", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--workers" in said and "--reader.split" in said and "paper" in said
+    assert cli.main(["data"]) == 0 and "magnet data fake" in capsys.readouterr().out
+
+
+def test_readers_options_are_read_by_their_types():
+    kind = catalogue.find("embody3d").load_reader()
+    got = cli_data.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
+    assert got == {"people": [2, 3], "good": 0}
+
+
+def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
+    from magnet.datamodules import download
+
+    asked = []
+
+    def fetch(subjects, out, progress=None, **where):
+        asked.append((list(subjects), Path(out), where))
+        progress("60_01.amc", 10, 20)
+        return download.Downloaded(Path(out), ("60.asf",), ("61.asf",), ())
+
+    monkeypatch.setattr(download, "download_cmu", fetch)
+    assert cli.main(["data", "download", "cmu", str(tmp_path), "--subjects", "2,60", "--base_url", "http://x"]) == 0
+    assert asked == [(["2", "60"], tmp_path, {"base_url": "http://x"})]
+    assert "1 files fetched, 1 were there" in capsys.readouterr().out
