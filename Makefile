@@ -7,7 +7,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-all check lint type format clean distclean
+.PHONY: help setup demo test test-slow test-browser test-all check lint type format clean distclean
 
 help:  ## list what make can do
 	@echo "magnet: diffusion forcing for the motion of several people"
@@ -48,6 +48,12 @@ test: $(READY)  ## run the tests, without the slow ones
 test-slow: $(READY)  ## run the slow tests only
 	@echo "test-slow: pytest, the slow tests"
 	@$(PY) -m pytest -q -m slow
+
+test-browser: $(READY)  ## the viewer in a real headless Chromium, installed from Debian if absent
+	@echo "test-browser: pytest, the viewer in Chromium"
+	@command -v chromium >/dev/null || \
+	  { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core; }
+	@$(PY) -m pytest -q -m browser tests/viewer
 
 test-all: $(READY)  ## run every test
 	@echo "test-all: pytest, everything"

@@ -218,6 +218,12 @@ class MagnetCLI(LightningCLI):
                 default="gif",
                 help='format of moving pictures; mp4 needs pip install "magnet-motion[video]"',
             )
+            parser.add_argument(
+                "--view",
+                type=bool,
+                default=False,
+                help='open the first scenes in the browser; needs pip install "magnet-motion[view]"',
+            )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         self.config = parser.parse_args(args)
@@ -335,3 +341,16 @@ class MagnetCLI(LightningCLI):
         if self.evaluation is not None and scenes:
             picture, count = self._option("picture"), self._option("pictures")
             cli_output.write_scenes(scenes, self.evaluation, self.model, self.datamodule, self.folder, picture, count)
+            self._point_to_viewer()
+
+    def _point_to_viewer(self) -> None:
+        """Say how to watch what was written, or show it."""
+        first = sorted((self.folder / "scenes").glob("*.npz"))[:1]
+        if not first or not self.trainer.is_global_zero:
+            return
+        words = [str(first[0]), "--context", str(self.datamodule.context_frames)]
+        print(f"watch it: magnet view {' '.join(words)}")
+        if self._option("view"):
+            from magnet.cli_view import main as view
+
+            view(words)

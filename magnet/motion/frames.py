@@ -164,6 +164,7 @@ def place(
     trust: float = 0.003,
     present: Tensor | None = None,
     fixed: Tensor | None = None,
+    anchor: Tensor | None = None,
 ) -> Tensor:
     """World canonical frames of a predicted stretch of motion.
 
@@ -172,12 +173,13 @@ def place(
         T_self_partner: (B, T, P, P - 1, 4, 4); `integrate` does not read it and takes None.
         T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
         placement: `integrate`: every agent integrates its own steps (the reference's way; agents may
-            drift apart slowly). `anchor`: agent 0 integrates, the others hang off it by its pairwise
+            drift apart slowly). `anchor`: one agent integrates, the others hang off it by its pairwise
             transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
             the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
         trust: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
         present: (B, P) bool; relations to absent agents are not read. None: all are there.
         fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
+        anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
 
     Returns:
         T_world_can (B, T, P, 4, 4), in the dtype of `steps`; computed in float64 so that thousands of
@@ -197,8 +199,12 @@ def place(
     ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
     T_world_can = from_planar(yaw, ground)
     if placement == "anchor" and T_self_partner is not None:
-        T_world_others = T_world_can[:, :, :1] @ project_se2(T_self_partner[:, :, 0].double())
-        T_world_can = torch.cat([T_world_can[:, :, :1], T_world_others], dim=2)
+        scene = torch.arange(len(steps), device=steps.device)
+        anchor = torch.zeros_like(scene) if anchor is None else anchor.to(steps.device)
+        T_anchor_others = project_se2(T_self_partner[scene, :, anchor].double())
+        T_world_others = T_world_can[scene, :, anchor][:, :, None] @ T_anchor_others  # (B, T, P - 1, 4, 4)
+        others = partners(steps.shape[2], steps.device)[anchor]
+        T_world_can[scene[:, None], :, others] = T_world_others.transpose(1, 2)
     return T_world_can.to(steps)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,13 +182,14 @@ class Scene:
             with np.load(path, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
                 arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
-        except (OSError, KeyError, ValueError, EOFError) as error:
+            version, facts = meta["format"], {"fps": meta["fps"], "body": meta["body"], "names": tuple(meta["names"])}
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error
-        if meta["format"] > SCENE_FORMAT:
-            raise ValueError(f"{path}: scene format {meta['format']}, this version reads up to {SCENE_FORMAT}")
-        return Scene(**arrays, fps=meta["fps"], body=meta["body"], names=tuple(meta["names"]))
+        if version > SCENE_FORMAT:
+            raise ValueError(f"{path}: scene format {version}, this version reads up to {SCENE_FORMAT}")
+        return Scene(**arrays, **facts)
 
 
 def absent(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:

@@ -175,6 +175,24 @@ def test_fuse_bounds_the_drift_between_agents(generator):
     assert apart["fuse"] < 0.3 * apart["integrate"]
 
 
+def test_others_hang_off_the_anchor_alone(generator):
+    """What all but each scene's anchor say of others, and the others' steps, may be anything."""
+    scene = random_scene(2, 40, 3, generator)
+    T_world_can, anchor = canonical_frame(scene.T_world_root), torch.tensor([2, 1])
+    steps, pairs = canonical_steps(T_world_can), pairwise(T_world_can)
+    heard = torch.arange(3) == anchor[:, None]
+    noise = pairwise(canonical_frame(random_scene(2, 40, 3, generator).T_world_root))
+    pairs = torch.where(heard[:, None, :, None, None, None], pairs, noise)
+    steps = torch.where(heard[:, None, :, None, None], steps, steps.flip(1))
+    placed = place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=anchor)
+    assert torch.allclose(placed, T_world_can[:, 1:], atol=1e-4)
+    first = place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor")
+    assert torch.equal(
+        first, place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=torch.zeros(2).long())
+    )
+    assert not torch.allclose(first, T_world_can[:, 1:], atol=0.1)
+
+
 def test_a_person_lying_on_the_side_keeps_the_last_yaw():
     lying = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, torch.pi / 2]))
     upright = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.7, 0.0]))

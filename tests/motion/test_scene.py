@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -69,3 +70,23 @@ def test_people_are_everybody_present_alone(generator):
         assert torch.equal(people.body_rot[m, :, 0], scene.body_rot[b, :, p])
         assert torch.equal(people.betas[m, 0], scene.betas[b, p])
         assert torch.equal(people.valid[m], scene.valid[b])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [{"meta": np.array("{}")}, {"meta": np.array("[1]")}, {"meta": np.array("not json")}, {"other": np.zeros(3)}],
+)
+def test_a_strangers_npz_is_refused_by_name(content, tmp_path):
+    path = tmp_path / "stranger.npz"
+    np.savez(path, **content)
+    with pytest.raises(ValueError, match=r"stranger\.npz: not a scene file"):
+        Scene.load(path)
+
+
+def test_a_damaged_file_is_refused_by_name(scene, tmp_path):
+    path = scene.save(tmp_path / "scene.npz")
+    whole = path.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:200] + b"x" * 400 + whole[600:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="not a scene file"):
+            Scene.load(path)

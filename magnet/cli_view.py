@@ -1,0 +1,198 @@
+"""`magnet view`: scenes in the browser, or a model that plays live."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+EXAMPLES = """\
+examples:
+  magnet view runs/predict/latest/scenes/0000.npz --context 32
+  magnet view sampled.npz --truth recorded.npz      the ground truth as ghosts
+  magnet view a.npz b.npz --style capsules          side by side, light
+  magnet view dance.npz --html dance.html           one page that needs no server
+  magnet view --live                                the shipped model plays; choose, steer, save
+  magnet view --live start.npz --ckpt_path last     goes on from a scene
+  magnet view start.npz --context 32 --record steps.npz --task joint_future
+
+over ssh: magnet view FILE --no-browser, and on your own machine ssh -L 8080:localhost:8080 HOST
+"""
+
+
+def arguments_of(words: Sequence[str]) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        prog="magnet view",
+        description="Watch scenes in the browser, or let a model play while you interfere.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
+    )
+    look = parser.add_argument_group("what is shown")
+    look.add_argument("--truth", metavar="FILE", help="a scene shown as ghosts in each of the others")
+    look.add_argument("--context", type=int, default=0, metavar="N", help="first frames that the model was given")
+    look.add_argument("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
+    look.add_argument("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
+    look.add_argument("--style", choices=("body", "capsules", "skeleton"), help="default: body, capsules for crowds")
+    look.add_argument(
+        "--no-shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
+    )
+    look.add_argument("--html", metavar="OUT.html", help="write the first scene as a page of its own, and end")
+    live = parser.add_argument_group("generating")
+    live.add_argument("--live", action="store_true", help="a model generates while you watch")
+    live.add_argument(
+        "--record", metavar="OUT.npz", help="continue FILE once, keep the steps of its denoising, and watch these"
+    )
+    live.add_argument("--frames", type=int, default=64, metavar="N", help="frames that --record adds (default: 64)")
+    live.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
+    live.add_argument("--task", default="joint_future", help="task to begin with (default: %(default)s)")
+    live.add_argument("--people", type=int, default=2, metavar="N", help="people of a scene from nothing (default: 2)")
+    live.add_argument("--steps", type=int, default=10, metavar="N", help="denoising steps (default: %(default)s)")
+    live.add_argument("--seed", type=int, default=1, help="of the sampling (default: %(default)s)")
+    web = parser.add_argument_group("where")
+    web.add_argument("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
+    web.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
+    web.add_argument("--no-browser", action="store_true", help="only say where it is")
+    return parser.parse_args(words)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run `magnet view`. Returns the exit code.
+
+    Raises:
+        ValueError, OSError, ImportError: something the user can put right; the message says what.
+    """
+    options = arguments_of(arguments)
+    _check(options)
+    if options.html is not None:
+        return _write_page(options)
+    stage = _live(options) if options.live else _watch(options)
+    announce(stage.port, options.host, options.no_browser)
+    try:
+        stage.run()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        stage.stop()
+    return 0
+
+
+def announce(port: int, host: str, quiet: bool) -> None:
+    """Say where the viewer is, and open the browser if there is one."""
+    from magnet.viewer.server import open_browser
+
+    url = f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1', '::') else host}:{port}"
+    print(f"magnet view: {url}   (Ctrl+C ends it)", flush=True)
+    if not quiet and not open_browser(url):
+        tunnel = f"ssh -L {port}:localhost:{port}"
+        print(f"no browser here: open that address yourself; from another machine first run {tunnel}", flush=True)
+
+
+def _check(options: argparse.Namespace) -> None:
+    if not options.files and not options.live:
+        raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
+    if options.live and len(options.files) > 1:
+        raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
+    if options.record is not None and (options.live or len(options.files) != 1):
+        raise ValueError("--record continues one FILE, and is not --live")
+    if options.context < 0 or options.samples < 1:
+        raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
+
+
+def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
+    from magnet.body.base import load_body
+    from magnet.viewer.takes import read_takes
+
+    body = load_body(options.body or "open")
+    return read_takes(options.files, body, options.context, options.samples)
+
+
+def _write_page(options: argparse.Namespace) -> int:
+    from magnet.viewer.html import save_html
+    from magnet.viewer.takes import read_takes
+
+    takes, body = _read(options)
+    truth = None
+    if options.truth:
+        truth = read_takes([options.truth], body, samples=1)[0][0].scene
+    styles = (options.style,) if options.style else None
+    path = save_html(
+        takes[0].scene,
+        options.html,
+        body,
+        context=options.context,
+        truth=truth,
+        title=takes[0].label,
+        styles=styles,
+    )
+    print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _watch(options: argparse.Namespace) -> Any:
+    from magnet.viewer.server import free_port, require_viser
+    from magnet.viewer.takes import read_takes
+    from magnet.viewer.watch import Viewer, first_look
+
+    require_viser()
+    free_port(options.host, options.port)  # before reading, which may take long
+    takes, body = _read(options)
+    if options.record is not None:
+        _record(options, takes[0].scene)
+        takes, _ = read_takes([options.record], body, options.context)
+    truth = None
+    if options.truth:
+        truth = read_takes([options.truth], body, samples=1)[0][0]
+        if truth.scene.fps != takes[0].scene.fps:
+            raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {takes[0].scene.fps:g}")
+    look = first_look(takes, options.style, not options.no_shadows)
+    return Viewer(takes, body, truth, options.host, options.port, look)
+
+
+def _record(options: argparse.Namespace, scene: Any) -> None:
+    import torch
+
+    from magnet import cli_stored
+    from magnet.denoiser.generation import SamplerOptions
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks import registry
+    from magnet.viewer.recording import record
+
+    task = registry.get(options.task)()
+    model = Denoiser.load(cli_stored.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    generator = torch.Generator().manual_seed(options.seed)
+    sampler = SamplerOptions(steps=options.steps)
+    recording = record(model, scene, task, options.context, options.frames, sampler, generator)
+    print(f"written: {recording.save(options.record)}")
+
+
+def _live(options: argparse.Namespace) -> Any:
+    from magnet.viewer.server import free_port, require_viser
+
+    require_viser()
+    free_port(options.host, options.port)
+    import torch
+
+    from magnet import cli_stored
+    from magnet.body.base import load_body
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks import registry
+    from magnet.viewer.live import Live
+    from magnet.viewer.play import Playground
+    from magnet.viewer.troupe import Look
+
+    registry.get(options.task)
+    start = None
+    body = load_body(options.body or "open")
+    if options.files:
+        takes, body = _read(options)
+        start = takes[0].scene
+    model = Denoiser.load(cli_stored.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
+    live.settings.task, live.settings.steps = options.task, options.steps
+    look = Look(style=options.style or "body", shadows=not options.no_shadows)
+    return Playground(live, body, options.host, options.port, look)

@@ -1,0 +1,66 @@
+"""What a viewer marks: feet that stand or slide, hands that touch, bodies that run through each other."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magnet.body.capsules import capsule_segments
+from magnet.metrics.penetration import penetration_depth
+from magnet.metrics.skating import PRESETS, TOES
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+WRISTS = (20, 21)
+HANDS_TOUCH = 0.2
+"""Metres between two people's wrists under which their hands are taken to touch."""
+
+
+def standing(before: Array, now: Array, fps: float) -> tuple[Mask, Mask]:
+    """Which toes stand, and which of these slide, by the rules of the metric FS. (P, 22, 3) x 2 -> (P, 2) bool x 2"""
+    height, speed = PRESETS["default"]
+    toes = now[:, TOES]
+    low = (toes[..., 1] < height) & (before[:, TOES][..., 1] < height)
+    moved = np.linalg.norm((toes - before[:, TOES])[..., [0, 2]], axis=-1) * fps
+    return low, low & (moved > speed)
+
+
+def touching(joints: Array) -> Array:
+    """Places between hands of different people that touch. (P, 22, 3) -> (M, 3)"""
+    wrists = joints[:, WRISTS]  # (P, 2, 3)
+    apart = np.linalg.norm(wrists[:, :, None, None] - wrists[None, None], axis=-1)  # (P, 2, P, 2)
+    p, hand, q, other = np.nonzero(apart < HANDS_TOUCH)
+    once = p < q
+    return (wrists[p[once], hand[once]] + wrists[q[once], other[once]]) / 2
+
+
+def penetrations(joints: Array) -> tuple[Array, Array, Array]:
+    """Where capsules of different people run through each other, by the rules of the metric IP.
+
+    (P, 22, 3) -> places (M, 3), radii of the thicker capsule (M,), depths (M,), metres
+    """
+    pairs = list(itertools.combinations(range(len(joints)), 2))
+    if not pairs:
+        return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
+    people = torch.from_numpy(np.ascontiguousarray(joints)).float()
+    one, other = people[[p for p, _ in pairs]], people[[q for _, q in pairs]]
+    depth = penetration_depth(one, other)
+    n, i, j = depth.nonzero(as_tuple=True)
+    a, b, radius = capsule_segments(one)
+    c, d, _ = capsule_segments(other)
+    place = nearest(a[n, i], b[n, i], c[n, j], d[n, j])
+    return place.numpy(), torch.maximum(radius[i], radius[j]).numpy(), depth[n, i, j].numpy()
+
+
+def nearest(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, d: torch.Tensor, parts: int = 12) -> torch.Tensor:
+    """A place between the nearest points of segments a-b and c-d, to a twelfth of their length. (M, 3) x 4 -> (M, 3)"""
+    share = torch.linspace(0, 1, parts + 1)[:, None]
+    on_first = a[:, None] + share * (b - a)[:, None]  # (M, parts + 1, 3)
+    on_second = c[:, None] + share * (d - c)[:, None]
+    best = torch.cdist(on_first, on_second).flatten(1).argmin(dim=1)
+    row = torch.arange(len(a))
+    return (on_first[row, best // (parts + 1)] + on_second[row, best % (parts + 1)]) / 2

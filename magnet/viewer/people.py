@@ -1,0 +1,134 @@
+"""People in viser's scene: skinned by the browser, or as light capsules and sticks that are only moved."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from magnet.body.base import Body
+from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs
+from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.viewer.palette import Colours, for_batches
+from magnet.viewer.rig import Array, Rig, Style, capsule, rigs, turn_to
+
+
+class People(Protocol):
+    """The P people of a take as they stand in the browser."""
+
+    def pose(self, turns: Array, places: Array) -> None:
+        """Bones of everybody: (P, 22, 4) wxyz, (P, 22, 3) metres."""
+
+    def paint(self, colours: Colours) -> None:
+        """(P, 3)"""
+
+    def show(self, on: bool) -> None:
+        """Hide or show everybody; who is hidden needs no poses."""
+
+
+def add_people(
+    server: Any, name: str, body: Body, scene: Scene, style: Style, colours: Colours, opacity: float | None = None
+) -> People:
+    """Put the people of a scene (B = 1) into the browser's scene below the node `name`."""
+    if style == "body":
+        return Skinned(server, name, rigs(body, scene), colours, opacity)
+    rest = body.rest_joints(scene.betas[0].float().cpu()).numpy()
+    return Jointed(server, name, rest, CAPSULES if style == "capsules" else STICKS, colours, opacity)
+
+
+class Skinned:
+    """One skinned mesh a person; of each frame only the poses of the bones are sent."""
+
+    def __init__(self, server: Any, name: str, people: list[Rig], colours: Colours, opacity: float | None) -> None:
+        upright = np.tile([1.0, 0.0, 0.0, 0.0], (BODY_JOINTS, 1))
+        self.colours = colours.copy()
+        self.meshes = [
+            server.scene.add_mesh_skinned(
+                f"{name}/person_{p}",
+                rig.skin.vertices,
+                rig.skin.faces,
+                bone_wxyzs=upright,
+                bone_positions=rig.rest,
+                skin_weights=rig.skin.dense_weights(),
+                color=tuple(int(c) for c in colours[p]),
+                opacity=opacity,
+                cast_shadow=opacity is None,
+                receive_shadow=False,
+            )
+            for p, rig in enumerate(people)
+        ]
+
+    def pose(self, turns: Array, places: Array) -> None:
+        for mesh, own_turns, own_places in zip(self.meshes, turns, places, strict=True):
+            for bone, turn, place in zip(mesh.bones, own_turns, own_places, strict=True):
+                bone.wxyz, bone.position = turn, place
+
+    def paint(self, colours: Colours) -> None:
+        for p in np.nonzero((colours != self.colours).any(axis=1))[0]:
+            self.meshes[p].color = tuple(int(c) for c in colours[p])
+        self.colours = colours.copy()
+
+    def show(self, on: bool) -> None:
+        # Hidden, never removed: viser 1.1's browser part fails while it takes a skinned mesh apart.
+        for mesh in self.meshes:
+            mesh.visible = on
+
+
+class Jointed:
+    """Everybody's same limb is one batch of tapered capsules: a frame costs two messages a limb for any crowd."""
+
+    def __init__(
+        self, server: Any, name: str, rest: Array, table: tuple[Limb, ...], colours: Colours, opacity: float | None
+    ) -> None:
+        self.table = table
+        start, end, radii = limbs(rest, table)
+        length = np.linalg.norm(end - start, axis=-1)  # (P, M)
+        turns, places = stand(start, end)
+        self.colours = colours.copy()
+        self.batches = []
+        for m in range(len(table)):
+            size, thick = length[:, m].mean(), radii[:, m].mean(axis=0)
+            vertices, faces, _ = capsule(float(size), float(thick[0]), float(thick[1]))
+            wide = radii[:, m, 0] / thick[0]
+            scales = np.stack([wide, wide, length[:, m] / size], axis=1).astype(np.float32)
+            self.batches.append(
+                server.scene.add_batched_meshes_simple(
+                    f"{name}/limb_{m}",
+                    vertices,
+                    faces,
+                    turns[:, m],
+                    places[:, m],
+                    batched_scales=scales,
+                    batched_colors=for_batches(colours),
+                    opacity=opacity,
+                    lod="off",
+                    cast_shadow=opacity is None,
+                    receive_shadow=False,
+                )
+            )
+
+    def pose(self, turns: Array, places: Array) -> None:
+        start, end, _ = limbs(places, self.table)
+        wxyz, at = stand(start, end)
+        for m, batch in enumerate(self.batches):
+            batch.batched_wxyzs, batch.batched_positions = wxyz[:, m], at[:, m]
+
+    def paint(self, colours: Colours) -> None:
+        if (colours != self.colours).any():
+            for batch in self.batches:
+                batch.batched_colors = for_batches(colours)
+        self.colours = colours.copy()
+
+    def show(self, on: bool) -> None:
+        for batch in self.batches:
+            batch.visible = on
+
+
+def stand(start: Array, end: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Turn and place that take a capsule along +z to each limb. (P, M, 3) x 2 -> (P, M, 4) wxyz, (P, M, 3)"""
+    R = torch.from_numpy(turn_to(np.asarray(end - start, dtype=np.float64)))
+    turns = roma.rotmat_to_unitquat(R)[..., [3, 0, 1, 2]].float().numpy()
+    return np.ascontiguousarray(turns), np.ascontiguousarray(start, dtype=np.float32)

@@ -1,0 +1,77 @@
+"""The web server behind the viewer."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import sys
+from typing import Any
+
+NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
+
+
+def start(host: str, port: int, title: str) -> Any:
+    """A viser server on exactly this port; port 0 takes one that is free.
+
+    Raises:
+        ImportError: viser is not installed.
+        OSError: the port is taken, or the host is not this machine.
+    """
+    viser = require_viser()
+    port = free_port(host, port)
+    # viser greets with a box of its own; ours says more.
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    if server.get_port() != port:
+        server.stop()
+        raise OSError(taken(host, port))
+    return server
+
+
+def require_viser() -> Any:
+    """The module viser.
+
+    Raises:
+        ImportError: it is not installed; says how to install it.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError(NEEDS) from error
+    return viser
+
+
+def free_port(host: str, port: int) -> int:
+    """The port, if nobody listens there; for 0 one that is free.
+
+    Raises:
+        OSError: it is taken, or the host is not this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except socket.gaierror as error:
+            raise OSError(f"--host {host}: no such address; use 127.0.0.1, or 0.0.0.0 for all") from error
+        except (OSError, OverflowError) as error:
+            raise OSError(taken(host, port)) from error
+        return int(probe.getsockname()[1])
+
+
+def taken(host: str, port: int) -> str:
+    """What to do when a port cannot be had."""
+    return f"port {port} of {host} is in use or not allowed; choose another: --port {port + 1}, or --port 0 for any"
+
+
+def open_browser(url: str) -> bool:
+    """Show a page in the user's browser; False where there is none, as over ssh."""
+    import webbrowser
+
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    try:
+        return webbrowser.open(url)
+    except webbrowser.Error:
+        return False

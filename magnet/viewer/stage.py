@@ -1,0 +1,294 @@
+"""What watching and playing live share: a stage in the browser with people, a timeline and cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magnet.body.base import Body
+from magnet.motion.scene import Scene
+from magnet.viewer.clock import SPEEDS, Clock
+from magnet.viewer.palette import PAPER
+from magnet.viewer.rig import STYLES, Array
+from magnet.viewer.scenery import Floor
+from magnet.viewer.server import start
+from magnet.viewer.takes import Take
+from magnet.viewer.troupe import Look, Troupe
+
+RATE = 30.0
+"""Frames a second that are sent at most."""
+CAMERAS = {"three quarters": (0.65, 0.30), "front": (0.0, 0.12), "side": (1.571, 0.12), "above": (0.0, 1.45)}
+"""Presets: azimuth about the vertical from +z and elevation, radians."""
+AIM = 0.85
+FIELD = 0.70
+
+
+class Stage:
+    """Server, floor, clock, the people, and their controls.
+
+    Args:
+        body: of all takes.
+        host, port: where the browser finds it; port 0 takes any that is free.
+    """
+
+    def __init__(
+        self, body: Body, look: Look, host: str = "127.0.0.1", port: int = 8080, title: str = "magnet"
+    ) -> None:
+        self.body = body
+        self.server = start(host, port, title)
+        self.port = self.server.get_port()
+        self.clock = Clock(1, 30.0)
+        self.look = look
+        self.troupes: list[Troupe] = []
+        self.lock = threading.RLock()
+        self.follow, self.centre = True, np.zeros(3)
+        self.shown = -1
+        self.sent = 0
+        self._stop = threading.Event()
+        scene = self.server.scene
+        scene.set_up_direction("+y")
+        scene.configure_default_lights(True, cast_shadow=look.shadows)
+        scene.set_background_image(np.full((4, 4, 3), PAPER, dtype=np.uint8))
+        self.root = scene.add_frame("/stage", show_axes=False)
+        self.floor = Floor(self.server, "/stage")
+        self.server.gui.main_panel.dock_right()
+        self.server.gui.main_panel.set_width(300)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(56, 128, 222))
+        self._look_from("three quarters", 4.0)
+
+    # -- controls ------------------------------------------------------------------------------
+
+    def add_timeline(self) -> None:
+        """Buttons and sliders of the clock."""
+        gui = self.server.gui
+        with gui.add_folder("Time"):
+            self.slider = gui.add_slider("frame", 0, max(self.clock.frames - 1, 1), 1, 0)
+            self.play = gui.add_button("Pause", icon="player-pause")
+            steps = gui.add_button_group("step", ("|<", "-10", "-1", "+1", "+10", ">|"))
+            speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
+            loop = gui.add_checkbox("loop", True)
+            self.clock_text = gui.add_markdown("")
+
+        def seek(event: Any) -> None:
+            if event.client_id is not None:  # moved by a person, not by the clock
+                with self.lock:
+                    self.clock.playing = False
+                    self.clock.seek(int(self.slider.value))
+                self._update_play()
+
+        def press(_: Any) -> None:
+            with self.lock:
+                self.clock.play(not self.clock.playing)
+            self._update_play()
+
+        def step(_: Any) -> None:
+            with self.lock:
+                last = self.clock.frames - 1
+                far = {"|<": -self.clock.frame, ">|": last - self.clock.frame}
+                self.clock.step(far[steps.value] if steps.value in far else int(steps.value))
+            self._update_play()
+
+        def set_speed(_: Any) -> None:
+            self.clock.speed = float(speed.value[:-1])
+
+        def set_loop(_: Any) -> None:
+            self.clock.loop = bool(loop.value)
+
+        self.slider.on_update(seek)
+        self.play.on_click(press)
+        steps.on_click(step)
+        speed.on_update(set_speed)
+        loop.on_update(set_loop)
+
+    def _update_play(self) -> None:
+        self.play.label = "Pause" if self.clock.playing else "Play"
+        self.play.icon = "player-pause" if self.clock.playing else "player-play"
+
+    def add_looks(self, ghosts: bool) -> None:
+        """What is shown, and from where."""
+        gui = self.server.gui
+        with gui.add_folder("Look"):
+            style = gui.add_dropdown("people", STYLES, initial_value=self.look.style)
+            shown = {"ghosts": gui.add_checkbox("ground truth", self.look.ghosts)} if ghosts else {}
+            shown |= {
+                "shadows": gui.add_checkbox("shadows", self.look.shadows, hint="off where there is no GPU"),
+                "trails": gui.add_checkbox("trails", self.look.trails),
+                "contacts": gui.add_checkbox("contacts", self.look.contacts, hint="green: stands, orange: slides"),
+                "collisions": gui.add_checkbox("collisions", self.look.collisions, hint="red: capsules overlap"),
+            }
+        with gui.add_folder("Camera"):
+            follow = gui.add_checkbox("follow the people", self.follow)
+            presets = gui.add_button_group("from", tuple(CAMERAS))
+
+        def dress(_: Any) -> None:
+            values = {name: bool(box.value) for name, box in shown.items()}
+            self.dress(dataclasses.replace(self.look, style=style.value, **values))
+
+        for control in (style, *shown.values()):
+            control.on_update(dress)
+
+        def set_follow(_: Any) -> None:
+            self.follow = bool(follow.value)
+
+        follow.on_update(set_follow)
+        presets.on_click(lambda event: self._move_cameras(presets.value, event.client))
+
+    def dress(self, look: Look) -> None:
+        """Take another look."""
+        with self.lock, self.server.atomic():
+            self.look = look
+            self.server.scene.configure_default_lights(True, cast_shadow=look.shadows)
+            for troupe in self.troupes:
+                troupe.dress(look)
+            self.shown = -1
+
+    # -- saving --------------------------------------------------------------------------------
+
+    def add_saving(self) -> None:
+        """Downloads of a take."""
+        gui = self.server.gui
+        names = tuple(troupe.take.label or "scene" for troupe in self.troupes)
+        with gui.add_folder("Save", expand_by_default=False):
+            which = gui.add_dropdown("take", names, initial_value=names[0]) if len(names) > 1 else None
+            buttons = {kind: gui.add_button(f".{kind}", icon="download") for kind in ("html", "npz", "gif")}
+
+        def save(kind: str, client: Any) -> None:
+            troupe = self.troupes[names.index(which.value) if which is not None else 0]
+            button = buttons[kind]
+            button.disabled = True
+            try:
+                content = saved(troupe.take, self.body, kind, troupe.truth)
+                name = "".join(c if c.isalnum() else "_" for c in troupe.take.label) or "scene"
+                client.send_file_download(f"{name}.{kind}", content)
+            finally:
+                button.disabled = False
+
+        for kind, button in buttons.items():
+            button.on_click(lambda event, kind=kind: save(kind, event.client))
+
+    # -- camera --------------------------------------------------------------------------------
+
+    def _eye(self, preset: str, distance: float) -> Array:
+        azimuth, elevation = CAMERAS[preset]
+        flat = np.cos(elevation)
+        away = np.array([np.sin(azimuth) * flat, np.sin(elevation), np.cos(azimuth) * flat])
+        return np.array([0.0, AIM, 0.0]) + distance * away
+
+    def _look_from(self, preset: str, distance: float) -> None:
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.fov = self._eye(preset, distance), np.array([0.0, AIM, 0.0]), FIELD
+        self.distance = distance
+
+    def _move_cameras(self, preset: str, client: Any = None) -> None:
+        for each in [client] if client is not None else self.server.get_clients().values():
+            with each.atomic():
+                each.camera.position = self._eye(preset, self.distance)
+                each.camera.look_at = np.array([0.0, AIM, 0.0])
+
+    def frame_all(self) -> None:
+        """Put the camera as far away as everybody needs, at the start, in the middle and at the end."""
+        wide = []
+        for share in (0.0, 0.5, 1.0):
+            moment = [
+                t.take.scene.T_world_root[0, round(share * (t.take.frames - 1)), :, :3, 3].cpu().numpy() + t.offset
+                for t in self.troupes
+            ]
+            wide.append(np.ptp(np.concatenate(moment)[:, [0, 2]], axis=0).max())
+        half = float(np.median(wide)) / 2 + 0.7
+        self._look_from("three quarters" if len(self.troupes) == 1 else "front", max(4.2, 2.4 * half))
+
+    # -- showing -------------------------------------------------------------------------------
+
+    def draw(self) -> None:
+        """Show the clock's frame, if it is not shown already."""
+        with self.lock:
+            frame = self.clock.frame
+            if frame == self.shown or not self.troupes:
+                return
+            jump = abs(frame - self.shown) > 5
+            with self.server.atomic():
+                for troupe in self.troupes:
+                    troupe.show(frame)
+                self._follow(frame, jump)
+                self.slider.value = frame
+                self.clock_text.content = self.caption(frame)
+            self.shown = frame
+            self.sent += 1
+
+    def _follow(self, frame: int, jump: bool) -> None:
+        middle = np.mean([troupe.centre(frame) for troupe in self.troupes], axis=0)
+        self.floor.under(middle)
+        goal = middle * np.array([1.0, 0.0, 1.0]) if self.follow else np.zeros(3)
+        self.centre = goal if jump else self.centre + 0.08 * (goal - self.centre)
+        self.root.position = tuple(float(-x) for x in self.centre)
+
+    def caption(self, frame: int) -> str:
+        """What the panel says about a frame."""
+        lines = [f"{frame / self.clock.fps:.2f} s of {self.clock.frames / self.clock.fps:.1f} s"]
+        for troupe in self.troupes:
+            known = troupe.take.known[min(frame, len(troupe.take.known) - 1)]
+            state = "given" if known.all() else "partly given" if known.any() else ""
+            facts = troupe.facts
+            if self.look.contacts:
+                state += f" · standing feet: {facts.get('feet', 0):.0f} · touching hands: {facts.get('hands', 0):.0f}"
+            if self.look.collisions and facts.get("deepest", 0.0) > 0:
+                state += f" · **{100 * facts['deepest']:.0f} cm inside each other**"
+            label = f"{troupe.take.label}: " if len(self.troupes) > 1 else ""
+            lines.append(f"{label}{state.removeprefix(' · ')}")
+        return "  \n".join(lines)
+
+    def before_draw(self) -> None:
+        """What happens between two frames."""
+
+    def run(self, seconds: float | None = None) -> None:
+        """Play until stopped, or for so many seconds."""
+        begin = last = time.perf_counter()
+        while not self._stop.is_set() and (seconds is None or last - begin < seconds):
+            now = time.perf_counter()
+            with self.lock:
+                was = self.clock.playing
+                self.clock.tick(now - last)
+            if was != self.clock.playing:
+                self._update_play()
+            last = now
+            self.before_draw()
+            self.draw()
+            self._stop.wait(max(0.001, 1 / RATE - (time.perf_counter() - now)))
+
+    def start(self) -> threading.Thread:
+        """`run` in a thread."""
+        thread = threading.Thread(target=self.run, name="magnet-view", daemon=True)
+        thread.start()
+        return thread
+
+    def stop(self) -> None:
+        """End, and give the port back."""
+        self._stop.set()
+        with self.lock:
+            self.server.stop()
+
+
+def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> bytes:
+    """A take as the content of a file: html, npz or gif."""
+    import tempfile
+
+    context = int(take.known.all(axis=1).cumprod().sum())
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene.{kind}"
+        if kind == "html":
+            from magnet.viewer.html import save_html
+
+            save_html(take.scene, path, body, context=context, truth=truth, title=take.label)
+        elif kind == "gif":
+            from magnet.export.video import render_video
+
+            render_video(take.scene, path, context_frames=context, body=body, fps=15.0, size=(480, 360), ghosts=truth)
+        else:
+            take.scene.save(path)
+        return io.BytesIO(path.read_bytes()).getvalue()

@@ -1,0 +1,153 @@
+"""What is watched: scenes read from files, who is in them, and which frames a model was given."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body.base import Body, load_body
+from magnet.motion.scene import Scene
+from magnet.viewer.recording import Recording
+
+SAMPLES = 4
+"""Scenes of one file that are shown side by side."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """One scene (B = 1, present people only) as it is shown.
+
+    Attributes:
+        slots: the people's slots, which say their colours.
+        known: (T, P) bool, frames that the model was given.
+        recording: its denoising steps, if they were recorded.
+    """
+
+    label: str
+    scene: Scene
+    slots: tuple[int, ...]
+    known: NDArray[np.bool_]
+    recording: Recording | None = None
+
+    @property
+    def frames(self) -> int:
+        return self.scene.frames
+
+
+def take(
+    label: str, scene: Scene, context: int = 0, recording: Recording | None = None, known: Tensor | None = None
+) -> Take:
+    """A scene (B = 1) made ready to be shown.
+
+    context: first frames that a model was given; known (T, P) bool: the given frames instead, of everybody.
+
+    Raises:
+        ValueError: nobody is there, no frames, or numbers that are not finite.
+    """
+    slots = scene.present[0].nonzero()[:, 0]
+    if not len(slots) or not scene.frames:
+        raise ValueError(f"{label}: {scene.frames} frames of {len(slots)} people, so there is nothing to see")
+    shown = (scene if len(slots) == scene.agents else scene.order(slots)).to("cpu")
+    for name in ("T_world_root", "body_rot"):
+        broken = ~getattr(shown, name)[0].flatten(1).isfinite().all(dim=1)
+        if bool(broken.any()):
+            first = int(broken.int().argmax())
+            raise ValueError(f"{label}: {name} is not finite in {int(broken.sum())} frames, the first is frame {first}")
+    given = np.zeros((scene.frames, len(slots)), dtype=bool)
+    given[: max(context, 0)] = True
+    if known is not None:
+        if tuple(known.shape) != (scene.frames, scene.agents):
+            raise ValueError(f"known: got {tuple(known.shape)}, expected (T, P) = {(scene.frames, scene.agents)}")
+        given = known[:, slots].cpu().numpy().astype(bool)
+    return Take(label, shown, tuple(slots.tolist()), given, recording)
+
+
+def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[Take]:
+    """The first of a file's B scenes, each a take."""
+    names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
+    many = scene.scenes > 1
+    return [
+        take(f"{names[b]} · {b + 1}" if many else names[b], scene.pick([b]), context)
+        for b in range(min(scene.scenes, samples))
+    ]
+
+
+def read_takes(
+    paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
+) -> tuple[list[Take], Body]:
+    """All that several files hold, and the body it is shown on.
+
+    body: the user's; by default the open one.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file that cannot be read, files of different frame rates or bodies; says which and what to do.
+    """
+    body = body or load_body("open")
+    found: list[tuple[Path, Take]] = []
+    for path in map(Path, paths):
+        scene, recording = read_scene(path, body)
+        here = takes(scene, path.stem, context, samples)
+        if recording is not None:
+            here = [take(path.stem, scene, context, recording)]
+        found += [(path, each) for each in here]
+    if not found:
+        raise ValueError("no file to show: magnet view FILE...")
+    rates = {each.scene.fps: path for path, each in found}
+    if len(rates) > 1:
+        listed = ", ".join(f"{path.name} has {fps:g}" for fps, path in rates.items())
+        raise ValueError(f"mixed frame rates (frames a second): {listed}; show files of one rate at a time")
+    return [each for _, each in found], body
+
+
+def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
+    """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not one of these, damaged, or of another body.
+    """
+    from magnet.export.formats import read  # late: it brings every format's code
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    if path.suffix.lower() == ".npz" and not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not readable (no npz archive, or cut short); copy or download it again")
+    if path.suffix.lower() == ".npz" and is_recording(path):
+        recording = Recording.load(path)
+        if recording.scene.body != body.id:
+            raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
+        return recording.scene, recording
+    try:
+        return read(path, body).scene, None
+    except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
+
+
+def is_recording(path: Path) -> bool:
+    """Whether an npz holds denoising steps.
+
+    Raises:
+        ValueError: the archive is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return "meta" in file.files and "recording" in json.loads(str(file["meta"]))
+    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error
+
+
+def same_length(one: Take, other: Take) -> Scene:
+    """The scene of `one`, cut or held so that it has the frames of `other`."""
+    frame = torch.arange(other.frames).clamp(max=one.frames - 1)
+    scene = one.scene
+    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=None)

@@ -1,0 +1,174 @@
+"""One take in the browser's scene: its people, their ghosts, trails and marks, at any frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from magnet.body.base import Body
+from magnet.motion.scene import Scene
+from magnet.viewer.palette import GHOST, agent_colours, pale
+from magnet.viewer.people import People, add_people
+from magnet.viewer.rig import Array, Style, bone_poses
+from magnet.viewer.scenery import Marks, Shades, Trails
+from magnet.viewer.takes import Take
+
+APART = 0.5
+"""Metres between the takes of a row."""
+WIDEST = 8.0
+"""Metres of the row that one take takes up at most."""
+CROWD = 8
+"""People in all from which the light view is the first choice."""
+HEAD_HIGH = 2.1
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is shown."""
+
+    style: Style = "body"
+    ghosts: bool = True
+    trails: bool = True
+    contacts: bool = True
+    collisions: bool = True
+    shadows: bool = True  # true ones, which cost a browser without a GPU seconds a frame; else discs
+    seconds: float = 2.0  # of the trails
+
+
+class Troupe:
+    """A take on the stage at `offset` metres.
+
+    Args:
+        server: viser's.
+        parent: scene node that the take hangs on.
+        truth: a scene (B = 1) of the same frames, shown as ghosts.
+        label: write the take's label above it.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        parent: str,
+        body: Body,
+        take: Take,
+        offset: Array,
+        look: Look,
+        truth: Scene | None = None,
+        label: bool = True,
+    ) -> None:
+        self.server, self.body, self.take, self.truth, self.look = server, body, take, truth, look
+        self.name = f"{parent}/{_node(take.label)}"
+        self.offset = offset
+        self.root = server.scene.add_frame(self.name, show_axes=False, position=tuple(float(x) for x in offset))
+        self.own = agent_colours(take.slots)
+        self.wardrobe: dict[tuple[Style, bool], People] = {}  # people and ghosts in the styles shown so far
+        self.people: People
+        self.ghosts: People | None = None
+        self.trails: Trails | None = None
+        self.marks = Marks(server, f"{self.name}/marks", len(take.slots), take.scene.fps)
+        self.shades = Shades(server, f"{self.name}/shades", len(take.slots))
+        self.label = server.scene.add_label(f"{self.name}/label", take.label) if label and take.label else None
+        self.facts: dict[str, float] = {}
+        self.estimate: Scene | None = None
+        self.dress(look)
+
+    def dress(self, look: Look) -> None:
+        """Take another look."""
+        self.look = look
+        self.people = self._dressed(look.style, False)
+        wanted = look.ghosts and self.truth is not None
+        self.ghosts = self._dressed(look.style, True) if wanted else None
+        for people in self.wardrobe.values():
+            people.show(people is self.people or people is self.ghosts)
+        if look.trails and self.trails is None:
+            self.trails = Trails(self.server, f"{self.name}/trails", self.own)
+        elif not look.trails and self.trails is not None:
+            self.trails.remove()
+            self.trails = None
+        self.marks.clear(not look.contacts, not look.collisions)
+        if look.shadows:
+            self.shades.clear()
+
+    def _dressed(self, style: Style, ghosts: bool) -> People:
+        if (style, ghosts) not in self.wardrobe:
+            scene = self.truth if ghosts and self.truth is not None else self.take.scene
+            colours = np.tile(np.array(GHOST, dtype=np.uint8), (scene.agents, 1)) if ghosts else self.own
+            name = f"{self.name}/{'ghosts' if ghosts else 'people'}_{style}"
+            opacity = 0.35 if ghosts else None
+            self.wardrobe[style, ghosts] = add_people(self.server, name, self.body, scene, style, colours, opacity)
+        return self.wardrobe[style, ghosts]
+
+    def show(self, frame: int) -> None:
+        """Put everybody where they are in a frame; after the last one they stay as they were."""
+        scene = self.estimate or self.take.scene
+        now = min(frame, scene.frames - 1)
+        start = max(now - 1, 0)
+        turns, places = bone_poses(self.body, scene.cut(start, now + 1))
+        self.people.pose(turns[-1], places[-1])
+        known = self.take.known[min(now, len(self.take.known) - 1)]
+        self.people.paint(np.where(known[:, None], pale(self.own), self.own))
+        if self.ghosts is not None and self.truth is not None:
+            at = min(now, self.truth.frames - 1)
+            ghost_turns, ghost_places = bone_poses(self.body, self.truth.cut(at, at + 1))
+            self.ghosts.pose(ghost_turns[-1], ghost_places[-1])
+        if self.trails is not None:
+            self.trails.show(self._ways(scene, now))
+        if not self.look.shadows:
+            self.shades.show(places[-1])
+        if self.look.contacts:
+            feet, hands = self.marks.contacts(places[0], places[-1])
+            self.facts |= {"feet": feet, "hands": hands}
+        if self.look.collisions:
+            self.facts["deepest"] = self.marks.collisions(places[-1])
+        if self.label is not None:
+            middle = places[-1][:, 0].mean(axis=0)
+            self.label.position = (float(middle[0]), HEAD_HIGH, float(middle[2]))
+
+    def _ways(self, scene: Scene, now: int) -> Array:
+        assert self.trails is not None
+        back = np.linspace(-self.look.seconds * scene.fps, 0, self.trails.pieces + 1).round().astype(int)
+        frames = torch.from_numpy(np.clip(now + back, 0, None))
+        return scene.T_world_root[0, frames, :, :3, 3].cpu().numpy()
+
+    def centre(self, frame: int) -> Array:
+        """Middle of the group on the stage. -> (3,)"""
+        scene = self.take.scene
+        at = min(frame, scene.frames - 1)
+        return scene.T_world_root[0, at, :, :3, 3].mean(dim=0).cpu().numpy() + self.offset
+
+    def appear(self, on: bool) -> None:
+        """Leave the stage, or come back."""
+        self.root.visible = on
+
+
+def _node(label: str) -> str:
+    return "take_" + "".join(c if c.isalnum() else "_" for c in label)
+
+
+def in_a_row(takes: list[Take]) -> list[Array]:
+    """Offsets that put takes side by side along x around the origin, each (3,)."""
+    edges = []
+    for each in takes:
+        x = each.scene.T_world_root[0, :, :, 0, 3]
+        middle = float(x.median())
+        half = min(float((x - middle).abs().flatten()[:: max(x.numel() // 9999, 1)].quantile(0.8)) + 0.5, WIDEST / 2)
+        edges.append((middle, half))
+    width = sum(2 * half for _, half in edges) + APART * (len(takes) - 1)
+    offsets, left = [], -width / 2
+    for (middle, half), each in zip(edges, takes, strict=True):
+        z = float(each.scene.T_world_root[0, :, :, 2, 3].median())
+        offsets.append(np.array([left + half - middle, 0.0, -z]))
+        left += 2 * half + APART
+    return offsets
+
+
+def numbered(takes: list[Take]) -> list[Take]:
+    """The takes with labels that differ, for they name nodes of the scene."""
+    labels = [each.label for each in takes]
+    return [
+        replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
+        for i, each in enumerate(takes)
+    ]

@@ -1,0 +1,93 @@
+"""What `magnet view` says when something is wrong."""
+
+import builtins
+import socket
+from pathlib import Path
+
+import pytest
+
+from magnet import cli_view
+from magnet.cli import main
+from magnet.motion.scene import Scene
+from magnet.viewer import server
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The one line that a command ends with."""
+    assert main(["view", *words]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def test_a_port_in_use_names_another(tmp_path: Path, duet: Scene, capsys) -> None:
+    pytest.importorskip("viser")
+    path = duet.save(tmp_path / "a.npz")
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        assert f"port {port} of 127.0.0.1 is in use" in (line := said(capsys, str(path), "--port", str(port)))
+        assert "--port" in line
+
+
+@pytest.mark.parametrize("words", [["--live"], ["a.npz"]])
+def test_without_viser_it_says_what_to_install(monkeypatch, capsys, words) -> None:
+    real = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name == "viser":
+            raise ImportError("No module named 'viser'")
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    assert 'pip install "magnet-motion[view]"' in said(capsys, *words)
+
+
+def test_nothing_to_watch_and_contradictions_are_named(capsys) -> None:
+    assert "magnet view FILE" in said(capsys)
+    assert "one scene" in said(capsys, "--live", "a.npz", "b.npz")
+    assert "--record" in said(capsys, "--live", "--record", "x.npz")
+    assert "--samples 0" in said(capsys, "a.npz", "--samples", "0")
+
+
+def test_an_unreadable_file_is_named(tmp_path: Path, capsys) -> None:
+    pytest.importorskip("viser")
+    path = tmp_path / "broken.npz"
+    path.write_bytes(b"PK no")
+    assert "broken.npz: not readable" in said(capsys, str(path), "--port", "0")
+
+
+def test_mixed_frame_rates_are_named_for_the_truth_too(tmp_path: Path, duet: Scene, capsys) -> None:
+    pytest.importorskip("viser")
+    slow, fast = duet.save(tmp_path / "a.npz"), duet.replace(fps=60.0).save(tmp_path / "b.npz")
+    assert "mixed frame rates" in said(capsys, str(slow), str(fast), "--port", "0")
+    assert "--truth has 60 frames a second" in said(capsys, str(slow), "--truth", str(fast), "--port", "0")
+
+
+def test_an_unknown_host_is_named() -> None:
+    with pytest.raises(OSError, match=r"--host no\.such\.host\.invalid"):
+        server.free_port("no.such.host.invalid", 0)
+
+
+def test_without_a_screen_it_says_how_to_get_there_by_ssh(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(server, "open_browser", lambda url: False)
+    cli_view.announce(8099, "127.0.0.1", quiet=False)
+    out = capsys.readouterr().out
+    assert "http://localhost:8099" in out
+    assert "ssh -L 8099:localhost:8099" in out
+
+
+def test_without_a_display_no_browser_is_started(monkeypatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    assert not server.open_browser("http://localhost:1")
+
+
+def test_a_page_is_written_without_viser_or_a_server(tmp_path: Path, duet: Scene, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    path = duet.save(tmp_path / "a.npz")
+    assert main(["view", str(path), "--html", str(tmp_path / "a.html"), "--style", "skeleton", "--context", "4"]) == 0
+    assert (tmp_path / "a.html").stat().st_size > 10_000
+    assert "written:" in capsys.readouterr().out

@@ -1,0 +1,107 @@
+"""The page that plays by itself holds the scene, and nothing from elsewhere."""
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import Body
+from magnet.body.base import PARENTS
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+from magnet.viewer.html import FULL, page, save_html
+
+TYPES = {"i16": "<i2", "u16": "<u2", "u32": "<u4", "u8": "u1", "f32": "<f4"}
+
+
+def contents(text: str) -> tuple[dict, dict[str, np.ndarray]]:
+    """What the player reads from a page."""
+    meta = json.loads(re.search(r'<script id="meta"[^>]*>(.*?)</script>', text, re.S)[1])
+    data = base64.b64decode(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+    arrays = {
+        name: np.frombuffer(data, TYPES[at["type"]], at["length"], at["offset"]) for name, at in meta["arrays"].items()
+    }
+    return meta, arrays
+
+
+def drawn(meta: dict, arrays: dict[str, np.ndarray], person: int, frame: int) -> np.ndarray:
+    """The player's way from the page's numbers to vertices, written once more. (V, 3)"""
+    M = len(meta["people"])
+    w, x, y, z = (arrays["turns"].reshape(-1, M, 22, 4)[frame, person] / FULL).T.astype(float)
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    R = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+    rest = arrays["rest"].reshape(M, 22, 3)[person].astype(float)
+    place = np.zeros((22, 3))
+    place[0] = arrays["roots"].reshape(-1, M, 3)[frame, person]
+    for j in range(1, 22):
+        place[j] = place[PARENTS[j]] + R[PARENTS[j]] @ (rest[j] - rest[PARENTS[j]])
+    bones = arrays["body_bones"].reshape(-1, 4)
+    weights = arrays["body_weights"].reshape(-1, 4) / 65535
+    vertices = arrays["body_vertices"].reshape(M, -1, 3)[person] * meta["unit"]
+    moved = np.einsum("vkab,vkb->vka", R[bones], vertices[:, None] - rest[bones]) + place[bones]
+    return (weights[..., None] * moved).sum(axis=1)
+
+
+def test_the_page_holds_the_bodys_vertices_within_a_millimetre(duet: Scene, body: Body) -> None:
+    meta, arrays = contents(page(duet, body))
+    truth = body.vertices(duet)[0].numpy()
+    for frame, person in [(0, 0), (13, 1), (23, 0)]:
+        assert np.abs(drawn(meta, arrays, person, frame) - truth[frame, person]).max() < 1e-3
+
+
+def test_neighbouring_turns_lie_on_one_side_so_that_between_them_nobody_flips(body: Body) -> None:
+    scene = random_scene(1, 200, 2, torch.Generator().manual_seed(3))
+    _, arrays = contents(page(scene, body, styles=("skeleton",)))
+    turns = arrays["turns"].reshape(200, 2, 22, 4).astype(float)
+    assert ((turns[1:] * turns[:-1]).sum(-1) > 0).all()
+
+
+def test_the_page_asks_for_nothing_from_elsewhere(duet: Scene, body: Body) -> None:
+    text = page(duet, body)
+    assert not re.findall(r"""(?:src|href)\s*=|https?:|//cdn|@import|fetch\(|XMLHttpRequest|import\(""", text)
+
+
+def test_context_truth_and_title_are_there(duet: Scene, body: Body) -> None:
+    meta, arrays = contents(page(duet, body, context=8, truth=duet.cut(0, 12), title="</script><b>"))
+    assert meta["context"] == 8
+    assert [person["ghost"] for person in meta["people"]] == [False, False, True, True]
+    known = arrays["known"].reshape(24, 4)
+    assert known[:8, :2].all()
+    assert not known[8:].any()
+    assert "</script><b>" not in page(duet, body, title="</script><b>")
+
+
+def test_two_people_for_six_seconds_take_less_than_two_megabytes(tmp_path: Path, body: Body) -> None:
+    scene = random_scene(1, 182, 2, torch.Generator().manual_seed(3))
+    assert save_html(scene, tmp_path / "scene", body, context=32).stat().st_size < 2e6
+
+
+def test_a_licensed_bodys_skin_is_left_out_unless_it_is_asked_for(duet: Scene, body: Body) -> None:
+    theirs = Body("smplx-neutral", *(getattr(body, name) for name in FIELDS))
+    scene = duet.replace(body="smplx-neutral")
+    meta, arrays = contents(page(scene, theirs))
+    assert meta["styles"] == ["capsules", "skeleton"]
+    assert not [name for name in arrays if name.startswith("body")]
+    assert contents(page(scene, theirs, styles=("body",)))[0]["styles"] == ["body"]
+
+
+FIELDS = ("J_template", "J_shapedirs", "v_template", "shapedirs", "weights", "faces")
+
+
+def test_several_scenes_and_unknown_styles_are_refused(scene: Scene, duet: Scene, body: Body) -> None:
+    with pytest.raises(ValueError, match="got 2 scenes, expected one"):
+        page(scene, body)
+    with pytest.raises(ValueError, match="choose from body, capsules, skeleton"):
+        page(duet, body, styles=("cartoon",))  # type: ignore[arg-type]
