@@ -121,8 +121,9 @@ def measure(
 
 
 def leaking(model: Denoiser) -> Denoiser:
-    """The same weights, with relations shown as clean as their token: the paper read literally."""
-    model.layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.relations, "token")
+    """The same weights, with relations as clean as their token, the paper read literally: not what they learnt."""
+    layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.relations, "token")
+    model.layout = model.transformer.layout = model.statistics.layout = layout
     return model
 
 

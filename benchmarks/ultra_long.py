@@ -14,6 +14,7 @@ import resource
 import subprocess
 import sys
 import time
+from typing import Any
 
 import torch
 
@@ -23,11 +24,14 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.seams import joined
 from magnet.motion.scene import Scene
-from magnet.tasks import registry
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.schedule import Grid
+from magnet.tasks import Task, registry
 from magnet.testing import random_scene, tiny_denoiser
 
 TOY = "toy"
 CONTEXT = 4  # frames, as in the paper's ultra-long runs
+CLIP = 300  # frames of the synthetic clip that a context is cut from
 MIB = 2**20
 
 
@@ -46,9 +50,14 @@ def main() -> None:
     if len(options.frames) == 1:
         measure(options)
         return
-    without = [word for word in sys.argv[1:] if not word.isdigit() and word != "--frames"]
     for frames in options.frames:
-        subprocess.run([sys.executable, __file__, *without, "--frames", str(frames)], check=True)
+        subprocess.run([sys.executable, __file__, *words({**vars(options), "frames": frames})], check=True)
+
+
+def words(options: dict[str, Any]) -> list[str]:
+    """Options as one writes them."""
+    given = {name: value for name, value in options.items() if value is not None}
+    return [word for name, value in given.items() for word in (f"--{name}", str(value))]
 
 
 def measure(options: argparse.Namespace) -> None:
@@ -59,10 +68,11 @@ def measure(options: argparse.Namespace) -> None:
     context = 0 if options.task == "generation" else CONTEXT
     sampler = SamplerOptions(steps=options.steps or (2 if options.model == TOY else 30), rolling=options.rolling)
     health = Health()
+    scene = recorded(options, frames if given_later(task, context) else context)
     empty = resident()
     began = time.perf_counter()
     pieces = model.stream(
-        recorded(options, frames),
+        scene,
         task,
         context,
         frames - context,
@@ -92,13 +102,20 @@ def measure(options: argparse.Namespace) -> None:
         print(f"  saved: {joined(kept).save(options.save)}")
 
 
+def given_later(task: Task, context: int) -> bool:
+    """Whether the task is given motion after the context too, to the end of the scene."""
+    past = context // STRIDE
+    return bool(task.schedule(Grid(past + 32, 2, past)).known[past:].any())
+
+
 def recorded(options: argparse.Namespace, frames: int) -> Scene:
-    """What the task may be given: as many frames as it needs of the toy, the context otherwise."""
+    """What the task may be given, and no more; at least a few frames, for who is there."""
+    frames = max(-(-frames // STRIDE) * STRIDE, CONTEXT)
     if options.model == TOY:
-        given = options.task in ("partner_inpainting", "motion_control", "inbetweening")
-        return random_scene(1, frames if given else CONTEXT, 2, torch.Generator().manual_seed(1))
-    data = Synthetic(couplings=[options.coupling], people=[options.people], test_clips=1)
-    return data.clips("test")[0].scene.cut(0, CONTEXT)
+        return random_scene(1, frames, 2, torch.Generator().manual_seed(1))
+    clip = max(frames, CLIP)
+    data = Synthetic(couplings=[options.coupling], people=[options.people], test_clips=1, clip_frames=clip)
+    return data.clips("test")[0].scene.cut(0, frames)
 
 
 def looks(scene: Scene) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 from magnet.denoiser.generation import reach
 from magnet.denoiser.seams import arrive, hold, joined, paste, step_between
 from magnet.motion.frames import (
+    Placement,
     canonical_frame,
     canonical_steps,
     from_9d,
@@ -139,10 +140,12 @@ class Canvas:
         kept = self.given.cut(frames)
         self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
-    def settle(self, canvas: Tensor, finished: Tensor) -> Tensor:
+    def settle(self, canvas: Tensor, finished: Tensor, apart: bool = False) -> Tensor:
         """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
 
-        Of known tokens nothing changes but the step that leads into them, once it is known where from.
+        Of known tokens nothing changes but the step that leads into them, once it is known where from. `apart`:
+        some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
+        would tie together who decided alone, so everybody is placed by the own steps, whatever the options say.
         """
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
@@ -155,7 +158,8 @@ class Canvas:
             code = self.model.tokenizer.requantise(latent)
             self.health.add_snap(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
-        moved = self._place_all(steps, relations if layout.slots else None, finished, first, stop)
+        placement = "integrate" if apart else self.options.placement
+        moved = self._place_all(steps, relations if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
             earlier = layout.unpack(statistics.restore(canvas[:, begin:first]))[0]
@@ -165,8 +169,11 @@ class Canvas:
         settled = layout.pack(latent, true_steps, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
         if layout.slots:
-            together = layout.group_present(self.given.present)[:, None] & changed_groups
-            self.health.add_drift(relations, implied[:, first - begin :], together[:, first - begin :, :, 1:])
+            together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
+            if apart:
+                new = finished[first:stop].to(canvas.device)
+                together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
+            self.health.add_drift(relations, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
         canvas[:, begin:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, begin:stop])
         return self._enter(canvas, begin, stop)
@@ -212,18 +219,29 @@ class Canvas:
             return own
         return torch.cat([own, own | moved[:, partners(moved.shape[1])]], dim=-1)
 
-    def _place_all(self, steps: Tensor, relations: Tensor | None, finished: Tensor, first: int, stop: int) -> Tensor:
+    def _place_all(
+        self,
+        steps: Tensor,
+        relations: Tensor | None,
+        finished: Tensor,
+        first: int,
+        stop: int,
+        placement: Placement,
+    ) -> Tensor:
         """Put the new tokens of a stage into the world, from known token to known token. -> (N, P) bool, who moved"""
         moved = finished.clone()
         for start, end in spans(finished, self.placed, first, stop):
             part = slice(start - first, end - first)
             new = finished[start]
-            self._place(steps[:, part], None if relations is None else relations[:, part], start, end, new)
+            pairs = None if relations is None else relations[:, part]
+            self._place(steps[:, part], pairs, start, end, new, placement)
             self.placed[start:end] |= new
             moved |= self._arrive(end, new)
         return moved
 
-    def _place(self, steps: Tensor, relations: Tensor | None, first: int, stop: int, new: Tensor) -> None:
+    def _place(
+        self, steps: Tensor, relations: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
+    ) -> None:
         """Put newly generated agents into the world from their predicted steps and relations. new (P,) bool"""
         new = new.to(steps.device)
         known = self.placed[first].to(steps.device)
@@ -232,44 +250,46 @@ class Canvas:
         T_self_partner = None
         if relations is not None:
             T_self_partner = from_9d(relations_by_frame(relations))
+        there = self.given.present & (known | new)  # of others, nothing is known here
         placed = place(
             T_prev_can,
             T_self_partner,
-            self._starts(T_prev_can, T_self_partner, first),
-            self.options.placement,
+            self._starts(T_prev_can, T_self_partner, first, new),
+            placement,
             self.options.trust,
-            present=self.given.present & (known | new),  # of others, nothing is known here
+            present=there,
             fixed=known,
+            anchor=first_of(there),
         )
         frames = slice(first * STRIDE, stop * STRIDE)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
-    def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int) -> Tensor:
+    def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`, such that the first step leads to the right place.
 
         Whoever was there before goes on from there. A newcomer's first frame hangs by the pairwise transform
-        off somebody known at that frame, or off somebody who was there before, or off agent 0, who then starts
-        at the origin.
+        off somebody known at that frame, or off somebody who was there before, or off the first newcomer, who then
+        starts at the origin; in each scene off somebody who is present.
         """
-        P = self.T_world_can.shape[2]
-        there = self.placed[first - 1] if first else torch.zeros(P, dtype=torch.bool)
         starts = self.T_world_can[:, max(first * STRIDE - 1, 0)].clone()
-        if bool(there.all()):
+        there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
+        present = self.given.present
+        if bool((there | ~present).all()):
             return starts
-        known_now = self.placed[first].nonzero()[:, 0].tolist()
-        anchor = (known_now or there.nonzero()[:, 0].tolist() or [0])[0]
-        T_world_anchor = self.T_world_can[:, first * STRIDE, anchor]
-        if not known_now:
-            T_world_anchor = torch.eye(4, device=starts.device).expand_as(T_world_anchor)
-            if bool(there[anchor]):
-                T_world_anchor = starts[:, anchor] @ T_prev_can[:, 0, anchor]
+        now = self.placed[first].to(new.device)
+        anchor = (present * (4 * now.int() + 2 * there.int() + new.int())).argmax(dim=1)
+        scene = torch.arange(len(starts), device=starts.device)
+        onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
+        onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
+        T_world_anchor = torch.where(now[anchor, None, None], self.T_world_can[scene, first * STRIDE, anchor], onward)
         for agent in (~there).nonzero()[:, 0].tolist():
             T_world_first = T_world_anchor
-            if agent in known_now:
+            if bool(now[agent]):
                 T_world_first = self.T_world_can[:, first * STRIDE, agent]
-            elif agent != anchor and T_self_partner is not None:
-                slot = agent - (agent > anchor)
-                T_world_first = T_world_anchor @ project_se2(T_self_partner[:, 0, anchor, slot])
+            elif T_self_partner is not None:
+                slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
+                hung = T_world_anchor @ project_se2(T_self_partner[scene, 0, anchor, slot])
+                T_world_first = torch.where((anchor == agent)[:, None, None], T_world_anchor, hung)
             starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
         return starts
 
@@ -280,20 +300,16 @@ class Canvas:
         was arbitrary, and all who are there move along with the first who arrives.
         """
         moved = torch.zeros_like(self.placed)
-        arriving = (self.known[row] & new).nonzero()[:, 0].tolist() if row < len(self.known) else []
+        arriving = self.known[row] & new if row < len(self.known) else torch.zeros_like(new)
+        if not bool(arriving.any()):
+            return moved
         key = row * STRIDE
-        for agent in arriving:
+        if not self.rooted and not bool(self.known[:row].any()):
+            self._root(key, arriving)
+            moved[:row] |= self.placed[:row]
+        for agent in arriving.nonzero()[:, 0].tolist():
             T_world_key = self.T_world_can[:, key, agent]
             key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
-            if not self.rooted and not bool(self.known[:row].any()) and agent == arriving[0]:
-                expected = self.T_world_can[:, key - 1, agent] @ step_between(
-                    self.T_world_can[:, :key, agent], key_step
-                )
-                shift = (T_world_key @ inverse(expected))[:, None, None]
-                there = self.placed[:row].repeat_interleave(STRIDE, dim=0).to(shift.device)[..., None, None]
-                now = self.T_world_can[:, :key]
-                self.T_world_can[:, :key] = torch.where(there, project_se2(shift @ now), now)
-                moved[:row] |= self.placed[:row]
             gap = (self.placed & ~self.known)[:row, agent]
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
@@ -302,6 +318,19 @@ class Canvas:
             self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
             moved[start:row, agent] = True
         return moved
+
+    def _root(self, key: int, arriving: Tensor) -> None:
+        """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
+        there = self.given.present & arriving.to(self.given.device)
+        scene, lead = torch.arange(len(there), device=there.device), first_of(there)
+        T_world_key = self.T_world_can[scene, key, lead]
+        key_step = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
+        path = self.T_world_can[scene, :key, lead]
+        shift = T_world_key @ inverse(path[:, -1] @ step_between(path, key_step))
+        shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
+        placed = self._by_frame(self.placed[: key // STRIDE])[..., None, None]
+        now = self.T_world_can[:, :key]
+        self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
     def scene(self, canvas: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
         """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
@@ -327,6 +356,11 @@ class Canvas:
 
     def _by_frame(self, rows: Tensor) -> Tensor:
         return rows.repeat_interleave(STRIDE, dim=0).to(self.given.device)
+
+
+def first_of(mask: Tensor) -> Tensor:
+    """The first agent of each scene for whom a mask holds; 0 where there is none. (B, P) bool -> (B,) int"""
+    return mask.int().argmax(dim=1)
 
 
 def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:

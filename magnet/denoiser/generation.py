@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -12,10 +13,12 @@ from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pa
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tokenizer.module import Tokenizer
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,37 @@ class SamplerOptions:
     paste: bool = True
     blend: int = 10
     guidance: Guidance = field(default_factory=Guidance)
+
+
+def occupied(scene: Scene) -> int:
+    """Slots up to the last that anybody is in, in any of the scenes: plans are made for people, not for free slots.
+
+    Raises:
+        ValueError: a scene has nobody in it.
+    """
+    empty = (~scene.present.any(dim=1)).nonzero()[:, 0].tolist()
+    if empty:
+        raise ValueError(f"{label(scene, empty[0])} has nobody in it: nothing can be sampled")
+    return int(scene.present.any(dim=0).nonzero()[-1]) + 1
+
+
+def require_people(schedule: MaskSchedule, scene: Scene) -> None:
+    """Raises ValueError where a scene has nobody to be generated, or nobody to be given if somebody is."""
+    generated = (schedule.finished & ~schedule.known).any(dim=0)
+    given = schedule.known.any(dim=0) & ~generated
+    for agents, what in ((generated, "generated"), (given, "given")):
+        lacking = (~(scene.present.cpu() & agents).any(dim=1)).nonzero()[:, 0].tolist()
+        if bool(agents.any()) and lacking:
+            slots = ", ".join(str(slot) for slot in agents.nonzero()[:, 0].tolist())
+            raise ValueError(
+                f"{label(scene, lacking[0])} has nobody in slot {slots}, of whom the task wants somebody to be {what}: "
+                "choose other slots for the task, or scenes with people in these"
+            )
+
+
+def label(scene: Scene, number: int) -> str:
+    """A scene of a batch as messages call it."""
+    return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
 
 
 def reach(model: Denoiser) -> tuple[int, int]:
@@ -82,13 +116,44 @@ def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) 
     return scene.replace(body_rot=body_rot, T_world_root=T_world_root, valid=None)
 
 
-def known_tokens(model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None) -> Tensor:
+def sight(schedule: MaskSchedule) -> Tensor:
+    """How far a known token's code may look ahead: up to which row, exclusive. -> (N, P) int
+
+    The first stage that hides what comes after a token settles it, as it would live: later frames of that agent do
+    not exist yet. N where no stage hides anything from everybody.
+    """
+    cuts = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
+    done = [0] * schedule.agents
+    for stage in schedule.stages:
+        if stage.hidden is None:
+            continue
+        gone = stage.hidden.all(dim=0) & schedule.known[stage.start : stage.stop]  # (W, P)
+        for agent in gone.any(dim=0).nonzero()[:, 0].tolist():
+            cut = stage.start + int(gone[:, agent].int().argmax())
+            cuts[done[agent] : cut, agent] = cut
+            done[agent] = max(done[agent], cut)
+    return cuts
+
+
+def task_sight(task: Task, grid: Grid) -> Tensor:
+    """`sight` by what a task hides, whether or not a window on this grid would show it. -> (N, P) int
+
+    A window that ends where a block does has nothing to hide, so the task is asked where the window goes on.
+    """
+    roomy = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, rolling=0)
+    return torch.minimum(sight(task.schedule(grid)), sight(task.schedule(roomy)))
+
+
+def known_tokens(
+    model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, cuts: Tensor | None = None
+) -> Tensor:
     """Normalised tokens of what is known; other tokens hold nothing of use. known (N, P) -> (B, N, P, D)
 
     Each agent's unbroken stretches are encoded alone: an encoder that looks ahead must not see beyond
-    them. Pairwise transforms are those of `related`, by default the same scene. A step into a stretch from an
-    unknown frame cannot be known either; the stretch's own next step stands in for it, which leaves a smaller
-    misfit at keyframes than standing still does. At the very beginning nobody has come from anywhere.
+    them, nor beyond `cuts` (N, P), see `sight`; where that is 0, the code is not wanted. Pairwise transforms are
+    those of `related`, by default the same scene. A step into a stretch from an unknown frame cannot be known
+    either; the stretch's own next step stands in for it, which leaves a smaller misfit at keyframes than standing
+    still does. At the very beginning nobody has come from anywhere.
     """
     N, P = known.shape
     like = given.T_world_root
@@ -96,13 +161,36 @@ def known_tokens(model: Denoiser, given: Scene, known: Tensor, related: Scene | 
     steps = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
     for start, stop, agents in stretches(known):
         part = given.cut(start * STRIDE, stop * STRIDE).order(torch.tensor(agents, device=like.device))
-        latent[:, start:stop, agents] = model.encode(part)
+        for low, first, last, cut, those in encodings(start, stop, agents, cuts, reach(model)[0]):
+            seen = given.cut(low * STRIDE, cut * STRIDE).order(torch.tensor(those, device=like.device))
+            latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
         own = by_token(to_9d(canonical_steps(canonical_frame(part.T_world_root))))
         if start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
         steps[:, start:stop, agents] = own
     relations = relations_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
     return model.statistics.normalise(model.layout.pack(latent, steps, relations))
+
+
+def encodings(
+    start: int, stop: int, agents: list[int], cuts: Tensor | None, behind: int
+) -> list[tuple[int, int, int, int, list[int]]]:
+    """What to encode of a known stretch, as (low, first, last, cut, agents): rows [first, last) from rows [low, cut).
+
+    Rows that look up to the end are encoded with the whole stretch, others with all the `behind` rows that their
+    codes depend on, and one more, so that an artificial beginning is not seen.
+    """
+    if cuts is None:
+        return [(start, start, stop, stop, agents)]
+    found: dict[tuple[int, int, int, int], list[int]] = {}
+    for agent in agents:
+        ends = cuts[start:stop, agent].clamp(max=stop)
+        for cut in ends[ends > 0].unique().tolist():
+            rows = (ends == cut).nonzero()[:, 0] + start
+            first, last = int(rows[0]), int(rows[-1]) + 1
+            low = start if cut == stop else max(start, first - behind - 1)
+            found.setdefault((low, first, last, cut), []).append(agent)
+    return [(*rows, those) for rows, those in found.items()]
 
 
 def stretches(known: Tensor) -> list[tuple[int, int, list[int]]]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.canvas import Canvas, Health
-from magnet.denoiser.generation import SamplerOptions, known_tokens, reach, scrub
+from magnet.denoiser.generation import SamplerOptions, known_tokens, occupied, reach, require_people, scrub, task_sight
 from magnet.denoiser.seams import joined
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
@@ -60,7 +60,8 @@ def generate(
         Scene of B * samples, context + frames frames, the given frames included.
 
     Raises:
-        ValueError: context is not a whole number of tokens, or the scene's slots do not fit the model.
+        ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
+            scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
     return joined(list(stream(model, scene, task, context, frames, samples, options, generator, progress, health)))
 
@@ -130,15 +131,20 @@ class Stream:
         o = self.options
         tokens = model.window if self.frames is None else -(-self.frames // STRIDE)
         past = context // STRIDE
-        grid = Grid(max(tokens, past), layout.agents, past, o.steps, model.window, o.stride, o.rolling)
+        grid = Grid(max(tokens, past), occupied(scene), past, o.steps, model.window, o.stride, o.rolling)
         self.rows: float = grid.tokens
         if frames is None:
-            schedule, self.plan = endless(task, grid)
+            schedule, self.plan = endless(task, grid, layout.agents)
             self.rows = torch.inf
         else:
-            schedule = task.schedule(grid)
+            schedule = task.schedule(grid).padded(layout.agents)
             self.plan = planned(schedule)
+        require_people(schedule, self.scene)
         self.known = schedule.known
+        self.cuts: Tensor | None = None  # how far codes look ahead; matters only where something is given later
+        if frames is not None and bool(self.known[past:].any()):
+            free = layout.agents - grid.agents
+            self.cuts = torch.nn.functional.pad(task_sight(task, grid), (0, free), value=grid.tokens)
         # The paper read literally: a known token holds its relations to everybody, also to those not known. It leaks.
         self.related: Tensor | None = None
         if layout.relation_noise == "token":
@@ -220,12 +226,21 @@ class Stream:
             given = scrub(self.scene, self.known, low, high)
             related = None if self.related is None else scrub(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
-            tokens = known_tokens(self.model, given, known, related)[:, part].repeat_interleave(self.samples, dim=0)
+            tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
+            tokens = tokens.repeat_interleave(self.samples, dim=0)
             fresh, veil = self.noise.rows(last - self.stop)
             self.tokens = torch.cat([self.tokens, begin(tokens, fresh, known[part], self.model.layout)], dim=1)
             self.veil = torch.cat([self.veil, veil], dim=1)
             self.canvas.extend(given.cut(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last
+
+    def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
+        """How far the codes of some of the rows [low, high) look ahead, counted from `low`; 0 for the others."""
+        if self.cuts is None:
+            return None
+        cuts = torch.zeros_like(self.cuts[low:high])
+        cuts[part] = (self.cuts[low:high][part] - low).clamp(max=high - low)
+        return cuts
 
     def _known(self, first: int, stop: int) -> Tensor:
         """Rows [first, stop) of what is known; nothing is, beyond the plan of a scene without end."""
@@ -267,14 +282,17 @@ def lows(schedule: MaskSchedule) -> list[int]:
     return found
 
 
-def endless(task: Task, grid: Grid) -> tuple[MaskSchedule, Plan]:
+def endless(task: Task, grid: Grid, slots: int) -> tuple[MaskSchedule, Plan]:
     """The beginning of a scene without end, and its plan: that of a long scene, the end of which is repeated.
+
+    `slots` are the model's, free ones included.
 
     Raises:
         ValueError: the plan depends on the scene's end, or does not repeat itself.
     """
     long, longer = (
-        task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)) for windows in (6, 7)
+        task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
+        for windows in (6, 7)
     )
     name = type(task).__name__
     if bool(longer.known[grid.context :].any()):

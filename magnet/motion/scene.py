@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -181,15 +182,16 @@ class Scene:
         try:
             with np.load(path, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
-                arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
-            version, facts = meta["format"], {"fps": meta["fps"], "body": meta["body"], "names": tuple(meta["names"])}
+                arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
+            version = meta["format"]
+            arrays |= {"fps": meta["fps"], "body": meta["body"], "names": tuple(meta["names"])}
         except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error
         if version > SCENE_FORMAT:
             raise ValueError(f"{path}: scene format {version}, this version reads up to {SCENE_FORMAT}")
-        return Scene(**arrays, **facts)
+        return Scene(**arrays)
 
 
 def absent(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.noise import LEVELS, add_noise
+from magnet.sampling.noise import LEVELS, alpha_bar
 
 if TYPE_CHECKING:
     from magnet.sampling.sampler import DenoiseFn
@@ -44,25 +44,40 @@ class Guidance:
         if not 0 <= self.context_level < LEVELS:
             raise ValueError(f"context_level: got {self.context_level}, expected 0 to {LEVELS - 1}")
 
-    def branches(self, agents: int) -> Tensor:
-        """Whose history each branch sees, the unguided one first. -> (K, P) bool, no two alike"""
-        everybody = torch.ones(1, agents, dtype=torch.bool)
+    def branches(self, there: Tensor) -> Tensor:
+        """Whose history each branch sees, the unguided one first; slots that are free everywhere see and tell nothing.
+
+        there (P,) bool, slots that somebody is in -> (K, P) bool, no two alike
+        """
+        everybody, nobody = there[None], torch.zeros_like(there)[None]
         if self.kind == "none":
             return everybody
-        eye = torch.eye(agents, dtype=torch.bool)
-        special = {"history": everybody[:0], "self": eye, "partner": ~eye}[self.kind]
+        special = {"history": nobody, "self": self.alone(there), "partner": ~self.alone(there) & there}[self.kind]
         kept: list[Tensor] = []
-        for row in torch.cat([everybody, ~everybody, special]):
+        for row in torch.cat([everybody, nobody, special[there] if self.kind != "history" else special]):
             if not any(torch.equal(row, other) for other in kept):
                 kept.append(row)
         return torch.stack(kept)
 
+    @staticmethod
+    def alone(there: Tensor) -> Tensor:
+        """Each slot by itself. (P,) bool -> (P, P) bool"""
+        return torch.eye(len(there), dtype=torch.bool, device=there.device)
+
     def apply(
-        self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
+        self,
+        denoise: DenoiseFn,
+        tokens: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        veil: Tensor,
+        layout: TokenLayout,
+        moves: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """The noisy tokens that the next step starts from, which smoothing moves, and the guided prediction.
 
-        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D) twice
+        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P), moves bool, which numbers the step denoises
+        -> (B, W, P, D) twice
         """
         if not self.smooth:
             return tokens, self.predict(denoise, tokens, levels, present, veil, layout)
@@ -72,8 +87,7 @@ class Guidance:
             still = levels.clone(), present.clone(), veil.clone()
             clean = self.predict(denoise, noisy, *still, layout)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
-        noised = layout.spread(layout.group_levels(levels)) > 0
-        return torch.where(noised, tokens - self.smooth * slope, tokens), clean.detach()
+        return torch.where(moves, tokens - self.smooth * slope, tokens), clean.detach()
 
     def predict(
         self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
@@ -84,13 +98,13 @@ class Guidance:
         tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
         """
         B, _, P, _ = tokens.shape
-        sees = self.branches(P).to(tokens.device)  # (K, P)
+        there = present.any(dim=0)
+        sees = self.branches(there)  # (K, P)
         clean = levels == 0
         if self.context_level:
-            levels = levels.clamp_min(self.context_level)
-            groups = layout.spread(layout.group_levels(levels))
-            faint = add_noise(tokens, veil, groups)
-            tokens = torch.where(layout.spread(layout.group_levels((~clean).long())) == 0, faint, tokens)
+            told = torch.where(clean, self.context_level, levels)
+            tokens = noisier(tokens, veil, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
+            levels = told
         if len(sees) == 1:
             return denoise(tokens, levels, present)
         forgotten = clean[:, None] & ~sees[None, :, None]  # (B, K, W, P)
@@ -99,27 +113,32 @@ class Guidance:
         unknown = (layout.spread(layout.group_levels(shown)) == LEVELS) & (was < LEVELS)
         views = torch.where(unknown, veil[:, None], tokens[:, None])
         K = len(sees)
-        clean = denoise(
+        clean_of = denoise(
             views.flatten(0, 1), shown.flatten(0, 1), present[:, None].expand(B, K, P).flatten(0, 1)
         ).unflatten(0, (B, K))
 
         def branch(row: Tensor) -> Tensor:
-            return clean[:, int((sees == row.to(sees.device)).all(dim=1).nonzero()[0, 0])]
+            return clean_of[:, int((sees == row).all(dim=1).nonzero()[0, 0])]
 
-        everybody = torch.ones(P, dtype=torch.bool)
-        cond, uncond = branch(everybody), branch(~everybody)
+        cond, uncond = branch(there), branch(torch.zeros_like(there))
         if self.kind == "history":
             special = cond
         else:
-            eye = torch.eye(P, dtype=torch.bool)
-            rows = eye if self.kind == "self" else ~eye
-            each = torch.stack([branch(row) for row in rows])  # (P branches, B, W, P, D)
+            rows = self.alone(there) if self.kind == "self" else ~self.alone(there) & there
+            each = torch.stack([branch(row) if here else cond for row, here in zip(rows, there, strict=True)])
             if self.literal:
-                special = each.mean(dim=0)
+                total = torch.where(present.T[..., None, None, None], each, 0.0).sum(dim=0)
+                special = total / present.sum(dim=1).view(-1, 1, 1, 1)
             else:
                 agent = torch.arange(P, device=tokens.device)
                 special = each[agent, :, :, agent].permute(1, 2, 0, 3)
         return cond + self.weight * (special - uncond)
+
+
+def noisier(tokens: Tensor, noise: Tensor, now: Tensor, wanted: Tensor) -> Tensor:
+    """Noise added to numbers (..., D) of levels `now` wherever a higher level is wanted."""
+    share = alpha_bar(wanted) / alpha_bar(now).clamp_min(1e-12)
+    return torch.where(wanted > now, share.sqrt() * tokens + (1 - share).clamp_min(0).sqrt() * noise, tokens)
 
 
 def roughness(clean: Tensor, present: Tensor) -> Tensor:

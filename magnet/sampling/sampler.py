@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, ddim_step
@@ -21,9 +22,10 @@ class DenoiseFn(Protocol):
     def __call__(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor: ...
 
 
-Settle = Callable[[Tensor, Tensor], Tensor]
-"""Called after each stage with the canvas (B, N, P, D) and which tokens it finished (N, P) bool; returns the
-canvas with those tokens made self-consistent (codes snapped, transforms recomputed from world poses)."""
+Settle = Callable[[Tensor, Tensor, bool], Tensor]
+"""Called after each stage with the canvas (B, N, P, D), which tokens it finished (N, P) bool, and whether it hid from
+somebody what it generated of others; returns the canvas with those tokens made self-consistent (codes snapped,
+transforms recomputed from world poses)."""
 
 
 @torch.no_grad()
@@ -94,7 +96,7 @@ def run_stages(
         if settle is not None:
             finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
             finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
-            canvas = settle(canvas, finished)
+            canvas = settle(canvas, finished, stage.apart)
     return canvas
 
 
@@ -115,7 +117,8 @@ def run_stage(
     for now, after in pairwise(levels):
         if hidden is None:
             each = now.expand(len(tokens), -1, -1)
-            tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout)
+            moves = layout.spread(layout.group_levels(now) != layout.group_levels(after))
+            tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout, moves)
             tokens = _step(tokens, clean, now, after, layout)
         else:
             tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance)
@@ -142,15 +145,17 @@ def _step_in_views(
 ) -> Tensor:
     """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
-    Agents that see the same share a view.
+    Agents that see the same share a view. A relation to somebody hidden is unknown too; it is updated from that
+    agent's view if that one sees both, or else stays noise.
     """
     B, W, P, _ = tokens.shape
-    hidden, view_of = hidden.unique(dim=0, return_inverse=True)
-    V = len(hidden)
-    seen_now = torch.where(hidden, LEVELS, now)  # (V, W, P)
-    seen_after = torch.where(hidden, LEVELS, after)
+    views_hidden, view_of = hidden.unique(dim=0, return_inverse=True)
+    V = len(views_hidden)
+    seen_now = torch.where(views_hidden, LEVELS, now)  # (V, W, P)
+    seen_after = torch.where(views_hidden, LEVELS, after)
     group = layout.spread(layout.group_levels(seen_now))  # (V, W, P, D)
-    # A relation to somebody hidden is unknown too, although the token that carries it is not.
+    group_after = layout.spread(layout.group_levels(seen_after))
+    # Shown at level K although it is further on: what it holds must not be seen.
     unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
     views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
     moved, clean = guidance.apply(
@@ -160,9 +165,23 @@ def _step_in_views(
         present[:, None].expand(B, V, P).flatten(0, 1),
         veil[:, None].expand_as(views).flatten(0, 1),
         layout,
+        (group != group_after).expand_as(views).flatten(0, 1),
     )
     moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
     moved = torch.where(unknown, tokens[:, None], moved)
-    stepped = ddim_step(moved, clean, group, layout.spread(layout.group_levels(seen_after)))
-    agent = torch.arange(P, device=tokens.device)
-    return stepped[:, view_of, :, agent].permute(1, 2, 0, 3)
+    stepped = ddim_step(moved, clean, group, group_after)
+    source = layout.spread(_views_to_read(hidden, view_of, layout))  # (W, P, D)
+    return stepped.gather(1, source.expand(B, 1, W, P, -1))[:, 0]
+
+
+def _views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tensor:
+    """From which view each group of each token is read. hidden (P, W, P), view_of (P,) -> (W, P, 1 + slots) int"""
+    P, W = hidden.shape[:2]
+    own = view_of.expand(W, P)[..., None]
+    if not layout.slots:
+        return own
+    partner = partners(P, hidden.device)  # (P, slots)
+    unseen = hidden.transpose(0, 1)  # (W, P viewer, P viewed)
+    agent = torch.arange(P, device=hidden.device)[:, None]
+    blind = unseen[:, agent, partner] & ~unseen[:, partner, agent]  # who sees one is not seen
+    return torch.cat([own, torch.where(blind, view_of[partner], own)], dim=-1)

@@ -73,6 +73,22 @@ class Stage:
     def stop(self) -> int:
         return self.start + self.levels.shape[1]
 
+    @property
+    def apart(self) -> bool:
+        """Whether some agent does not see what this stage generates of another."""
+        generated = (self.levels[0] > 0) & (self.levels[0] != self.levels[-1])
+        return self.hidden is not None and bool((self.hidden & generated).any())
+
+    def padded(self, agents: int) -> Stage:
+        """The same with free slots behind, of which nothing is known and nothing generated."""
+        extra = agents - self.levels.shape[2]
+        levels = torch.nn.functional.pad(self.levels, (0, extra), value=LEVELS)
+        hidden = self.hidden
+        if hidden is not None and extra:
+            hidden = torch.nn.functional.pad(hidden, (0, extra))
+            hidden = torch.cat([hidden, hidden[:1].expand(extra, -1, -1)])  # nobody's view: one that is there already
+        return Stage(self.start, levels, hidden)
+
 
 @dataclass(frozen=True, eq=False)
 class MaskSchedule:
@@ -123,6 +139,11 @@ class MaskSchedule:
             if idle.any():
                 raise ValueError(f"stage {number}: denoising step {int(idle.nonzero()[0])} changes nothing")
             level[stage.start : stage.stop] = rows[-1]
+
+    def padded(self, agents: int) -> MaskSchedule:
+        """The same plan with free slots behind, of which nothing is known and nothing generated."""
+        known = torch.nn.functional.pad(self.known, (0, agents - self.agents))
+        return MaskSchedule(self.tokens, agents, tuple(stage.padded(agents) for stage in self.stages), known)
 
     @property
     def evaluations(self) -> int:
@@ -186,9 +207,7 @@ class MaskSchedule:
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
     @staticmethod
-    def roll(
-        known: Tensor, target: Tensor, grid: Grid, unseen: Tensor | None = None, lookahead: bool = True
-    ) -> MaskSchedule:
+    def roll(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
         """Denoise along a slope: each token `grid.rolling` denoising steps behind the one before it in time.
 
         A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
@@ -198,29 +217,22 @@ class MaskSchedule:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated.
             grid: sizes; `grid.rolling` is the slope.
-            unseen: (P, P) bool; unseen[p, q]: agent p does not see what agent q has not finished.
-            lookahead: False: nobody sees what is known after the token that is being finished.
         """
         plan = ddim_levels(grid.steps)
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
-        place = torch.full((grid.tokens,), -1)
-        place[wanted] = torch.arange(len(wanted))
+        first = wanted[0] if wanted else 0
         level, stages = initial_levels(known), []
-        for number, token in enumerate(wanted):
-            ends = grid.steps + number * grid.rolling
-            begins = ends - grid.rolling if number else 0
+        ended = 0
+        for token in wanted:
+            begins, ended = ended, grid.steps + (token - first) * grid.rolling
             start = max(0, min(token + grid.rolled, grid.tokens) - grid.window)
             stop = min(start + grid.window, grid.tokens)
-            turn = torch.arange(begins, ends + 1)[:, None] - grid.rolling * place[start:stop]  # (rows, W)
-            planned = plan[turn.clamp(0, grid.steps)][..., None]
-            rows = torch.where(target[start:stop], planned, level[start:stop])
-            hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
-            if unseen is not None:
-                hidden[:, token - start :] = unseen[:, None]
-            if not lookahead:
-                hidden[:, token + 1 - start :] |= known[token + 1 : stop]
-            hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
-            stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
+            behind = grid.rolling * (torch.arange(start, stop) - first)
+            turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
+            rows = torch.where(target[start:stop], plan[turn.clamp(0, grid.steps)][..., None], level[start:stop])
+            changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
+            rows = torch.cat([rows[:1], rows[1:][changes]])
+            stages.append(Stage(start, rows.short()))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
@@ -246,15 +258,13 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is longer than the window, or agents wait and `grid.rolling` is asked for.
+            ValueError: the block is longer than the window, or `grid.rolling` is asked for.
         """
-        if grid.rolling and delay is not None and bool(delay.any()):
-            raise ValueError(
-                "rolling: agents that take turns cannot roll, for who is ahead would see the others' past late; "
-                "leave rolling at 0, or give an offset of 0"
-            )
         if grid.rolling:
-            return MaskSchedule.roll(known, target, grid, unseen, lookahead)
+            raise ValueError(
+                "rolling: here agents act on what they have seen of each other, and a token begun ahead of time would "
+                "be half made up by then; leave rolling at 0"
+            )
         if not 1 <= block <= grid.window:
             raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay

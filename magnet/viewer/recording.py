@@ -201,7 +201,7 @@ class RecordedStream(Stream):
         self.levels.append(self.level.to("cpu", torch.int16))
         self.starts.append(stage.start * STRIDE)
         wanted = stage.levels[-1] < LEVELS  # the others stay unknown
-        self.windows.append(preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted))
+        self.windows.append(preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted, stage.apart))
 
 
 def own_view(clean: Tensor, stage: Stage) -> Tensor:
@@ -217,10 +217,11 @@ def own_view(clean: Tensor, stage: Stage) -> Tensor:
     return each[view_of, :, agent].transpose(0, 1)[None]
 
 
-def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor) -> Scene:
+def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, apart: bool = False) -> Scene:
     """A window as the model expects it to end, placed in the world; the canvas stays as it is.
 
-    tokens (1, N, P, D), estimate (1, W, P, D) normalised, wanted (W, P) bool: ever to be generated. -> W frames
+    tokens (1, N, P, D), estimate (1, W, P, D) normalised, wanted (W, P) bool: ever to be generated; apart as for
+    `Canvas.settle`. -> W frames
     """
     shown = copy.copy(canvas)
     shown.T_world_can, shown.placed = canvas.T_world_can.clone(), canvas.placed.clone()
@@ -231,4 +232,4 @@ def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted
     whole = tokens.clone()
     fresh = finished[first:stop, :, None].to(whole.device)
     whole[:, first:stop] = torch.where(fresh, estimate, whole[:, first:stop])
-    return shown.scene(shown.settle(whole, finished), first, stop).to("cpu")
+    return shown.scene(shown.settle(whole, finished, apart), first, stop).to("cpu")

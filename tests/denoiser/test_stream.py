@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from magnet.denoiser.canvas import Canvas, Health
-from magnet.denoiser.generation import SamplerOptions, known_tokens, reach, scrub
+from magnet.denoiser.generation import SamplerOptions, known_tokens, reach, scrub, task_sight
 from magnet.denoiser.seams import joined
 from magnet.denoiser.stream import Stream, endless, lows
 from magnet.motion.scene import Scene
@@ -53,7 +53,7 @@ def at_once(model, scene: Scene, task, context: int, frames: int, options: Sampl
     schedule = task.schedule(grid)
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, options, 1)
-    start = known_tokens(model, given, schedule.known)
+    start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid))
     generator = torch.Generator().manual_seed(seed)
     out = sample(
         model.denoise, schedule, start, given.present, model.layout, generator, canvas.settle, guidance=options.guidance
@@ -199,9 +199,9 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
     low = iter(lows(schedule))
     before: list[tuple[torch.Tensor, torch.Tensor]] = [(torch.empty(0), canvas.T_world_can.clone())]
 
-    def settle(tokens: torch.Tensor, finished: torch.Tensor) -> torch.Tensor:
+    def settle(tokens: torch.Tensor, finished: torch.Tensor, apart: bool) -> torch.Tensor:
         first = next(low)
-        after = canvas.settle(tokens.clone(), finished)
+        after = canvas.settle(tokens.clone(), finished, apart)
         old_tokens, old_world = before[-1]
         if len(old_tokens):
             assert torch.equal(old_tokens[:, :first], after[:, :first])
@@ -245,7 +245,7 @@ def test_a_plan_that_does_not_repeat_itself_needs_an_end():
             return type(plan)(plan.tokens, plan.agents, plan.stages[:1], plan.known)
 
     with pytest.raises(ValueError, match="does not repeat itself"):
-        endless(Odd(), Grid(4, 3, 2, 2, 8, 2))
+        endless(Odd(), Grid(4, 3, 2, 2, 8, 2), 3)
 
 
 def test_bad_requests_are_named_before_anything_is_sampled(model, recording):

@@ -40,6 +40,11 @@ def run(given, **options) -> Tensor:
     return Guidance(**options).predict(model, tokens, levels, present, veil, LAYOUT)
 
 
+def moves(levels: Tensor) -> Tensor:
+    """A step that takes all that is noisy on."""
+    return LAYOUT.spread(LAYOUT.group_levels(levels)) > 0
+
+
 def test_without_guidance_nothing_changes(given):
     tokens, levels, present, _ = given
     assert torch.equal(run(given), model(tokens, levels, present))
@@ -88,7 +93,8 @@ def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
     tokens, levels, present, veil = given
     Guidance(guide).predict(counting, tokens, levels, present, veil, LAYOUT)
     assert sizes == [2 * count]
-    assert len(Guidance(guide).branches(2)) == min(count, 4)
+    assert len(Guidance(guide).branches(torch.ones(2, dtype=torch.bool))) == min(count, 4)
+    assert len(Guidance(guide).branches(torch.tensor([True, True, False, False]))) == min(count, 4)
 
 
 # -- what is finished, shown faintly -----------------------------------------------------------
@@ -141,7 +147,7 @@ def test_smoothing_follows_the_slope_through_the_denoiser(given):
     """Against finite differences in float64."""
     tokens, levels, present, veil = given
     tokens = tokens.double()
-    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, veil, LAYOUT)
+    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))
     assert torch.equal(clean, model(tokens, levels, present))
     for place in ((0, 4, 0, 0), (1, 5, 2, 3), (0, 5, 1, -1)):
         shift = torch.zeros_like(tokens)
@@ -155,7 +161,7 @@ def test_smoothing_follows_the_slope_through_the_denoiser(given):
 def test_smoothing_goes_with_every_guidance_and_leaves_known_numbers_alone(given, kind):
     tokens, levels, present, veil = given
     guidance = Guidance(kind, smooth=0.3)
-    moved, clean = guidance.apply(model, tokens, levels, present, veil, LAYOUT)
+    moved, clean = guidance.apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))
     known = LAYOUT.spread(LAYOUT.group_levels(levels)) == 0
     assert torch.equal(moved[known], tokens[known])
     assert not torch.allclose(moved[~known], tokens[~known])
@@ -165,9 +171,11 @@ def test_smoothing_goes_with_every_guidance_and_leaves_known_numbers_alone(given
 def test_smoothing_works_in_inference_mode(given):
     with torch.inference_mode():
         inside = tuple(x + 0 for x in given)
-        moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT)
+        moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT, moves(inside[1]))
     tokens, levels, present, veil = given
-    assert torch.equal(moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT)[0])
+    assert torch.equal(
+        moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))[0]
+    )
 
 
 def test_smoothing_makes_samples_smoother(generator):
@@ -189,3 +197,54 @@ def test_smoothing_makes_samples_smoother(generator):
         return float(roughness(out[:, 4:], there))
 
     assert rough(0.05) < 0.9 * rough(0.0)
+
+
+def test_smoothing_leaves_alone_what_the_step_does_not_denoise(given):
+    """A token that stays at pure noise must stay noise, however many steps go by."""
+    tokens, levels, present, veil = given
+    step = moves(levels)
+    step[:, 5] = False
+    moved, _ = Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT, step)
+    assert torch.equal(moved[:, 5], tokens[:, 5])
+    assert not torch.equal(moved[:, 4], tokens[:, 4])
+
+
+def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
+    tokens, levels, present, veil = given
+    levels = levels.clone()
+    levels[:, 4:] = 20
+    seen = []
+
+    def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
+        seen.append((noisy, shown))
+        return model(noisy, shown, present)
+
+    Guidance(context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    noisy, shown = seen[0]
+    assert (shown[:, 4:] == 20).all()
+    assert torch.equal(noisy[:, 4:], tokens[:, 4:])
+
+
+# -- free slots --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("literal", [False, True])
+@pytest.mark.parametrize("kind", ["history", "self", "partner"])
+def test_free_slots_change_nothing_in_guidance(kind, literal, generator):
+    """Two people in two slots, and the same two in four: a model that looks at those present alone."""
+    layout = TokenLayout(latent=4, agents=4, relations=False)
+
+    def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        there = present[:, None, :, None]
+        seen = torch.where(there, noisy * (1 + levels[..., None] / LEVELS), 0.0)
+        return torch.tanh(noisy + seen.sum(dim=(1, 2), keepdim=True) / present.sum(dim=1).view(-1, 1, 1, 1))
+
+    tokens, veil = (torch.randn(3, 6, 4, layout.width, generator=generator) for _ in range(2))
+    levels = torch.zeros(3, 6, 4, dtype=torch.long)
+    levels[:, 4:] = 600
+    there = torch.tensor([True, True, False, False]).expand(3, 4)
+    few = TokenLayout(latent=4, agents=2, relations=False)
+    guidance = Guidance(kind, literal=literal)
+    wide = guidance.predict(blind, tokens, levels, there, veil, layout)
+    narrow = guidance.predict(blind, tokens[:, :, :2], levels[:, :, :2], there[:, :2], veil[:, :, :2], few)
+    assert torch.allclose(wide[:, :, :2], narrow, atol=1e-5)

@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 
@@ -156,3 +156,48 @@ def test_what_a_view_hides_cannot_influence_it(generator):
 def test_grid_and_tokens_must_fit(generator):
     with pytest.raises(ValueError, match="tokens are 7 x 3"):
         run(GRID, torch.zeros(2, 7, 3, LAYOUT.width))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0])
+def test_in_every_view_numbers_are_as_noisy_as_they_are_said_to_be(offset, generator):
+    """The model believes levels; with a model that says 0, what is left at level k has the spread of noise at k."""
+    from magnet.tasks.agentic import AgenticAsync
+
+    grid = Grid(tokens=8, agents=3, context=4, steps=8, window=8)
+    layout = TokenLayout(latent=4, agents=3)
+    plan = AgenticAsync(offset, order=(1, 2, 0), block=2).schedule(grid)
+
+    def nothing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        share = (1 - alpha_bar(layout.group_levels(levels))).sqrt()
+        for group in range(3):
+            spread = noisy[..., layout.groups() == group].std(dim=(0, -1))
+            assert torch.allclose(spread, share[0, ..., group], atol=0.06), f"group {group}"
+        return torch.zeros_like(noisy)
+
+    def one_view(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        views = levels.flatten(1).unique(dim=0)
+        out = torch.zeros_like(noisy)
+        for view in views:
+            mine = (levels.flatten(1) == view).all(dim=1)
+            out[mine] = nothing(noisy[mine], levels[mine], present[mine])
+        return out
+
+    tokens = torch.zeros(400, 8, 3, layout.width)
+    sample(one_view, plan, tokens, torch.ones(400, 3, dtype=torch.bool), layout, generator)
+
+
+def test_a_relation_is_denoised_in_the_view_of_whoever_sees_both(generator):
+    from magnet.tasks.agentic import AgenticAsync
+
+    grid = Grid(tokens=6, agents=2, context=4, steps=6, window=6)
+    layout = TokenLayout(latent=4, agents=2)
+    plan = AgenticAsync(0.5).schedule(grid)
+    truth = torch.randn(2, 6, 2, layout.width, generator=generator)
+    stages = iter([stage for stage in plan.stages for _ in range(len(stage.levels) - 1)])
+
+    def oracle(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        stage = next(stages)
+        return truth[:, stage.start : stage.stop].repeat_interleave(len(noisy) // 2, dim=0)
+
+    out = sample(oracle, plan, truth, torch.ones(2, 2, dtype=torch.bool), layout, generator)
+    assert torch.equal(out, truth), "both relations too, without anybody putting them right afterwards"

@@ -115,15 +115,33 @@ def test_a_rolling_window_keeps_some_past_in_view():
         assert (stage.levels[0] == 0).all(dim=1).sum() >= 8 - 3 - 1
 
 
-def test_rolling_agents_in_step_do_not_see_what_the_others_have_not_finished():
+def test_plans_in_which_agents_see_each_other_as_they_are_cannot_roll():
     grid = Grid(24, 2, 4, steps=6, window=8, rolling=2)
-    plan = MaskSchedule.blocks(grid.past(), ~grid.past(), grid, unseen=~torch.eye(2, dtype=torch.bool))
-    for stage in plan.stages:
-        unfinished = stage.levels[-1] > 0
-        started = stage.levels[-1] < LEVELS
-        for p, q in ((0, 1), (1, 0)):
-            assert stage.hidden[p, :, q][(unfinished & started)[:, q]].all()
-            assert not stage.hidden[p, :, p].any(), "one always sees oneself"
+    with pytest.raises(ValueError, match="half made up"):
+        MaskSchedule.blocks(grid.past(), ~grid.past(), grid)
+
+
+def test_rolling_over_what_is_known_in_between():
+    grid = Grid(24, 2, 4, steps=6, window=8, rolling=2)
+    known = grid.past()
+    known[10:16] = True
+    plan = MaskSchedule.together(known, ~known, grid)
+    assert plan.finished.all()
+
+
+def test_padded_plans_know_and_generate_nothing_in_free_slots_and_add_no_view():
+    from magnet.tasks.agentic import AgenticAsync
+
+    plan = AgenticAsync(0.5).schedule(Grid(12, 2, 4, steps=4, window=8))
+    wide = plan.padded(4)
+    assert (wide.tokens, wide.agents) == (12, 4)
+    assert not wide.known[:, 2:].any()
+    assert (wide.final_levels()[:, 2:] == LEVELS).all()
+    assert torch.equal(wide.final_levels()[:, :2], plan.final_levels())
+    for stage, narrow in zip(wide.stages, plan.stages, strict=True):
+        assert len(stage.hidden.unique(dim=0)) == len(narrow.hidden.unique(dim=0))
+        assert torch.equal(stage.hidden[:2, :, :2], narrow.hidden)
+        assert stage.apart == narrow.apart
 
 
 @pytest.mark.parametrize(
