@@ -32,9 +32,16 @@ def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any]) ->
     print_table(
         results, title=f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     )
+    print(cost(results.meta["health"]))
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
     print(f"written: {folder / 'results.json'} and .csv")
+
+
+def cost(health: dict[str, float]) -> str:
+    """What sampling cost, in a line."""
+    calls, evaluations = health["calls"], health["evaluations"]
+    return f"sampling: {calls:.0f} network calls a batch, {evaluations:.0f} denoiser evaluations a scene"
 
 
 def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
@@ -61,7 +68,10 @@ def write_scenes(
     picture: str,
     pictures: int,
 ) -> None:
-    """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames."""
+    """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames.
+
+    What was sampled and what it cost is written beside them.
+    """
     from magnet.export.picture import contact_sheet
     from magnet.export.video import render_video
 
@@ -79,6 +89,9 @@ def write_scenes(
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
+    facts = evaluation.facts(model) | cli_record.provenance() | {"machine": machine()}
+    (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
+    print(cost(facts["health"]))
     print(f"written: {number} scenes of {evaluation.samples} samples to {folder / 'scenes'}")
 
 

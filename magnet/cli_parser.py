@@ -20,6 +20,9 @@ USAGE = (
 )
 
 
+SHARING = ("model", "data")
+"""Their classes have many fields in common, which help tells once. Of a task all fields are told."""
+
 REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
 
@@ -41,12 +44,28 @@ class Parser(LightningArgumentParser):
         if not self.command:
             return super().format_help(*args, **kwargs)
         self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
+        for key in self.classes:
+            self._name_choices(key)
         parts = [super().format_help(*args, **kwargs)]
         for key, classes in self.classes.items():
-            seen: set[str] = set()
+            shared: set[str] = set()
             for name, kind in classes.items():
-                parts.append(_fields_help(key, name, kind, seen))
+                parts.append(_fields_help(key, name, kind, shared if key in SHARING else set()))
         return "\n".join(parts)
+
+    def _name_choices(self, key: str) -> None:
+        """Head a group by what can be chosen, in place of class paths and of what base classes say of themselves."""
+        names = ", ".join(self.classes[key])
+        for group in self._action_groups:
+            for action in group._group_actions:
+                if f"--{key}.help" in action.option_strings:
+                    action.help = argparse.SUPPRESS
+                if f"--{key}" in action.option_strings:
+                    action.help = argparse.SUPPRESS
+                    path = action.default["class_path"] if action.default else ""
+                    default = f"; default: {path.rpartition('.')[2]}" if path else ""
+                    group.title = f"--{key} NAME"
+                    group.description = f"One of {names}{default}. What each is and its --{key}.FIELD VALUE is below."
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Say what is wrong, and the closest thing that would be right."""
@@ -124,19 +143,21 @@ def _options(key: str, kind: type) -> list[str]:
     return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
 
 
-def _fields_help(key: str, name: str, kind: type, seen: set[str]) -> str:
-    """Fields of one class as `--key.field`, less those that a class before it has too."""
+def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:
+    """Fields of one class as `--key.field`, less those that a class before it has told the same of."""
     parser = LightningArgumentParser(add_help=False, usage=argparse.SUPPRESS)
     parser.add_class_arguments(kind, key, fail_untyped=False)
-    shown: list[str] = []
+    told: set[str] = set()
     for action in parser._actions:
         flags = action.option_strings
-        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags) or seen & set(flags):
+        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags):
             action.help = argparse.SUPPRESS
-        else:
-            shown.extend(flags)
-    more = " (more fields as above)" if seen else ""
-    seen.update(shown)
+            continue
+        told.add(f"{flags} {action.default!r} {action.help}")
+        if f"{flags} {action.default!r} {action.help}" in shared:
+            action.help = argparse.SUPPRESS
+    more = " (more fields as above)" if told & shared else "" if told else " (no fields)"
+    shared |= told
     first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
     text = parser.format_help()
     lines = text.splitlines()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import inspect
 import re
@@ -19,12 +20,15 @@ ALIASES = "magnet.cli_tasks.aliases"
 SHOW_USAGE = "magnet tasks show NAME [--out FILE.png] [--people 2] [--task.FIELD VALUE]"
 
 
-class NamedTask:
-    """Base of what stands for each task while a command line is read: a class of the task's fields and its name.
+class NamedTask(abc.ABC):
+    """What is sampled: one of the tasks that `magnet tasks` lists."""
 
-    The parser resolves short names only for subclasses of one base that are imported; tasks share no base, and
-    their names are not their classes'.
-    """
+    # The parser resolves short names only for imported subclasses of one base. Tasks share no base, and their names
+    # are not their classes': each gets a stand-in of its fields under its name, with this as base.
+
+    @abc.abstractmethod
+    def schedule(self, grid: Any) -> Any:
+        """The task's own."""
 
 
 def aliases() -> dict[str, type]:

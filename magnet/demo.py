@@ -1,17 +1,23 @@
-"""`magnet demo`: the main job on the embedded default, from nothing to a table and pictures."""
+"""`magnet demo`: what one model does, from nothing to a table and pictures: everybody's future beside baselines, scenes
+from nothing, a partner filled in, agents that take turns, and a minute of motion from a second of it."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from magnet import cli_output, cli_record
+from magnet.body import Body
 from magnet.cli_run import quiet
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.generation import SamplerOptions
@@ -20,11 +26,52 @@ from magnet.evaluation import Evaluation, aligned
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
 from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.schedule import Grid
+from magnet.tasks.agentic import AgenticAsync
+from magnet.tasks.base import Task
 from magnet.tasks.joint import Generation, JointFuture
+from magnet.tasks.partner import PartnerInpainting
 
 CONTEXT, HORIZON = 32, 150
-SHOWN = (("handshake", 2), ("circle", 3), ("follow", 4))
-"""Coupling and number of people of the scenes that are drawn."""
+LONG = 1800
+"""Frames of the minute that one scene is continued for."""
+LONG_SHOWN = 10.0
+"""Seconds of it that the moving picture shows, the last ones."""
+COLUMNS = 9
+
+
+@dataclass(frozen=True)
+class Show:
+    """One scene of the demo.
+
+    Args:
+        name: of its files.
+        words: what is to be seen, for whoever runs the demo.
+        task: what is sampled.
+        scene: coupling and number of people of the test scene it starts from.
+        context: frames of it that are given.
+        frames: generated after them.
+        sampler: changes to the sampler's options.
+    """
+
+    name: str
+    words: str
+    task: Task
+    scene: tuple[str, int]
+    context: int = CONTEXT
+    frames: int = HORIZON
+    sampler: dict[str, Any] | None = None
+
+
+SHOWS = (
+    Show("joint_future", "three people's future, from a second of their past", JointFuture(), ("circle", 3)),
+    Show("duet", "two people from nothing", Generation(), ("handshake", 2), context=0),
+    Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
+    Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
+    Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
+    Show("minute", "a minute from a second", JointFuture(), ("circle", 2), frames=LONG, sampler={"rolling": 4}),
+)
 
 
 def main(arguments: Sequence[str] = ()) -> int:
@@ -49,9 +96,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     evaluation = measure(model, data, sampler, options.samples)
     facts = {"checkpoint": options.ckpt_path or "shipped"}
     cli_output.show_results(evaluation, out, facts)
-    console.rule("pictures")
-    for path in draw(model, data, sampler, out):
-        console.print(f"written: {path}")
+    for show in SHOWS:
+        console.rule(show.name)
+        for line in perform(show, model, data, sampler, out, options.minute):
+            console.print(line)
     console.rule(f"done in {time.perf_counter() - began:.0f} s")
     return 0
 
@@ -60,9 +108,10 @@ def parser() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser("magnet demo", description=__doc__)
     options.add_argument("--out", default="demo", help="folder for table and pictures (default: %(default)s)")
     options.add_argument("--ckpt_path", default=None, help="another model; default: the one that comes along")
-    options.add_argument("--scenes", type=int, default=15, help="test scenes (default: %(default)s)")
-    options.add_argument("--samples", type=int, default=5, help="samples of each (default: %(default)s)")
+    options.add_argument("--scenes", type=int, default=9, help="test scenes that are scored (default: %(default)s)")
+    options.add_argument("--samples", type=int, default=4, help="samples of each (default: %(default)s)")
     options.add_argument("--steps", type=int, default=30, help="denoising steps (default: %(default)s)")
+    options.add_argument("--minute", type=int, default=LONG, help="frames of the long scene (default: %(default)s)")
     return options
 
 
@@ -81,28 +130,58 @@ def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: 
     return evaluation
 
 
-def draw(model: Denoiser, data: Synthetic, sampler: SamplerOptions, out: Path) -> list[Path]:
-    """One scene each of two, three and four people continued, beside what was recorded; one from nothing."""
-    written = []
+def perform(
+    show: Show, model: Denoiser, data: Synthetic, sampler: SamplerOptions, out: Path, minute: int = LONG
+) -> list[str]:
+    """Sample a show's scene, write it, a strip and a moving picture. -> what to say about it"""
+    frames = min(show.frames, minute)
+    sampler = replace(sampler, **(show.sampler or {}))
+    truth = test_scene(data, *show.scene)
     generator = torch.Generator().manual_seed(data.seed)
-    body = data.body.to("cpu")
-    for coupling, people in SHOWN:
-        truth = test_scene(data, coupling, people)
-        sampled = model.generate(truth, JointFuture(), CONTEXT, HORIZON, 2, sampler, generator)
-        rows = [("truth", truth), ("magnet, sample 1", sampled.pick([0])), ("magnet, sample 2", sampled.pick([1]))]
-        name = f"joint_future_{people}_people"
-        moments = [0, 16, 31, 46, 76, 106, 136, 166, 181]
-        look = {"context_frames": CONTEXT, "body": body}
-        written.append(contact_sheet(rows, out / f"{name}.png", frames=moments, **look))  # type: ignore[arg-type]
-        written.append(render_video(rows, out / f"{name}.gif", size=(320, 240), fps=15, progress=True, **look))  # type: ignore[arg-type]
-        sampled.save(out / f"{name}.npz")
-    pair = test_scene(data, *SHOWN[0])
-    free = {"from nothing": model.generate(pair, Generation(), 0, HORIZON, 1, sampler, generator)}
-    written.append(contact_sheet(free, out / "generation.png", context_frames=0, body=body))
-    written.append(
-        render_video(free, out / "generation.gif", size=(480, 360), fps=15, context_frames=0, body=body, progress=True)
+    began = time.perf_counter()
+    sampled = model.generate(truth, show.task, show.context, frames, 1, sampler, generator)
+    seconds = time.perf_counter() - began
+    known = given(show, model, sampled)
+    sampled.save(out / f"{show.name}.npz")
+    rows = {show.words: sampled}
+    if known.any() and sampled.frames <= truth.frames:
+        rows = {"recorded": truth.cut(0, sampled.frames), show.words: sampled}
+    written = picture(show, rows, known, data.body.to("cpu"), out)
+    pace = sampled.frames / seconds
+    return [
+        f"{show.words}: {sampled.frames} frames in {seconds:.1f} s, {pace:.0f} frames a second",
+        *(f"written: {path}" for path in written),
+    ]
+
+
+def given(show: Show, model: Denoiser, sampled: Scene) -> Tensor:
+    """What of a scene the task gave. -> (T, P) bool"""
+    tokens = math.ceil(sampled.frames / STRIDE)
+    schedule = show.task.schedule(Grid(tokens, model.layout.agents, show.context // STRIDE, window=model.window))
+    return schedule.known.repeat_interleave(STRIDE, dim=0)[: sampled.frames]
+
+
+def picture(show: Show, rows: dict[str, Scene], known: Tensor, body: Body, out: Path) -> list[Path]:
+    """A strip of the whole scene, and a moving picture of it, or of its end if it is long."""
+    frames = next(iter(rows.values())).frames
+    moments = [round(i * (frames - 1) / (COLUMNS - 1)) for i in range(COLUMNS)]
+    sheet = contact_sheet(
+        rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, known=known, body=body
     )
-    return written
+    first = max(0, frames - round(30 * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
+    end = {words: scene.cut(first) for words, scene in rows.items()}
+    paint: Callable[..., Path] = render_video
+    moving = paint(
+        end,
+        out / f"{show.name}.gif",
+        size=(320, 240),
+        fps=10,
+        context_frames=max(0, show.context - first),
+        known=known[first:],
+        body=body,
+        progress=True,
+    )
+    return [sheet, moving]
 
 
 def test_scene(data: Synthetic, coupling: str, people: int) -> Scene:

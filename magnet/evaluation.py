@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.metrics import FrechetDistance, all_metrics, frechet_distance, ground_truth_metrics
 from magnet.metrics.frechet import moments
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import STRIDE
 from magnet.report import Results
 from magnet.sampling.schedule import Grid, MaskSchedule
@@ -38,9 +38,9 @@ CONFIDENCE = 0.95
 BASELINE_COMPOSED = 500
 """Composed training stretches that baselines choose from where test scenes are composed too."""
 
-Predictor = Callable[[Scene, int, torch.Generator], Scene]
-"""A method under test: whole test scenes, samples, randomness -> (B * samples, horizon, P). It must read of the
-scenes no more than its task gives."""
+Predictor = Callable[[Scene, int, Sequence[torch.Generator]], Scene]
+"""A method under test: whole test scenes, samples, a source of randomness for each of the B * samples scenes to make
+-> (B * samples, horizon, P). It must read of the scenes no more than its task gives."""
 
 
 @dataclass
@@ -52,7 +52,8 @@ class Evaluation:
         samples: scenes drawn for each test scene (paper 4; metrics.md B.0).
         options: how they are sampled.
         baselines: also measure nearest neighbour, random sample and held pose, aligned with the context and as found.
-        seed: test scene b of a batch draws the same noise whenever the seed is the same.
+        seed: all noise follows from it. A sample's is its own, whatever else is in the batch, so that scores do not
+            depend on the batch size.
         baseline_stride: frames between the starts of training stretches that baselines choose from.
     """
 
@@ -64,6 +65,8 @@ class Evaluation:
     baseline_stride: int = 15
     results: Results | None = field(default=None, init=False)
     progress: Callable[[int], None] | None = field(default=None, init=False)
+    health: Health = field(default_factory=Health, init=False)
+    scenes: int = field(default=0, init=False)
 
     def start(self, model: Denoiser, datamodule: MotionDataModule) -> None:
         """Set up methods and metrics.
@@ -78,7 +81,7 @@ class Evaluation:
             raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")
         self.body: Body = datamodule.body.to(model.device)
         known = self.schedule(model, self.context, self.horizon).known
-        self.past_is_given = bool(known[: self.context // STRIDE].all())
+        self.past_is_given = self.context > 0 and bool(known[: self.context // STRIDE].all())
         self.nothing_is_given = not bool(known.any())
         self.methods: dict[str, Predictor] = {MODEL: self._model(model)}
         train = None
@@ -89,10 +92,10 @@ class Evaluation:
         if train is not None and self.past_is_given:
             self.methods |= {
                 "NN": self._baseline(NearestNeighbour(train)),
-                "RS": self._baseline(RandomSample(train)),
+                "RS": self._baseline(RandomSample(train), draws=True),
                 "held pose": self._baseline(HoldPose()),
                 "NN, not aligned": self._baseline(NearestNeighbour(train, aligned=False)),
-                "RS, not aligned": self._baseline(RandomSample(train, aligned=False)),
+                "RS, not aligned": self._baseline(RandomSample(train, aligned=False), draws=True),
             }
         self.scored = scored = self.scored_agents(model)
         fps = datamodule.store("test").fps
@@ -101,9 +104,13 @@ class Evaluation:
         self.train_features = self._train_features(train, scored)
         self.halves = [FrechetDistance(fps=fps, agents=scored).to(model.device) for _ in range(2)]
         self.half_of: dict[str, int] = {}
-        self.health = Health()
+        self.health, self.scenes = Health(), 0
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
-        self.scenes = 0
+
+    @property
+    def now(self) -> int:
+        """The last recorded frame; the first one where there is no past."""
+        return max(self.context - 1, 0)
 
     def schedule(self, model: Denoiser, context: int, horizon: int) -> MaskSchedule:
         """The task's plan for scenes of so many frames."""
@@ -123,22 +130,27 @@ class Evaluation:
     # -- methods -------------------------------------------------------------------------------
 
     def _model(self, model: Denoiser) -> Predictor:
-        def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
+        def predict(scene: Scene, samples: int, generators: Sequence[torch.Generator]) -> Scene:
             horizon, options = self.horizon, self.options
             whole = model.generate(
-                scene, self.task, self.context, horizon, samples, options, generator, self.progress, self.health
+                scene, self.task, self.context, horizon, samples, options, generators, self.progress, self.health
             )
             if self.nothing_is_given:  # such a scene stands anywhere: put it where the recorded ones are put
                 with torch.autocast(scene.device.type, enabled=False):
-                    whole = aligned(whole, self.context - 1)
+                    whole = aligned(whole, self.now)
             return whole.cut(self.context)
 
         return predict
 
-    def _baseline(self, method: Callable[..., Scene]) -> Predictor:
-        def predict(scene: Scene, samples: int, generator: torch.Generator) -> Scene:
+    def _baseline(self, method: Callable[..., Scene], draws: bool = False) -> Predictor:
+        def predict(scene: Scene, samples: int, generators: Sequence[torch.Generator]) -> Scene:
+            past = scene.cut(0, self.context)
             with torch.autocast(scene.device.type, enabled=False):
-                return method(scene.cut(0, self.context), self.horizon, samples, generator)
+                if not draws:
+                    return method(past, self.horizon, samples)
+                first = generators[::samples]
+                each = [method(past.pick([b]), self.horizon, samples, first[b]) for b in range(past.scenes)]
+                return concatenate(each)
 
         return predict
 
@@ -148,7 +160,7 @@ class Evaluation:
             return None
         pooled = FrechetDistance(agents=scored).to(train.device)
         for start in range(0, train.scenes, 256):
-            part = aligned(train.pick(slice(start, start + 256)), self.context - 1)
+            part = aligned(train.pick(slice(start, start + 256)), self.now)
             future = self.body.joints(part.cut(self.context))
             pooled.update(future[None], future, part.present)
         return pooled
@@ -163,15 +175,15 @@ class Evaluation:
         """
         answers = {}
         for name, method in self.methods.items():
-            generator = self._generator(model, batch_idx)
+            generators = self._generators(model, batch.scenes)
             began = time.perf_counter()
-            answers[name] = method(batch, self.samples, generator)
+            answers[name] = method(batch, self.samples, generators)
             self.seconds[name] += time.perf_counter() - began
         with torch.autocast(batch.device.type, enabled=False):  # half precision is for the network alone
             self._measure(batch, answers)
 
     def _measure(self, batch: Scene, answers: dict[str, Scene]) -> None:
-        T_shared_world = shared_world(batch, self.context - 1)
+        T_shared_world = shared_world(batch, self.now)
         future = self.body.joints(batch.cut(self.context).moved(T_shared_world))
         for name, predicted in answers.items():
             if not self.nothing_is_given:
@@ -205,7 +217,13 @@ class Evaluation:
             rows[HALVES] = {"fd": _distance(*self.halves)}
         if self.nothing_is_given:  # a scene of its own has no recording to be compared with
             rows[MODEL] = {name: value for name, value in rows[MODEL].items() if not name.startswith("mpj")}
-        meta = {
+        seconds = {name: round(value, 2) for name, value in self.seconds.items()}
+        self.results = Results(rows=rows, meta=self.facts(model) | {"seconds": seconds})
+        return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}
+
+    def facts(self, model: Denoiser) -> dict[str, Any]:
+        """What has been sampled, how, and what it cost; JSON-ready."""
+        return {
             "task": type(self.task).__name__,
             "task options": repr(self.task),
             "samples": self.samples,
@@ -213,16 +231,17 @@ class Evaluation:
             "test scenes": self.scenes,
             "context frames": self.context,
             "horizon frames": self.horizon,
-            "seconds": {name: round(value, 2) for name, value in self.seconds.items()},
             "device": str(model.device),
             "health": {name: round(value, 4) for name, value in self.health.means().items()},
         }
-        self.results = Results(rows=rows, meta=meta)
-        return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}
 
     def predict(self, model: Denoiser, batch: Scene, batch_idx: int, datamodule: MotionDataModule) -> Scene:
         """Context and samples of one batch of scenes, for writing."""
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        if batch_idx == 0:
+            self.health, self.scenes = Health(), 0
+        generators = self._generators(model, batch.scenes)
+        self.scenes += batch.scenes
         return model.generate(
             batch,
             self.task,
@@ -230,13 +249,18 @@ class Evaluation:
             self.horizon,
             self.samples,
             self.options,
-            self._generator(model, batch_idx),
+            generators,
             self.progress,
+            self.health,
         )
 
-    def _generator(self, model: Denoiser, batch_idx: int) -> torch.Generator:
-        seed = derive(self.seed, "test", batch_idx, model.global_rank)
-        return torch.Generator(device=model.device).manual_seed(seed)
+    def _generators(self, model: Denoiser, scenes: int) -> list[torch.Generator]:
+        """One for each sample of the next scenes of this run, known by a scene's number, not by its batch."""
+        trainer = model._trainer  # None where a batch is sampled by hand
+        world = 1 if trainer is None else trainer.world_size
+        numbers = [(self.scenes + b) * world + model.global_rank for b in range(scenes)]  # ranks deal scenes out
+        seeds = [derive(self.seed, "test", number, sample) for number in numbers for sample in range(self.samples)]
+        return [torch.Generator(device=model.device).manual_seed(seed) for seed in seeds]
 
 
 def aligned(scene: Scene, frame: int) -> Scene:
@@ -247,7 +271,7 @@ def aligned(scene: Scene, frame: int) -> Scene:
 def shared_world(scene: Scene, frame: int) -> Tensor:
     """T_shared_world, with the origin between the people and facing as agent 0 does. -> (B, 1, 1, 4, 4)
 
-    Both are taken at one frame, the last known one, so that positions of different scenes can be compared.
+    Both are taken at one frame, the last recorded one, so that positions of different scenes can be compared.
     """
     yaw, ground = to_planar(canonical_frame(scene.T_world_root)[:, frame])  # (B, P), (B, P, 2)
     there = scene.present[..., None].to(ground)

@@ -12,6 +12,7 @@ from torch import Tensor
 from magnet.motion.frames import partners, rigid
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
@@ -100,8 +101,9 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
     The laws: a task is a frozen dataclass with a docstring and a formula; it plans the same twice; levels never
     rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
     clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
-    cannot influence the sample, nor can relations to it; the same seed gives the same sample; and several scenes
-    in a batch are sampled as each would be alone.
+    cannot influence the sample, nor can relations to it; what a stage hides from an agent cannot influence what the
+    stage makes of that agent, not by way of the others either; the same seed gives the same sample; and several
+    scenes in a batch are sampled as each would be alone.
 
     Args:
         task: the task with its options.
@@ -129,10 +131,11 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
                 raise
             refused.append(str(error))
             continue
-        _check_plan(task, grid, schedule, nameless)
+        _check_plan(task, grid, schedule)
         _check_samples(task, grid, schedule)
+        _check_hidden(task, grid, schedule)
         if nameless:
-            _check_nameless(task, grid, schedule)
+            renaming_law(task, task, grid, torch.arange(grid.agents).roll(1))
         checked.append(grid)
     if not checked:
         raise ValueError(f"{type(task).__name__} refuses every grid: {'; '.join(dict.fromkeys(refused))}")
@@ -172,7 +175,7 @@ def _check_record(task: Task) -> None:
     )
 
 
-def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule, nameless: bool) -> None:
+def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     place, known = _place(task, grid), schedule.known
     size = (schedule.tokens, schedule.agents)
     _require(size == (grid.tokens, grid.agents), f"{place}: planned {size[0]} tokens of {size[1]} agents")
@@ -191,16 +194,14 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule, nameless: bool) 
         shape = (grid.agents, width, grid.agents)
         fits = stage.hidden is None or tuple(stage.hidden.shape) == shape
         _require(fits, f"{place}: stage {number}: hidden is not of shape {shape}")
+        if stage.hidden is not None:
+            agent = torch.arange(grid.agents)
+            blind = stage.hidden[agent, :, agent].T & (stage.levels[0] != stage.levels[-1])
+            _require(not blind.any(), f"{place}: stage {number}: hides from an agent what it generates of itself")
     again = task.schedule(grid)
     same = torch.equal(again.known, known) and len(again.stages) == len(schedule.stages)
     same = same and all(_same_stage(a, b) for a, b in zip(again.stages, schedule.stages, strict=True))
     _require(same, f"{place}: planned twice, the plans differ; a task must not draw random numbers")
-    if nameless:
-        order = torch.arange(grid.agents).roll(1)
-        for number, stage in enumerate(schedule.stages):
-            hidden = None if stage.hidden is None else stage.hidden[order][:, :, order]
-            alike = _same_stage(stage, Stage(stage.start, stage.levels[:, :, order], hidden))
-            _require(alike, f"{place}: stage {number} treats agents differently for the slots they are in")
 
 
 def _same_stage(a: Stage, b: Stage) -> bool:
@@ -234,31 +235,91 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     _require(same, f"{place}: scenes in a batch are sampled otherwise than alone")
 
 
-def _check_nameless(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
+def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
+    """Change what a stage hides from an agent, on the canvas and in all that the model says of it."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
-    tokens, noise, veil = (torch.randn(shape, generator=generator) for _ in range(3))
+    tokens, noise, veil, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
-    order = torch.arange(grid.agents).roll(1)
+    canvas = begin(tokens, noise, schedule.known, layout)
+    last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
+    for number, stage in enumerate(schedule.stages[: last + 1]):
+        before = canvas
+        canvas = run_stages(mixing, [stage], before, veil, present, layout, guidance=guidance)
+        if stage.hidden is None:
+            continue
+        window = slice(stage.start, stage.stop)
+        told = layout.spread(layout.group_levels(stage.levels[0]) < LEVELS)  # pure noise tells nothing
+        for hidden in stage.hidden.unique(dim=0):
+            secret = layout.spread(layout.group_levels(hidden.long()) > 0)  # (W, P, D)
+            changed = before.clone()
+            changed[:, window] = torch.where(secret & told, 10 * other[:, window], before[:, window])
+
+            def lying(noisy: Tensor, levels: Tensor, present: Tensor, secret: Tensor = secret) -> Tensor:
+                said = mixing(noisy, levels, present)
+                return torch.where(secret, 1 - 3 * said, said)
+
+            # Smoothing follows what is said of everybody, in each agent's own view: not told by what is hidden.
+            model = mixing if guidance is not None and guidance.smooth else lying
+            after = run_stages(model, [stage], changed, veil, present, layout, guidance=guidance)
+            same = ((after == canvas)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
+            for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
+                message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
+                _require(same[agent], f"{_place(task, grid)}: {message}")
+
+
+def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
+    """Check that a task does the same to the same people in other slots, by its plan and in its samples.
+
+    Args:
+        task: as it names the agents by their slots.
+        renamed: the same task as it names them where agent p is who was agent order[p].
+        grid: what to plan on.
+        order: (P,) int, a permutation.
+
+    Raises:
+        AssertionError: agents are treated differently for the slots they are in.
+    """
+    place, layout = _place(renamed, grid), TokenLayout(latent=4, agents=grid.agents)
+    first, second = task.schedule(grid), renamed.schedule(grid)
+    same = len(first.stages) == len(second.stages) and torch.equal(first.known[:, order], second.known)
+    _require(same, f"{place}: knows or generates other things for the slots they are in")
+    for number, (stage, other) in enumerate(zip(first.stages, second.stages, strict=True)):
+        hidden = None if stage.hidden is None else stage.hidden[order][:, :, order]
+        alike = _same_stage(other, Stage(stage.start, stage.levels[:, :, order], hidden))
+        _require(alike, f"{place}: stage {number} treats agents differently for the slots they are in")
+    generator = torch.Generator().manual_seed(1)
+    shape = (1, grid.tokens, grid.agents, layout.width)
+    drawn = [torch.randn(shape, generator=generator) for _ in range(3)]
+    plain = sampled_blind(first, layout, grid.agents, drawn)
+    moved = sampled_blind(second, layout, grid.agents, [reordered(each, order, layout) for each in drawn])
+    alike = torch.allclose(reordered(plain, order, layout), moved, atol=1e-5)
+    _require(alike, f"{place}: with the agents in other slots, they are sampled differently")
+
+
+def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, drawn: Sequence[Tensor]) -> Tensor:
+    """A sample of a model that knows no slots, of people in the first ones.
+
+    drawn: what is given, noise and veil (B, N, P, D) -> (B, N, P, D)
+    """
+    tokens, noise, veil = drawn
+    P = layout.agents
+    there = torch.arange(P) < people
+    pairs = there[:, None] & there[partners(P)] if layout.slots else there[:, None]
 
     def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Tokens of an agent from its own, its relations and everybody's, all slots alike."""
         latent, steps, relations = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
-        own = torch.cat([latent, steps.flatten(-2)], dim=-1)
-        heard = own.mean(dim=(1, 2), keepdim=True) + relations.flatten(3).sum(dim=-1, keepdim=True)
-        own = torch.tanh(own.roll(1, dims=1) + heard)
+        own = torch.cat([latent, steps.flatten(-2)], dim=-1) * there[:, None]
+        relations = relations * pairs[..., None, None]
+        everybody = own.sum(dim=2, keepdim=True).mean(dim=1, keepdim=True) / there.sum()
+        own = torch.tanh(own.roll(1, dims=1) + everybody + relations.flatten(3).sum(dim=-1, keepdim=True))
         latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
         return layout.pack(latent, steps, torch.tanh(relations + steps.mean(dim=(-1, -2))[..., None, None, None]))
 
-    def run(tokens: Tensor, noise: Tensor, veil: Tensor) -> Tensor:
-        canvas = begin(tokens, noise, schedule.known, layout)
-        return run_stages(blind, schedule.stages, canvas, veil, present, layout)
-
-    plain = reordered(run(tokens, noise, veil), order, layout)
-    other = run(*(reordered(each, order, layout) for each in (tokens, noise, veil)))
-    alike = torch.allclose(plain, other, atol=1e-5)
-    _require(alike, f"{_place(task, grid)}: with the agents in other slots, they are sampled differently")
+    canvas = begin(tokens, noise, schedule.known, layout)
+    return run_stages(blind, schedule.stages, canvas, veil, there.expand(len(tokens), P), layout)
 
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -99,6 +102,33 @@ def test_show_help_explains_sizes_and_fields(capsys: pytest.CaptureFixture[str],
     assert "how many more tokens are given" in text
     assert "--people" in text
     assert "--out" in printed(capsys, "show", "--help")
+
+
+@pytest.mark.parametrize("command", ["test", "predict"])
+def test_help_of_a_command_explains_every_field_of_every_task(capsys: pytest.CaptureFixture[str], command: str) -> None:
+    assert cli.main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    sections = dict(re.findall(r"^--task (\w+): (.*?)(?=^--task |\Z)", text, re.MULTILINE | re.DOTALL))
+    assert list(sections) == registry.names()
+    for entry in registry.entries():
+        section = " ".join(sections[entry.name].split())
+        names = [each.name for each in dataclasses.fields(entry.task)]
+        assert re.findall(r"--task\.(\w+) ", section) == names
+        explained = " ".join((inspect.getdoc(entry.task) or "").split())
+        for name in names:
+            found = re.search(rf"\b{name}: (.*?)(?: \w+: |$)", explained)
+            assert found
+            assert found[1].rstrip(".") in section
+        assert ("(no fields)" in section) == (not names)
+        assert "as above" not in section
+
+
+def test_help_names_tasks_and_not_what_stands_for_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["test", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"--task NAME: One of {', '.join(registry.names())}; default: joint_future." in text
+    for internal in ("NamedTask", "cli_tasks", "stands for", "class_path"):
+        assert internal not in text
 
 
 @pytest.mark.parametrize(

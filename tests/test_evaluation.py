@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
 from magnet.evaluation import HALVES, MODEL, TRAINING, TRUTH, Evaluation, aligned
 from magnet.motion.frames import canonical_frame, from_planar, to_planar
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
@@ -18,16 +19,28 @@ FAST = SamplerOptions(steps=2, stride=2)
 
 def data(clips: list | None = None, **options) -> FakeData:
     clips = clips or [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(3)]
-    return FakeData(clips, max_agents=3, context_frames=16, horizon_frames=20, test_batch_size=3, **options)
+    sizes = {"max_agents": 3, "context_frames": 16, "horizon_frames": 20, "test_batch_size": 3}
+    return FakeData(clips, **{**sizes, **options})
 
 
-def run(datamodule: FakeData, **options) -> Evaluation:
+def prepared(**options) -> tuple[Denoiser, Evaluation, L.Trainer]:
     model = tiny_denoiser(max_agents=3)
     evaluation = Evaluation(samples=3, options=FAST, baseline_stride=10, **options)
     model.configure_test(evaluation)
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
+    return model, evaluation, trainer
+
+
+def run(datamodule: FakeData, **options) -> Evaluation:
+    model, evaluation, trainer = prepared(**options)
     trainer.test(model, datamodule=datamodule, verbose=False)
     return evaluation
+
+
+def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluation]:
+    """All scenes that `magnet predict` writes, whatever batches they came in."""
+    model, evaluation, trainer = prepared(**options)
+    return concatenate(trainer.predict(model, datamodule=datamodule)), evaluation
 
 
 def test_every_method_is_measured_on_the_same_scenes():
@@ -77,7 +90,7 @@ def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
         evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
         evaluation.start(model, datamodule)
         batch = next(iter(datamodule.test_dataloader()))
-        seen.append(evaluation.methods[MODEL](batch, 2, evaluation._generator(model, 0)))
+        seen.append(evaluation.methods[MODEL](batch, 2, evaluation._generators(model, batch.scenes)))
     plain, replaced = seen
     assert torch.equal(plain.body_rot, replaced.body_rot)
     assert torch.equal(plain.T_world_root, replaced.T_world_root)
@@ -100,6 +113,62 @@ def test_scores_follow_the_seed():
     same = [run(data(), baselines=False, seed=3).results.rows[MODEL] for _ in range(2)]
     assert same[0] == same[1]
     assert run(data(), baselines=False, seed=4).results.rows[MODEL] != same[0]
+
+
+def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in():
+    """Random retrieval draws, too: a scene's noise is its own."""
+    by_size = [run(data(test_batch_size=size)).results for size in (1, 3)]
+    for method in (MODEL, "RS"):
+        alone, together = (results.rows[method] for results in by_size)
+        assert alone.keys() == together.keys()
+        for metric in alone:
+            assert alone[metric] == pytest.approx(together[metric], rel=1e-3, abs=1e-4, nan_ok=True), (method, metric)
+    (alone, _), (together, _) = (predicted(data(test_batch_size=size)) for size in (1, 3))
+    torch.testing.assert_close(alone.body_rot, together.body_rot, rtol=0, atol=1e-4)
+    torch.testing.assert_close(alone.T_world_root, together.T_world_root, rtol=0, atol=1e-4)
+
+
+def test_no_two_samples_share_their_noise():
+    model, evaluation, _ = prepared()
+    seeds = [g.initial_seed() for g in evaluation._generators(model, 2)]
+    evaluation.scenes = 2
+    seeds += [g.initial_seed() for g in evaluation._generators(model, 1)]
+    assert len(set(seeds)) == len(seeds) == 9
+
+
+def test_prediction_counts_what_it_costs():
+    """Two denoising steps for each of the windows of a scene, whose first is filled and then moves by two of five."""
+    scenes, evaluation = predicted(data())
+    health = evaluation.health
+    tokens = scenes.frames // 4
+    windows = 1 + -(-(tokens - 8) // FAST.stride)
+    assert (evaluation.scenes, scenes.scenes, health.runs) == (9, 27, 3)
+    assert health.means()["calls"] == health.evaluations == FAST.steps * windows
+    assert evaluation.facts(prepared()[0])["health"]["evaluations"] == health.evaluations
+
+
+@pytest.mark.parametrize("name", ["generation", "partner_inpainting", "inbetweening"])
+def test_no_past_is_no_past_that_baselines_could_continue(name: str):
+    datamodule = data()
+    datamodule.context_frames = 0
+    results = run(datamodule, task=registry.get(name)()).results
+    assert set(results.rows) == {MODEL, TRUTH, TRAINING, HALVES}
+    assert math.isfinite(results.rows[MODEL]["fd"])
+
+
+def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
+    datamodule = data()
+    datamodule.context_frames = 0
+    seen = run(datamodule, task=registry.get("generation")())
+    assert (seen.now, seen.past_is_given) == (0, False)
+    batch = next(iter(datamodule.test_dataloader()))
+    model = tiny_denoiser(max_agents=3)
+    made = seen.methods[MODEL](batch, 3, seen._generators(model, batch.scenes))
+    yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
+    there = made.present[..., None]
+    middle = torch.where(there, ground, 0).sum(dim=1) / there.sum(dim=1)
+    assert middle.abs().max() < 1e-5
+    assert yaw[:, 0].abs().max() < 1e-5
 
 
 def test_composed_scenes_have_baselines_of_their_size():

@@ -44,7 +44,7 @@ class MotionDataModule(LightningDataModule):
         weights: share of each source of clips among training windows; None: as many as it has frames.
         epoch_size: training windows an epoch over all processes; None: as many as fit side by side into the
             training frames, times four.
-        context_frames: known frames of a test scene.
+        context_frames: known frames of a test scene; 0 for tasks that start from nothing.
         horizon_frames: frames of a test scene to predict; 150 are five seconds.
         test_stride: frames between the starts of test scenes of a clip; None: they do not overlap.
         test_limit: at most so many test scenes, evenly spaced over all; None: all.
@@ -91,7 +91,6 @@ class MotionDataModule(LightningDataModule):
             "window_frames": window_frames,
             "batch_size": batch_size,
             "max_agents": max_agents,
-            "context_frames": context_frames,
             "horizon_frames": horizon_frames,
             "test_batch_size": test_batch_size,
             "val_batch_size": val_batch_size,
@@ -102,6 +101,8 @@ class MotionDataModule(LightningDataModule):
         for name, number in at_least_one.items():
             if number is not None and number < 1:
                 raise ValueError(f"{name}: got {number}, expected at least 1")
+        if context_frames < 0:
+            raise ValueError(f"context_frames: got {context_frames}, expected 0 (from nothing) or more")
         for name, share in {"drop_agent": drop_agent, "compose": compose}.items():
             if not 0 <= share <= 1:
                 raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")

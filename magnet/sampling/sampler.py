@@ -155,8 +155,9 @@ def _step_in_views(
     seen_after = torch.where(views_hidden, LEVELS, after)
     group = layout.spread(layout.group_levels(seen_now))  # (V, W, P, D)
     group_after = layout.spread(layout.group_levels(seen_after))
-    # Shown at level K although it is further on: what it holds must not be seen.
-    unknown = (group == LEVELS) & (layout.spread(layout.group_levels(now)) < LEVELS)
+    # What speaks of somebody hidden is shown as noise of its own: its own noise would tell where it is going.
+    veiled = torch.where(views_hidden, LEVELS, 0)
+    unknown = layout.spread(layout.group_levels(veiled)) == LEVELS
     views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
     moved, clean = guidance.apply(
         denoise,

@@ -1,18 +1,24 @@
 """Every registered task obeys the same laws, whoever wrote it; and the laws find those that do not."""
 
+import dataclasses
+import itertools
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 import torch
+from torch import Tensor
 
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling import sampler
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
-from magnet.testing import TASK_GRIDS, task_laws
+from magnet.testing import TASK_GRIDS, _check_hidden, renaming_law, sampled_blind, task_laws
 
 TWO_AND_MORE = ("partner_inpainting", "partner_prediction", "motion_control")
-CANNOT_ROLL = ("agentic_async", "inbetweening")
+CANNOT_ROLL = ("agentic_async", "agentic_sync", "inbetweening", "motion_control")
 FROM_NOTHING = ("generation", "partner_inpainting", "inbetweening")
 NAMELESS = ("joint_future", "generation", "agentic_sync", "inbetweening")
 
@@ -31,13 +37,114 @@ def test_a_task_that_cannot_roll_says_why(name: str):
         registry.get(name)().schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
 
 
-def test_turns_that_all_begin_at_once_can_roll():
-    registry.get("agentic_async")(offset=0.0).schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
-
-
 def test_joint_future_needs_a_past():
     with pytest.raises(ValueError, match="use the task generation"):
         registry.get("joint_future")().schedule(Grid(20, 2, 0))
+
+
+# -- what is hidden stays hidden ---------------------------------------------------------------
+
+HIDING = ("agentic_async", "agentic_sync", "motion_control")
+
+
+@pytest.mark.parametrize("name", HIDING)
+@pytest.mark.parametrize(
+    "guidance",
+    [
+        Guidance("history"),
+        Guidance("self"),
+        Guidance("partner", literal=True),
+        Guidance(smooth=0.1),
+        Guidance(context_level=50),
+    ],
+    ids=lambda guidance: f"{guidance.kind}-{guidance.smooth}-{guidance.context_level}",
+)
+def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, guidance: Guidance):
+    task, grid = registry.get(name)(), Grid(8, 3, 3, steps=4, window=6, stride=2)
+    schedule = task.schedule(grid)
+    assert any(stage.hidden is not None for stage in schedule.stages)
+    _check_hidden(task, grid, schedule, guidance)
+
+
+@pytest.mark.parametrize("name", HIDING)
+def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypatch: pytest.MonkeyPatch):
+    honest = sampler.run_stage
+
+    def open_to_all(denoise: Any, stage: Stage, *rest: Any) -> Tensor:
+        return honest(denoise, dataclasses.replace(stage, hidden=None), *rest)
+
+    monkeypatch.setattr(sampler, "run_stage", open_to_all)
+    task = registry.get(name)(**({"offset": 0.25} if name == "agentic_async" else {}))  # at 1 there is nothing to see
+    with pytest.raises(AssertionError, match="what it hides from agent 0 influences"):
+        task_laws(task, [Grid(8, 2, 3, steps=4, window=6, stride=2)])
+
+
+# -- slots are no names ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("partner_inpainting", {"target": (0,)}),
+        ("partner_inpainting", {"target": (0, 2)}),
+        ("partner_prediction", {"target": (0,)}),
+        ("partner_prediction", {"target": (0, 2)}),
+        ("motion_control", {"target": (0,)}),
+        ("motion_control", {"target": (0, 2), "block": 2}),
+        ("agentic_async", {"order": (0, 1, 2)}),
+        ("agentic_async", {"order": (2, 0, 1), "offset": 0.5, "block": 2}),
+        ("agentic_async", {"order": (0, 1, 2), "offset": 0.0}),
+        ("inbetweening", {"keys": (8, -1), "agents": (0, 2)}),
+        ("inbetweening", {"pairs": ((0, 8), (1, 11), (2, -1))}),
+    ],
+)
+def test_an_agent_is_treated_as_its_role_says_whichever_slot_it_is_in(name: str, options: dict[str, Any]):
+    task = registry.get(name)
+    rolling = (0,) if name in CANNOT_ROLL else (0, 2)
+    for order, slope in itertools.product(itertools.permutations(range(3)), rolling):
+        grid = Grid(14, 3, 4, steps=4, window=8, stride=3, rolling=slope)
+        moved = dict(options)
+        for field in set(options) & {"target", "order", "agents"}:
+            moved[field] = tuple(order.index(slot) for slot in options[field])
+        if "pairs" in options:
+            moved["pairs"] = tuple((order.index(slot), step) for slot, step in options["pairs"])
+        renaming_law(task(**options), task(**moved), grid, torch.tensor(order))
+
+
+def test_turns_that_follow_the_slots_are_found_to():
+    task = registry.get("agentic_async")()
+    with pytest.raises(AssertionError, match="for the slots they are in"):
+        renaming_law(task, task, Grid(14, 3, 4, steps=4), torch.tensor([1, 2, 0]))
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_empty_slots_change_nothing(name: str):
+    """Two people are sampled in four slots as in two, whatever stands in the slots that nobody is in."""
+    small, large = (TokenLayout(latent=4, agents=agents) for agents in (2, 4))
+    checked = 0
+    for context, rolling in itertools.product((0, 4), (0, 2)):
+        try:
+            plan = registry.get(name)().schedule(Grid(14, 2, context, 4, 8, 3, rolling))
+        except ValueError:
+            continue
+        generator = torch.Generator().manual_seed(3)
+        drawn = [torch.randn(2, 14, 2, small.width, generator=generator) for _ in range(3)]
+        rest = [torch.randn(2, 14, 4, large.width, generator=generator) for _ in range(3)]
+        alone = sampled_blind(plan, small, 2, drawn)
+        seated = [in_more_slots(*pair, small, large) for pair in zip(drawn, rest, strict=True)]
+        out = sampled_blind(plan.padded(4), large, 2, seated)
+        torch.testing.assert_close(in_more_slots(alone, out, small, large), out, atol=1e-4, rtol=0)
+        checked += 1
+    assert checked
+
+
+def in_more_slots(people: Tensor, slots: Tensor, small: TokenLayout, large: TokenLayout) -> Tensor:
+    """People's tokens in the first of more slots, the rest as it is in `slots`."""
+    P = small.agents
+    whole = [part.clone() for part in large.unpack(slots)]
+    latent, steps, relations = small.unpack(people)
+    whole[0][:, :, :P], whole[1][:, :, :P], whole[2][:, :, :P, : P - 1] = latent, steps, relations
+    return large.pack(*whole)
 
 
 # -- the laws find what breaks them ------------------------------------------------------------
@@ -69,6 +176,11 @@ class Broken:
         if self.law == "names":
             known[:, 0] = True
             return MaskSchedule.together(known, ~known, grid)
+        if self.law in ("rumour", "blind"):
+            # Rumour: 0 does not see 1, but sees 2, who sees 1.
+            unseen = torch.zeros(grid.agents, grid.agents, dtype=torch.bool)
+            unseen[0, 1 if self.law == "rumour" else 0] = True
+            return MaskSchedule.blocks(known, ~known, grid, unseen=unseen)
         if self.law == "refuse":
             raise ValueError("this task needs seven agents")
         return plan
@@ -91,6 +203,17 @@ GRID = Grid(24, 2, 4, steps=3)
 def test_a_broken_law_is_named(law: str, message: str):
     with pytest.raises(AssertionError, match=message):
         task_laws(Broken(law), [GRID], nameless=law == "names")
+
+
+def test_what_is_hidden_must_not_be_told_by_others():
+    assert task_laws(Broken("rumour"), [Grid(24, 2, 4, steps=3)])
+    with pytest.raises(AssertionError, match="what it hides from agent 0 influences"):
+        task_laws(Broken("rumour"), [Grid(24, 3, 4, steps=3)])
+
+
+def test_an_agent_must_see_what_is_generated_of_it():
+    with pytest.raises(AssertionError, match="hides from an agent what it generates of itself"):
+        task_laws(Broken("blind"), [GRID])
 
 
 def test_a_lawful_task_passes():
