@@ -65,9 +65,9 @@ def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
         "joint_future, SHG w = 1": guided(kind="self"),
         "joint_future, PHG w = 1": guided(kind="partner"),
         "joint_future, SHG as printed": guided(kind="self", literal=True),
-        "joint_future, HG w = 0.3": guided(kind="history", weight=0.3),
+        "joint_future, HG w = 0.2": guided(kind="history", weight=0.2),
         "joint_future, smoothing 0.01": guided(smooth=0.01),
-        "joint_future, smoothing 0.1": guided(smooth=0.1),
+        "joint_future, context level 30": guided(context_level=30),
         "joint_future, rolling 4": replace(options, rolling=4),
     }
     return {name: (task, options) for name, task in plain.items()} | {
@@ -159,7 +159,7 @@ def main() -> None:
         truth = f"{PARTNER if PARTNER in name else ''}{TRUTH}"
         found.rows.setdefault(truth, results.rows[TRUTH])
         found.meta[name] = results.meta
-        found.meta |= cli_record.provenance() | {"machine": machine()}
+        found.meta.update(cli_record.provenance() | {"machine": machine()})
         found.save_json(file)
     shown = [metric for metric in METRICS if metric in found.metrics]
     (given.out / "table.md").write_text(found.to_markdown(shown))

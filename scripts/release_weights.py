@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from magnet import weights
 
@@ -29,6 +30,17 @@ ABOUT = {
 }
 
 
+def without_folders(value: Any) -> Any:
+    """The same record with files by their names alone: where they lay on some machine is nobody's business."""
+    if isinstance(value, dict):
+        return {key: without_folders(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_folders(one) for one in value]
+    if isinstance(value, str):
+        return " ".join(Path(word).name if word.startswith("/") else word for word in value.split(" "))
+    return value
+
+
 def main() -> None:
     """Read, write, say how large it is."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -37,7 +49,10 @@ def main() -> None:
     given = options.parse_args()
     run = given.checkpoint.parents[1] / "run.json"
     about = ABOUT | ({"run": json.loads(run.read_text())} if run.exists() else {})
-    folder = weights.write(weights.read(given.checkpoint), weights.FOLDER / given.name, about)
+    checkpoint = weights.read(given.checkpoint)
+    for part in [name for name in checkpoint if name != "state_dict"]:
+        checkpoint[part] = without_folders(checkpoint[part])
+    folder = weights.write(checkpoint, weights.FOLDER / given.name, without_folders(about))
     parts = sorted(folder.glob("*.safetensors"))
     size = sum(part.stat().st_size for part in parts) / 1e6
     print(f"{folder}: {len(parts)} parts, {size:.1f} MB")

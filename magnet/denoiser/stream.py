@@ -128,6 +128,8 @@ class Stream:
         self.scene = scene.to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.health = samples, progress, health or Health()
         self.frames = None if frames is None else context + frames
+        if self.frames is not None and scene.frames >= self.frames:
+            self.scene = whole_tokens(self.scene, self.frames)
         o = self.options
         tokens = model.window if self.frames is None else -(-self.frames // STRIDE)
         past = context // STRIDE
@@ -246,6 +248,16 @@ class Stream:
         """Rows [first, stop) of what is known; nothing is, beyond the plan of a scene without end."""
         rows = self.known[first:stop]
         return torch.nn.functional.pad(rows, (0, 0, 0, stop - first - len(rows)))
+
+
+def whole_tokens(scene: Scene, frames: int) -> Scene:
+    """So many frames of a scene and, up to the end of their last token, its last pose held if there are no more."""
+    wanted = -(-frames // STRIDE) * STRIDE
+    if scene.frames >= wanted:
+        return scene
+    frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)
+    valid = None if scene.valid is None else scene.valid[:, frame]
+    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=valid)
 
 
 # -- the plan ----------------------------------------------------------------------------------

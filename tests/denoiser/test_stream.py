@@ -305,3 +305,14 @@ def test_calls_and_evaluations_are_counted(model, recording, name, guidance, vie
     assert health.evaluations == schedule.evaluations * views * branches
     means = health.means()
     assert (means["calls"], means["evaluations"]) == (schedule.evaluations, health.evaluations)
+
+
+@pytest.mark.parametrize("name", ["partner_inpainting", "inbetweening", "motion_control"])
+def test_a_scene_that_ends_within_a_token_is_enough_for_tasks_given_all_of_it(name, generator):
+    """32 and 150 frames, the defaults of `magnet test`, are 45 tokens and a half."""
+    model = tiny_denoiser(max_agents=2, window=8)
+    scene = random_scene(1, 34, 2, generator)
+    out = model.generate(scene, registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))
+    assert out.frames == 34
+    with pytest.raises(ValueError, match="the task needs"):
+        model.generate(scene.cut(0, 30), registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))
