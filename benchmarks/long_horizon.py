@@ -35,6 +35,7 @@ from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
 from magnet.metrics.frechet import moments
 from magnet.motion.scene import Scene, concatenate
 from magnet.report import machine
+from magnet.sampling.guidance import Guidance
 from magnet.tasks.joint import JointFuture
 
 CONTEXT, WINDOW = 4, 150
@@ -93,6 +94,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=6, help="starts, evenly spaced over the test takes")
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--rolling", type=int, default=0)
+    parser.add_argument("--guidance", type=float, default=0.0, help="weight of history guidance")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
     given = parser.parse_args()
     body, model = load_body(), Denoiser.load(given.ckpt_path)
@@ -103,7 +105,8 @@ def main() -> None:
         for k in range(clip.frames // WINDOW)
     ]
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
-    options = SamplerOptions(steps=given.steps, rolling=given.rolling)
+    guidance = Guidance("history", given.guidance) if given.guidance else Guidance()
+    options = SamplerOptions(steps=given.steps, rolling=given.rolling, guidance=guidance)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):

@@ -16,7 +16,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from magnet import cli_output, cli_record
+from magnet import cli_output, cli_record, weights
 from magnet.body import Body
 from magnet.cli_run import quiet
 from magnet.datamodules.synthetic import Synthetic
@@ -44,6 +44,10 @@ LIVELY = Guidance("history", 0.3)
 """For the shows: without it the model that comes along moves people less than was recorded (docs/results.md)."""
 
 
+MADE = "duet"
+"""A scene that the model made from nothing, and that comes with it."""
+
+
 @dataclass(frozen=True)
 class Show:
     """One scene of the demo.
@@ -52,7 +56,7 @@ class Show:
         name: of its files.
         words: what is to be seen, for whoever runs the demo.
         task: what is sampled.
-        scene: coupling and number of people of the test scene it starts from.
+        scene: coupling and number of people of the test scene it starts from; or a scene that comes with the model.
         context: frames of it that are given.
         frames: generated after them.
         sampler: changes to the sampler's options.
@@ -73,7 +77,7 @@ SHOWS = (
     Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
     Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
     Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
-    Show("minute", "a minute from a second", JointFuture(), ("circle", 2), frames=LONG, sampler={"rolling": 4}),
+    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, sampler={"rolling": 4}),
 )
 
 
@@ -188,6 +192,8 @@ def picture(show: Show, rows: dict[str, Scene], known: Tensor, body: Body, out: 
 
 
 def test_scene(data: Synthetic, coupling: str, people: int) -> Scene:
-    """Context and future of a test scene of that kind."""
+    """Context and future of a test scene of that kind, or of one that comes with the model."""
+    if coupling == MADE:
+        return Scene.load(weights.FOLDER / "duet" / "scenes" / f"{coupling}.npz").pad_agents(data.max_agents)
     kind = data.kinds.index((coupling, people))
     return aligned(data.scene("test", kind).scene.pad_agents(data.max_agents).cut(0, CONTEXT + HORIZON), CONTEXT - 1)
