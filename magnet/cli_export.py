@@ -20,7 +20,7 @@ OUT's suffix:
   .mp4 .gif .webp   a film;   .png   a strip of moments
 
 for example:
-  magnet export demo/joint_future_2_people.npz duet.glb --scene 0
+  magnet export demo/quartet.npz duet.glb --scene 0
   magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
   magnet export duet.npz duet.bvh --unit cm
 """

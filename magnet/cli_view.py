@@ -119,6 +119,8 @@ def _write_page(options: argparse.Namespace) -> int:
     truth = None
     if options.truth:
         truth = read_takes([options.truth], body, samples=1)[0][0].scene
+        if abs(truth.fps - takes[0].scene.fps) > 1e-3:
+            raise ValueError(f"{options.truth}: {truth.fps:g} frames a second, the scene has {takes[0].scene.fps:g}")
     styles = (options.style,) if options.style else None
     path = save_html(
         takes[0].scene,

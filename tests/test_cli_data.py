@@ -145,3 +145,11 @@ def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
     assert cli.main(["data", "download", "cmu", str(tmp_path), "--subjects", "2,60", "--base_url", "http://x"]) == 0
     assert asked == [(["2", "60"], tmp_path, {"base_url": "http://x"})]
     assert "1 files fetched, 1 were there" in capsys.readouterr().out
+
+
+def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(copy, capsys):
+    file = min((copy / "dl").rglob("*_00.npy"))
+    file.write_bytes(file.read_bytes()[:100])
+    assert cli.main(["data", "check", "dl", "--picture", "none", "--body", "dl/body.npz"]) == 1
+    said = capsys.readouterr()
+    assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out

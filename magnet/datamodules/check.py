@@ -203,6 +203,8 @@ def check_download(order: Order, workers: int = 1, limit: int | None = None, tel
     found.notes += [f"{note} ({count} takes)" for note, count in notes.items()]
     if not found.counts:
         found.problems.append(f"none of {len(takes)} takes can be used")
+    elif found.skipped:
+        found.problems.append(f"{len(found.skipped)} of {len(takes)} takes broke an assertion; they are listed above")
     return found
 
 

@@ -118,6 +118,11 @@ def to_clips(
     notes = list(recording.notes)
     up = steps.up or recording.up
     valid = check_motion.usable(recording)
+    if recording.poses is not None and body.id.startswith("open"):
+        raise DataError(
+            f"rotations and shape numbers of {source} belong to SMPL-X's body, not to {body.id}: "
+            "give --body SMPLX_NEUTRAL.npz"
+        )
     if recording.poses is not None:
         motion = _posed(recording, valid, body)
         check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)

@@ -77,7 +77,8 @@ class Order:
             "steps": self.steps.__dict__,
             "reader": self.name,
             "reader version": kind.version,
-            "options": {key: str(value) for key, value in self.options.items()},
+            # A folder's name and not its place, so that a store's bytes do not depend on the machine.
+            "options": {key: Path(str(value)).name for key, value in self.options.items()},
             "body": body_hash(body),
         }
 

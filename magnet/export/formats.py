@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from magnet.body import Body, load_body
@@ -198,7 +199,10 @@ def write(
         return [contact_sheet(scene, path, title=title, **look)]
     if fps is not None and abs(fps - scene.fps) > 1e-6:
         context_frames = round(context_frames * fps / scene.fps)
+        frames, rate = scene.frames, scene.fps
         scene = resampled(scene, fps)
+        if known is not None:
+            known = known[(torch.arange(scene.frames) * rate / fps).round().long().clamp(max=frames - 1)]
     if suffix == ".csv":
         return [save_csv(scene, path, body)]
     if suffix == ".npz" and not smplx:
@@ -207,7 +211,7 @@ def write(
         ".npz": lambda one, to: save_smplx(one, to, body),
         ".bvh": lambda one, to: save_bvh(one, to, body, unit=unit),
         ".glb": lambda one, to: [save_glb(one, to, body)],
-        ".html": lambda one, to: [_save_page(one, to, body, context_frames, title)],
+        ".html": lambda one, to: [_save_page(one, to, body, context_frames, known, style, title)],
     }
     if scene.scenes == 1:
         return each[suffix](scene, path)
@@ -217,7 +221,11 @@ def write(
     return written
 
 
-def _save_page(scene: Scene, path: Path, body: Body, context: int, title: str | None) -> Path:
+def _save_page(
+    scene: Scene, path: Path, body: Body, context: int, known: Tensor | None, style: str, title: str | None
+) -> Path:
     from magnet.viewer.html import save_html  # late: the viewer stands on this room
 
-    return save_html(scene, path, body, context=context, title=title or "")
+    # A body's skin is only written where the page itself thinks it may be.
+    styles: Any = None if style == "body" else (style,)
+    return save_html(scene, path, body, context=context, known=known, title=title or "", styles=styles)

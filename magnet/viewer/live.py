@@ -30,6 +30,8 @@ from magnet.tasks.joint import Generation, JointFuture
 
 CONTEXT = 32
 """Frames that each piece goes on from."""
+FPS = 30.0
+"""The rate that models are trained at."""
 FIRST = 64
 """Frames of a scene from nothing."""
 REACH = 32
@@ -151,6 +153,10 @@ class Live:
             raise ValueError(
                 f"start: {start.scenes} scenes, {start.frames} frames, {start.agents} agents; expected 1, at least "
                 f"{CONTEXT}, at most {slots}"
+            )
+        elif abs(start.fps - FPS) > 1e-3:
+            raise ValueError(
+                f"start: {start.fps:g} frames a second, the model makes {FPS:g}; convert it: magnet export"
             )
         else:
             piece = Piece(0, start.frames, 0.0)
@@ -355,8 +361,8 @@ class Worker:
                 continue
             try:
                 self.last = self.live.advance()
-            except ValueError as error:
+            except Exception as error:  # whatever a task or its options raise: the page says so, and goes on
                 if self.failed is not None:
-                    self.failed(str(error))
+                    self.failed(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
                 self._wake.clear()
                 self._wake.wait(timeout=2.0)

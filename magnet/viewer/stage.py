@@ -278,13 +278,16 @@ def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> byte
     """A take as the content of a file: html, npz or gif."""
     import tempfile
 
+    import torch
+
     context = int(take.known.all(axis=1).cumprod().sum())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"
         if kind == "html":
             from magnet.viewer.html import save_html
 
-            save_html(take.scene, path, body, context=context, truth=truth, title=take.label)
+            known = torch.from_numpy(take.known)
+            save_html(take.scene, path, body, known=known, truth=truth, title=take.label)
         elif kind == "gif":
             from magnet.export.video import render_video
 

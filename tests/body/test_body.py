@@ -287,19 +287,23 @@ def for_smplx(path, arrays):
 def smplx_output(path, scene):
     """Joints and vertices by the smplx package; its transl is the pelvis less the rest pelvis."""
     smplx = pytest.importorskip("smplx")
-    model = smplx.SMPLXLayer(str(path), num_betas=10, num_expression_coeffs=10, ext="npz")
+    model = smplx.SMPLXLayer(str(path), num_betas=10, num_expression_coeffs=10, ext="npz", dtype=torch.float64)
     B, T, P = scene.scenes, scene.frames, scene.agents
     n = B * T * P
     betas = scene.betas[:, None].expand(B, T, P, 10).reshape(n, 10)
-    arguments = {"body_pose": scene.body_rot.reshape(n, 21, 3, 3), "betas": betas, "expression": torch.zeros(n, 10)}
+    arguments = {
+        "body_pose": scene.body_rot.reshape(n, 21, 3, 3),
+        "betas": betas,
+        "expression": torch.zeros(n, 10, dtype=torch.float64),
+    }
     arguments["global_orient"] = scene.T_world_root[..., :3, :3].reshape(n, 1, 3, 3)
-    eye = torch.eye(3).expand(n, 1, 3, 3)
+    eye = torch.eye(3, dtype=torch.float64).expand(n, 1, 3, 3)
     for part in ("jaw_pose", "leye_pose", "reye_pose"):
         arguments[part] = eye
     for hand in ("left_hand_pose", "right_hand_pose"):
         arguments[hand] = eye.expand(n, 15, 3, 3)
     with torch.no_grad():
-        out = model(**arguments, transl=torch.zeros(n, 3))
+        out = model(**arguments, transl=torch.zeros(n, 3, dtype=torch.float64))
     shift = scene.T_world_root[..., :3, 3].reshape(n, 1, 3) - out.joints[:, :1]
     return (out.joints[:, :22] + shift).view(B, T, P, 22, 3), (out.vertices + shift).view(B, T, P, -1, 3)
 
@@ -319,7 +323,8 @@ def test_joints_and_vertices_equal_the_smplx_package(tmp_path, source):
         body, wanted_id = load_body(tmp_path / "plain.npz"), "plain"
     for_smplx(path, {k: v.astype(np.float64) if v.dtype.kind == "f" else v.astype(np.int64) for k, v in arrays.items()})
     scene = random_scene(1, 2, 2, body=wanted_id)
+    scene = scene.replace(**{name: value.double() for name, value in scene.tensors().items() if name != "present"})
     joints, vertices = smplx_output(path, scene)
-    torch.testing.assert_close(body.joints(scene), joints, atol=5e-6, rtol=0)
-    torch.testing.assert_close(body.vertices(scene), vertices, atol=1e-5, rtol=0)
+    torch.testing.assert_close(body.joints(scene), joints, atol=1e-6, rtol=0)
+    torch.testing.assert_close(body.vertices(scene), vertices, atol=1e-6, rtol=0)
     assert torch.equal(load_body(path).faces, body.faces)

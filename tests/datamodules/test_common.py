@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from magnet.body import load_body
 from magnet.datamodules import check_motion
 from magnet.datamodules.common import Steps, resample_rotations, resample_valid, stretches, times, to_clips
 from magnet.datamodules.fakes.motion import UP, made_up_body, people, turned
@@ -199,3 +200,8 @@ def test_stretches_are_all_the_runs_and_nothing_else(good, least):
         while b < len(good) and good[b] and good[i]:
             b += 1
         assert b - a < least
+
+
+def test_rotations_are_not_put_on_a_body_that_they_do_not_belong_to():
+    with pytest.raises(DataError, match="belong to SMPL-X's body, not to open-1: give --body"):
+        to_clips(recorded(people(60, 2, 30.0, seed=3)), load_body(), "take", "made", "train")

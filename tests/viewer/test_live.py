@@ -175,3 +175,10 @@ def wait(done, seconds: float = 20.0) -> None:
     while not done():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.02)
+
+
+def test_a_start_at_another_rate_is_refused():
+    model = tiny_denoiser(max_agents=2)
+    start = random_scene(1, 40, 2, torch.Generator().manual_seed(0)).replace(fps=60.0)
+    with pytest.raises(ValueError, match="60 frames a second, the model makes 30"):
+        Live(model).begin(2, start)
