@@ -92,8 +92,10 @@ class NoiseStream:
 
         -> (B, count, P, D) each
         """
-        drawn = [self._row() for _ in range(count)]
-        both = torch.stack(drawn, dim=2) if drawn else torch.empty(2, self.shape[0], 0, *self.shape[1:])
+        B, P, D = self.shape
+        both = torch.empty(2, B, count, P, D, device=self.device, dtype=self.dtype)
+        for row in range(count):
+            both[:, :, row] = self._row()
         return both[0], both[1]
 
     def _row(self) -> Tensor:
