@@ -116,7 +116,7 @@ class Parser(LightningArgumentParser):
             value = joined or value
             if name == f"--{key}":
                 chosen = value
-            elif name == "--config" and Path(value).is_file():
+            elif name == "--config" and not value.startswith("{") and Path(value).is_file():  # JSON: a checkpoint's
                 part = (yaml.safe_load(Path(value).read_text()) or {}).get(key)
                 chosen = part.get("class_path", chosen) if isinstance(part, dict) else chosen
         return chosen and chosen.rpartition(".")[2]

@@ -161,3 +161,12 @@ def test_show_imports_no_lightning() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.splitlines()[-1].strip() == "#"
+
+
+def test_a_wrong_flag_is_named_whatever_the_checkpoint_remembers(capsys):
+    """The options of the shipped model are longer than any path may be."""
+    from magnet import cli
+
+    assert cli.main(["test", "--taks", "joint_future"]) == 2
+    said = capsys.readouterr().err
+    assert "no option --taks" in said and "--task" in said
