@@ -14,14 +14,14 @@ from torchmetrics import MetricCollection
 from magnet.baselines import HoldPose, NearestNeighbour, RandomSample
 from magnet.body import Body
 from magnet.denoiser.canvas import Health
-from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.generation import SamplerOptions, planning_grid
 from magnet.metrics import FrechetDistance, all_metrics, frechet_distance, ground_truth_metrics
 from magnet.metrics.frechet import moments
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import STRIDE
 from magnet.report import Results
-from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
 from magnet.tasks.base import Task
 from magnet.tasks.joint import JointFuture
@@ -115,10 +115,8 @@ class Evaluation:
     def schedule(self, model: Denoiser, context: int, horizon: int) -> MaskSchedule:
         """The task's plan for scenes of so many frames."""
         tokens = -(-(context + horizon) // STRIDE)
-        options = self.options
-        grid = Grid(
-            tokens, model.layout.agents, context // STRIDE, options.steps, model.window, options.stride, options.rolling
-        )
+        past = context // STRIDE
+        grid = planning_grid(tokens, model.layout.agents, past, model.window, self.options)
         return self.task.schedule(grid)
 
     def scored_agents(self, model: Denoiser) -> Tensor | None:

@@ -3,7 +3,7 @@
     python scripts/release_weights.py runs/duet_denoiser/latest/checkpoints/last.ckpt duet
 
 writes magnet/weights/duet: tensors in float16 safetensors, and config.json with how to build the model, what it was
-trained on, and a hash of every part.
+trained on, and a hash of every part. `--decoder CHECKPOINT` takes the decoder of a tokenizer that went on alone.
 """
 
 from __future__ import annotations
@@ -46,10 +46,13 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("checkpoint", type=Path)
     options.add_argument("name")
+    options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
     given = options.parse_args()
     run = given.checkpoint.parents[1] / "run.json"
     about = ABOUT | ({"run": json.loads(run.read_text())} if run.exists() else {})
     checkpoint = weights.read(given.checkpoint)
+    if given.decoder:
+        checkpoint = weights.with_decoder(checkpoint, weights.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
     folder = weights.write(checkpoint, weights.FOLDER / given.name, without_folders(about))

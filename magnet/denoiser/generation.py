@@ -37,6 +37,9 @@ class SamplerOptions:
         requantise: snap generated latents to the nearest code before decoding, as the reference does.
         paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
+        eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours).
+        shift: over 1, more of the denoising steps at high noise levels, where what has yet to be decided is decided
+            (ours); 1 spaces them evenly, as the paper does.
         guidance: motion history guidance (paper A.7), off by default.
     """
 
@@ -48,7 +51,15 @@ class SamplerOptions:
     requantise: bool = True
     paste: bool = True
     blend: int = 10
+    eta: float = 0.0
+    shift: float = 1.0
     guidance: Guidance = field(default_factory=Guidance)
+
+
+def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
+    """The grid that a task plans on: sizes in token steps, and how these options sample."""
+    o = options
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift)
 
 
 def occupied(scene: Scene) -> int:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.noise import LEVELS, shifted
 
 NoiseLevels = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
 
@@ -15,19 +15,29 @@ PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
 MIXTURE = (0.35, 0.15, 0.05, 0.45)
 """Shares of the four kinds in `mixture`."""
 
+FROM_NOTHING = 0.2
+"""Share of roll-outs without any past: chance alone would start one in N there, and every generation does."""
 
-def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Generator) -> Tensor:
+
+def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
     `per_sequence`: one a scene. `mixture` (ours) draws one of these or a *roll-out* for each scene: a
     clean past, a block being denoised, an unknown future, which is what the sampler will ask about but
     what independent levels almost never show.
+
+    Args:
+        kind: see above.
+        B, N, P: scenes, token steps, agents.
+        generator: source of all randomness.
+        shift: over 1 draws high levels more often, see `shifted`.
     """
     device = generator.device
 
     def uniform(*shape: int) -> Tensor:
-        return torch.randint(LEVELS + 1, shape, generator=generator, device=device).expand(B, N, P)
+        levels = torch.randint(LEVELS + 1, shape, generator=generator, device=device)
+        return shifted(levels, shift).expand(B, N, P)
 
     if kind == "per_token":
         return uniform(B, N, P)
@@ -41,10 +51,10 @@ def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Gene
     which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator), levels)
+    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator, shift), levels)
 
 
-def rollout_levels(B: int, N: int, P: int, generator: torch.Generator) -> Tensor:
+def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Clean past, one block at a shared level, unknown future; agents may be given or hidden. -> (B, N, P) int
 
     In half of the scenes every agent is generated. In the others each agent is, by chance, generated,
@@ -60,8 +70,9 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator) -> Tensor
 
     zero = torch.zeros(B, 1, 1, dtype=torch.long, device=device)
     past = integers(zero, zero + N - 1)
+    past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < FROM_NOTHING, 0, past)
     stop = integers(past + 1, zero + N)
-    level = integers(zero + 1, zero + LEVELS)
+    level = shifted(integers(zero + 1, zero + LEVELS), shift)
     time = torch.arange(N, device=device)[None, :, None]
     generated = torch.where(time < past, 0, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)

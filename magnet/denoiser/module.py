@@ -58,6 +58,7 @@ class Denoiser(L.LightningModule):
             `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
         noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
             `mixture` (ours: these and the patterns that sampling asks about).
+        level_shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
         latent_weight: lambda_0 of paper Eq. 10.
         step_weight: lambda_1 of paper Eq. 10.
         relation_weight: lambda_2 of paper Eq. 10.
@@ -94,6 +95,7 @@ class Denoiser(L.LightningModule):
         relations: bool = True,
         relation_noise: Literal["noisier_end", "token"] = "noisier_end",
         noise_levels: NoiseLevels = "per_token",
+        level_shift: float = 1.0,
         latent_weight: float = 1.0,
         step_weight: float = 1.0,
         relation_weight: float = 1.0,
@@ -326,7 +328,7 @@ class Denoiser(L.LightningModule):
             tokens, there = self.tokenize(scene)
             truth = self.statistics.normalise(tokens)
             B, N, P, _ = truth.shape
-            levels = draw_levels(h.noise_levels, B, N, P, generator)
+            levels = draw_levels(h.noise_levels, B, N, P, generator, h.level_shift)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
             noisy = add_noise(truth, noise, self.layout.spread(self.layout.group_levels(levels)))
         clean = self.denoise(noisy, levels, scene.pad_agents(P).present).float()

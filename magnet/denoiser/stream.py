@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.canvas import Canvas, Health
-from magnet.denoiser.generation import SamplerOptions, known_tokens, occupied, reach, require_people, scrub, task_sight
+from magnet.denoiser.generation import (
+    SamplerOptions,
+    known_tokens,
+    occupied,
+    planning_grid,
+    reach,
+    require_people,
+    scrub,
+    task_sight,
+)
 from magnet.denoiser.seams import joined
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
@@ -133,7 +142,7 @@ class Stream:
         o = self.options
         tokens = model.window if self.frames is None else -(-self.frames // STRIDE)
         past = context // STRIDE
-        grid = Grid(max(tokens, past), occupied(scene), past, o.steps, model.window, o.stride, o.rolling)
+        grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
         self.rows: float = grid.tokens
         if frames is None:
             schedule, self.plan = endless(task, grid, layout.agents)
@@ -153,7 +162,7 @@ class Stream:
             self.related = torch.zeros_like(self.known)
             self.related[: scene.frames // STRIDE] = True
         B, P = scene.scenes * samples, layout.agents
-        self.noise = NoiseStream((B, P, layout.width), generator, model.device)
+        self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
         self.health.begin(B)
         self.first = self.stop = 0
         self.canvas = Canvas(model, scrub(self.scene, self.known, 0, 0), schedule, o, samples, self.health)
@@ -196,6 +205,8 @@ class Stream:
                 self.canvas.settle,
                 self.progress,
                 self.options.guidance,
+                self.noise,
+                self.first,
             )
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from magnet.seeding import derive
+
 LEVELS = 1000
 """K: level 0 is clean, level K is pure noise."""
 
@@ -40,27 +42,64 @@ def add_noise(clean: Tensor, noise: Tensor, levels: Tensor, K: int = LEVELS) -> 
     return alpha.sqrt() * clean + (1 - alpha).sqrt() * noise
 
 
-def ddim_step(noisy: Tensor, clean: Tensor, now: Tensor, after: Tensor, K: int = LEVELS) -> Tensor:
-    """One deterministic DDIM step (eta 0) from levels `now` down to `after`, given the predicted clean value.
+def ddim_step(
+    noisy: Tensor,
+    clean: Tensor,
+    now: Tensor,
+    after: Tensor,
+    eta: float = 0.0,
+    fresh: Tensor | None = None,
+    K: int = LEVELS,
+) -> Tensor:
+    """One DDIM step from levels `now` down to `after`, given the predicted clean value (Song et al. 2021, Eq. 12, 16).
 
     Elements whose level stays come back bit-identical; those that reach level 0 become `clean` exactly.
+
+    Args:
+        noisy, clean: (..., D).
+        now, after: (..., D) int or broadcastable.
+        eta: how much of the noise that is left is new: 0 none, the deterministic step; 1 as in ancestral sampling.
+        fresh: (..., D) new standard normal noise; needed where eta is not 0.
+        K: number of levels.
     """
     a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
     # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
-    noise = (noisy - a_now.sqrt() * clean) / (1 - a_now).clamp_min(1e-12).sqrt()
-    moved = a_after.sqrt() * clean + (1 - a_after).sqrt() * noise
+    left = (1 - a_now).clamp_min(1e-12)
+    noise = (noisy - a_now.sqrt() * clean) / left.sqrt()
+    if eta and fresh is not None:
+        renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
+        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * fresh
+    else:
+        noise = (1 - a_after).sqrt() * noise
+    moved = a_after.sqrt() * clean + noise
     return torch.where(now == after, noisy, torch.where(after == 0, clean, moved))
 
 
-def ddim_levels(steps: int, K: int = LEVELS) -> Tensor:
-    """The levels a token passes in `steps` denoising steps, from K down to 0. -> (S + 1,) int
+def shifted(levels: Tensor, shift: float, K: int = LEVELS) -> Tensor:
+    """Levels moved toward noise, `shift` u / (1 + (shift - 1) u) of u = level / K; 0 and K stay. (...) int -> same
+
+    A token tells the same pose with hundreds of numbers, so it can be made out until almost nothing of it is
+    left: what has yet to be decided is decided at high levels. (The form: Esser et al. 2024, Scaling rectified
+    flow transformers, for images of high resolution.)
+    """
+    if shift == 1.0:
+        return levels
+    share = levels.double() / K
+    return (K * shift * share / (1 + (shift - 1) * share)).round().long()
+
+
+def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
+    """The levels a token passes in `steps` denoising steps, from K down to 0, `shifted`. -> (S + 1,) int
 
     Raises:
-        ValueError: fewer than one step, or more steps than levels.
+        ValueError: fewer than one step, or so many that two would be at one level.
     """
     if not 1 <= steps <= K:
         raise ValueError(f"denoising steps: got {steps}, expected 1 to {K}")
-    return torch.tensor([K * (steps - s) // steps for s in range(steps + 1)])
+    levels = shifted(torch.tensor([K * (steps - s) // steps for s in range(steps + 1)]), shift, K)
+    if not bool((levels.diff() < 0).all()):
+        raise ValueError(f"denoising steps: {steps} with a shift of {shift:g} pass the same of {K} levels twice")
+    return levels
 
 
 @dataclass
@@ -73,19 +112,25 @@ class NoiseStream:
             is in the batch. None: the global one.
         device: of the noise and of the generators.
         dtype: of the noise.
+        eta: share of new noise in each denoising step, see `ddim_step`.
 
     Raises:
-        ValueError: another number of generators than scenes.
+        ValueError: another number of generators than scenes, or eta outside 0 to 1.
     """
 
     shape: tuple[int, int, int]
     generator: torch.Generator | Sequence[torch.Generator] | None = None
     device: torch.device | str = "cpu"
     dtype: torch.dtype = torch.float32
+    eta: float = 0.0
 
     def __post_init__(self) -> None:
         if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
+        if not 0 <= self.eta <= 1:
+            raise ValueError(f"eta: got {self.eta:g}, expected 0 (no new noise) to 1")
+        # Drawn once: the noise of a step then hangs on its place alone, in whatever order places are asked for.
+        self._seeds = self._draw_seeds() if self.eta else []
 
     def rows(self, count: int) -> tuple[Tensor, Tensor]:
         """The noise of the next `count` token steps, and their veil, which stands in where a view hides them.
@@ -105,3 +150,26 @@ class NoiseStream:
             each = [torch.randn(2, P, D, generator=g, device=self.device, dtype=self.dtype) for g in self.generator]
             return torch.stack(each, dim=1)
         return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)
+
+    def at(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
+        """New noise of the denoising steps that leave these levels, on token steps `first` and on.
+
+        levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)
+        """
+        B, P, D = self.shape
+        noise = torch.zeros(B, *levels.shape, device=self.device, dtype=self.dtype)
+        for row in moves.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
+            for level in levels[row][moves[row]].unique().tolist():
+                seeds = [derive(seed, first + row, level) for seed in self._seeds]
+                drawn = self._seeded(seeds, (B // len(seeds), P, D)).flatten(0, 1)
+                noise[:, row] = torch.where(levels[row] == level, drawn, noise[:, row])
+        return noise
+
+    def _draw_seeds(self) -> list[int]:
+        """One number, or one for each scene where each has a generator."""
+        generators = self.generator if isinstance(self.generator, Sequence) else [self.generator]
+        return [int(torch.randint(2**62, (), generator=g, device=self.device)) for g in generators]
+
+    def _seeded(self, seeds: list[int], shape: tuple[int, int, int]) -> Tensor:
+        draws = [torch.Generator(device=self.device).manual_seed(seed) for seed in seeds]
+        return torch.stack([torch.randn(shape, generator=g, device=self.device, dtype=self.dtype) for g in draws])

@@ -65,7 +65,7 @@ def sample(
     noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
     fresh, veil = noise.rows(N)
     canvas = begin(tokens, fresh, schedule.known, layout)
-    return run_stages(denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance)
+    return run_stages(denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance, noise)
 
 
 def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> Tensor:
@@ -85,13 +85,20 @@ def run_stages(
     settle: Settle | None = None,
     progress: Callable[[int], None] | None = None,
     guidance: Guidance | None = None,
+    noise: NoiseStream | None = None,
+    offset: int = 0,
 ) -> Tensor:
-    """Run stages in their order on a canvas. canvas, veil (B, N, P, D) -> (B, N, P, D)"""
+    """Run stages in their order on a canvas. canvas, veil (B, N, P, D) -> (B, N, P, D)
+
+    Arguments as for `sample`; `noise` gives what is new in each step, and `offset` says which of its rows the canvas
+    begins with.
+    """
     canvas = canvas.clone()
     for stage in stages:
         window = slice(stage.start, stage.stop)
+        tokens, hides, first = canvas[:, window], veil[:, window], offset + stage.start
         canvas[:, window] = run_stage(
-            denoise, stage, canvas[:, window], veil[:, window], present, layout, progress, guidance or Guidance()
+            denoise, stage, tokens, hides, present, layout, progress, guidance or Guidance(), noise, first
         )
         if settle is not None:
             finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
@@ -109,27 +116,30 @@ def run_stage(
     layout: TokenLayout,
     progress: Callable[[int], None] | None,
     guidance: Guidance,
+    noise: NoiseStream | None = None,
+    first: int = 0,
 ) -> Tensor:
-    """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)"""
+    """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)
+
+    `first` is the row of `noise` that the window begins with.
+    """
     device = tokens.device
     levels = stage.levels.to(device).long()
     hidden = None if stage.hidden is None else stage.hidden.to(device)
     for now, after in pairwise(levels):
+        group, group_after = (layout.spread(layout.group_levels(x)) for x in (now, after))
+        moves = group != group_after
+        eta = noise.eta if noise is not None else 0.0
+        fresh = noise.at(first, group, moves) if noise is not None and eta else None
         if hidden is None:
             each = now.expand(len(tokens), -1, -1)
-            moves = layout.spread(layout.group_levels(now) != layout.group_levels(after))
             tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout, moves)
-            tokens = _step(tokens, clean, now, after, layout)
+            tokens = ddim_step(tokens, clean, group, group_after, eta, fresh)
         else:
-            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance)
+            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance, eta, fresh)
         if progress is not None:
             progress(1)
     return tokens
-
-
-def _step(tokens: Tensor, clean: Tensor, now: Tensor, after: Tensor, layout: TokenLayout) -> Tensor:
-    group_now, group_after = layout.group_levels(now), layout.group_levels(after)
-    return ddim_step(tokens, clean, layout.spread(group_now), layout.spread(group_after))
 
 
 def _step_in_views(
@@ -142,6 +152,8 @@ def _step_in_views(
     present: Tensor,
     layout: TokenLayout,
     guidance: Guidance,
+    eta: float,
+    fresh: Tensor | None,
 ) -> Tensor:
     """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
@@ -170,7 +182,7 @@ def _step_in_views(
     )
     moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
     moved = torch.where(unknown, tokens[:, None], moved)
-    stepped = ddim_step(moved, clean, group, group_after)
+    stepped = ddim_step(moved, clean, group, group_after, eta, None if fresh is None else fresh[:, None])
     source = layout.spread(_views_to_read(hidden, view_of, layout))  # (W, P, D)
     return stepped.gather(1, source.expand(B, 1, W, P, -1))[:, 0]
 

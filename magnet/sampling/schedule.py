@@ -22,12 +22,15 @@ class Grid:
     window: int = 16  # token steps W that the model sees at once
     stride: int = 4  # token steps finished before the window moves on
     rolling: int = 0  # denoising steps between a token and the next; 0: the tokens of a stride go together
+    shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
 
     def __post_init__(self) -> None:
         if not 0 <= self.context <= self.tokens or self.agents < 1 or self.tokens < 1:
             raise ValueError(f"no such grid: {self}")
         if not 1 <= self.stride <= self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
+        if not self.shift > 0:
+            raise ValueError(f"shift: got {self.shift:g}, expected a number over 0; 1 leaves the levels even")
         if self.rolling < 0:
             raise ValueError(f"rolling: got {self.rolling}, expected 0 or a number of denoising steps")
         if self.rolling and self.rolled >= self.window:
@@ -193,7 +196,7 @@ class MaskSchedule:
             return MaskSchedule.roll(known, target, grid)
         stages = []
         level = initial_levels(known)
-        plan = ddim_levels(grid.steps)
+        plan = ddim_levels(grid.steps, grid.shift)
         for start, first, last in positions or window_positions(target, grid):
             stop = min(start + grid.window, grid.tokens)
             active = target[start:stop].clone()
@@ -218,7 +221,7 @@ class MaskSchedule:
             target: (N, P) bool, to be generated.
             grid: sizes; `grid.rolling` is the slope.
         """
-        plan = ddim_levels(grid.steps)
+        plan = ddim_levels(grid.steps, grid.shift)
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
         first = wanted[0] if wanted else 0
         level, stages = initial_levels(known), []
@@ -268,7 +271,7 @@ class MaskSchedule:
         if not 1 <= block <= grid.window:
             raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
-        plan = ddim_levels(grid.steps)
+        plan = ddim_levels(grid.steps, grid.shift)
         turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)
         plans = plan[turns.clamp(0, grid.steps)]
         level, stages = initial_levels(known), []

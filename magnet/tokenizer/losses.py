@@ -14,6 +14,9 @@ from magnet.motion.rotations import from_6d, geodesic
 FPS = 30.0
 """Frames a second of every training window."""
 
+FEET = (7, 8, 10, 11)
+"""Ankles and toes."""
+
 BODY = 21 * 6
 """Where the 21 joint rotations of a pose end and T_can_root begins."""
 
@@ -40,7 +43,7 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 def reconstruction_losses(
     decoded: Tensor, truth: Tensor, mask: Tensor, joints: Callable[[Tensor], Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """The terms of paper Eq. 4, each a mean over people, frames and joints; and two of ours.
+    """The terms of paper Eq. 4, each a mean over people, frames and joints; and three of ours.
 
     A smooth-L1 of the angle is quadratic below 1 radian: gentle to the many small errors, not led by a few flips.
 
@@ -48,13 +51,14 @@ def reconstruction_losses(
         decoded: (B, T, P, 135), any scale of 6-D numbers.
         truth: the same of the recording.
         mask: (B, T, P) bool, the frames that count.
-        joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint` and
-            `velocity` (ours).
+        joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`,
+            `velocity` and `foot` (ours).
 
     Returns:
         body: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of the
         joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that
-        flicker cost nothing else, and are what an eye sees first.
+        flicker cost nothing else, and are what an eye sees first. foot: the same of ankles and toes alone, whose
+        flicker is seen as sliding.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -70,7 +74,9 @@ def reconstruction_losses(
     if joints is not None:
         away = joints(decoded) - joints(truth)
         losses["joint"] = masked_mean(_length(away), mask)
-        losses["velocity"] = masked_mean(FPS * _length(away.diff(dim=1)), both)
+        slip = FPS * _length(away.diff(dim=1))
+        losses["velocity"] = masked_mean(slip, both)
+        losses["foot"] = masked_mean(slip[..., FEET], both)
     return losses
 
 

@@ -55,11 +55,14 @@ class Tokenizer(L.LightningModule):
         commitment_weight: pulls embeddings to their codes; the paper does not say.
         joint_weight: adds the distance of the joints in metres to the loss (ours).
         velocity_weight: adds the error of the joints' velocities in m/s to the loss, against flicker (ours).
+        foot_weight: adds the error of ankles' and toes' velocities in m/s to the loss, against sliding feet (ours).
         exchange_limbs: share of limbs that in training move as somebody else's of the batch do (ours).
         turn_joints: radians by which joints are turned at random in training (ours); with exchanged limbs it
             keeps a small data set from being learnt by heart.
         start_from: checkpoint of a tokenizer whose encoder and decoder training starts from; codes start anew
             where there is another number of them.
+        decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
+            trained on them takes the new decoder as it is.
         std_floor: smallest standard deviation used for z-scores of poses and steps.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -84,9 +87,11 @@ class Tokenizer(L.LightningModule):
         commitment_weight: float = 0.3,
         joint_weight: float = 0.0,
         velocity_weight: float = 0.0,
+        foot_weight: float = 0.0,
         exchange_limbs: float = 0.0,
         turn_joints: float = 0.0,
         start_from: str | None = None,
+        decoder_only: bool = False,
         std_floor: float = 1e-2,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
@@ -221,6 +226,10 @@ class Tokenizer(L.LightningModule):
     def on_fit_start(self) -> None:
         if self.hparams["start_from"] and not self._prepared:
             self._start_from(Path(self.hparams["start_from"]))
+        if self.hparams["decoder_only"]:
+            if not self._prepared:
+                raise ValueError("decoder_only: there are no codes to decode yet; give start_from a trained tokenizer")
+            self.codebook.frozen = True
         batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
         if not self._prepared and batches is not None:
             self.prepare(batches())
@@ -268,11 +277,13 @@ class Tokenizer(L.LightningModule):
     def _losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantised]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
         h = self.hparams
-        embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not h["decoder_only"]):
+            embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
         quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         pose = self._reconstruct(quantised.latent, seen.betas, by_token(seen.steps), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
-            joints = self._canonical_joints(seen) if h["joint_weight"] or h["velocity_weight"] else None
+            bodies = h["joint_weight"] or h["velocity_weight"] or h["foot_weight"]
+            joints = self._canonical_joints(seen) if bodies else None
             losses = reconstruction_losses(pose, seen.pose, seen.counts, joints)
         losses["commitment"] = quantised.commitment
         return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantised
@@ -334,7 +345,8 @@ class Tokenizer(L.LightningModule):
     def configure_optimizers(self) -> Any:
         h = self.hparams
         rates = (h["learning_rate"], h["weight_decay"], h["warmup_steps"])
-        return adamw_cosine(self, self.vqvae.parameters(), *rates)
+        trained = self.vqvae.decoder if h["decoder_only"] else self.vqvae
+        return adamw_cosine(self, trained.parameters(), *rates)
 
     # -- freezing and loading ------------------------------------------------------------------
 

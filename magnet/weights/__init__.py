@@ -93,6 +93,22 @@ def _widen(value: Tensor) -> Tensor:
     return value.float() if value.dtype == torch.float16 else value
 
 
+def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
+    """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
+
+    Raises:
+        ValueError: the tokenizer's codes mean something else: it has other codes, statistics or another encoder.
+    """
+    state = dict(checkpoint["state_dict"])
+    for name, value in tokenizer["state_dict"].items():
+        own = f"tokenizer.{name}"
+        if name.startswith("vqvae.decoder."):
+            state[own] = value
+        elif name.startswith(("vqvae.", "codebook.codes")) and not torch.equal(state[own], value):
+            raise ValueError(f"this decoder belongs to other codes than the denoiser's: {name} differs")
+    return checkpoint | {"state_dict": state, "tokenizer_hyper_parameters": dict(tokenizer["hyper_parameters"])}
+
+
 def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None = None, half: bool = True) -> Path:
     """Release a checkpoint as a folder.
 

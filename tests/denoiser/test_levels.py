@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import draw_levels, rollout_levels
+from magnet.denoiser.levels import FROM_NOTHING, draw_levels, rollout_levels
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -30,6 +30,22 @@ def test_a_roll_out_is_a_clean_past_a_block_and_an_unknown_future(generator):
     levels = rollout_levels(3000, 16, 2, generator)
     assert (levels.diff(dim=1) >= 0).all()
     assert (levels[:, -1] == LEVELS).any() and (levels[:, 0] == 0).any()
+
+
+def test_more_roll_outs_begin_from_nothing_than_chance_gives(generator):
+    levels = rollout_levels(4000, 16, 1, generator)
+    nothing = FROM_NOTHING + (1 - FROM_NOTHING) / 16
+    given = 0.25  # half of those in scenes of mixed roles
+    assert (levels[:, 0] > 0).double().mean() == pytest.approx((1 - given) * nothing, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_shift_draws_high_levels_more_often_and_keeps_both_ends(kind, generator):
+    even, moved = (draw_levels(kind, 4000, 4, 2, generator, shift).double() for shift in (1.0, 3.0))
+    assert (int(moved.min()), int(moved.max())) == (0, LEVELS)
+    assert moved.mean() > even.mean() + 40
+    if kind != "mixture":
+        assert moved.median() == pytest.approx(750, abs=30)  # 3 / 2 over 1 + 2 / 2
 
 
 def test_an_unknown_kind_is_named(generator):

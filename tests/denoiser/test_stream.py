@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from magnet.denoiser.canvas import Canvas, Health
-from magnet.denoiser.generation import SamplerOptions, known_tokens, reach, scrub, task_sight
+from magnet.denoiser.generation import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
 from magnet.denoiser.seams import joined
 from magnet.denoiser.stream import Stream, endless, lows
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -49,14 +50,16 @@ def recording() -> Scene:
 def at_once(model, scene: Scene, task, context: int, frames: int, options: SamplerOptions, seed: int = 0) -> Scene:
     """The whole scene on one canvas: encoded, sampled and decoded in one go."""
     tokens = -(-(context + frames) // 4)
-    grid = Grid(tokens, 3, context // 4, options.steps, model.window, options.stride, options.rolling)
+    grid = planning_grid(tokens, 3, context // 4, model.window, options)
     schedule = task.schedule(grid)
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, options, 1)
     start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid))
     generator = torch.Generator().manual_seed(seed)
+    noise = NoiseStream((scene.scenes, 3, model.layout.width), generator, eta=options.eta)
+    present, guidance = given.present, options.guidance
     out = sample(
-        model.denoise, schedule, start, given.present, model.layout, generator, canvas.settle, guidance=options.guidance
+        model.denoise, schedule, start, present, model.layout, settle=canvas.settle, guidance=guidance, noise=noise
     )
     with torch.no_grad():
         return canvas.scene(out).cut(0, context + frames)
@@ -100,6 +103,8 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
         SamplerOptions(steps=2, stride=2, blend=17),
         SamplerOptions(steps=2, stride=2, requantise=False),
         SamplerOptions(steps=4, rolling=2),
+        SamplerOptions(steps=3, stride=2, eta=1.0, shift=3.0),
+        SamplerOptions(steps=4, rolling=2, eta=0.5),
         SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
         SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
     ],
@@ -260,13 +265,14 @@ def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
 # -- one generator for each scene --------------------------------------------------------------
 
 
+@pytest.mark.parametrize("eta", [0.0, 1.0])
 @pytest.mark.parametrize("name", registry.names())
-def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name):
-    context = context_of(name)
+def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, eta):
+    context, options = context_of(name), SamplerOptions(steps=2, stride=2, eta=eta)
 
     def run(scene: Scene, seeds: range, samples: int) -> Scene:
         each = [torch.Generator().manual_seed(seed) for seed in seeds]
-        return model.generate(scene, TASKS[name], context, 48 - context, samples, FAST, each)
+        return model.generate(scene, TASKS[name], context, 48 - context, samples, options, each)
 
     batch = run(recording, range(4), 2)
     for number in range(4):

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from magnet.sampling.noise import LEVELS, NoiseStream, add_noise, alpha_bar, ddim_levels, ddim_step
+from magnet.sampling.noise import LEVELS, NoiseStream, add_noise, alpha_bar, ddim_levels, ddim_step, shifted
 
 
 def test_level_zero_is_clean_and_the_last_level_pure_noise_bit_for_bit(generator):
@@ -35,6 +35,17 @@ def test_thirty_steps_pass_the_papers_levels():
 def test_no_more_steps_than_levels():
     with pytest.raises(ValueError, match="denoising steps: got 1001"):
         ddim_levels(1001)
+    with pytest.raises(ValueError, match="1000 with a shift of 3 pass the same"):
+        ddim_levels(1000, 3.0)
+
+
+def test_shifted_levels_rise_with_the_level_and_keep_both_ends():
+    levels = torch.arange(LEVELS + 1)
+    assert shifted(levels, 1.0) is levels
+    moved = shifted(levels, 3.0)
+    assert (moved.diff() >= 0).all() and moved[[0, 500, -1]].tolist() == [0, 750, LEVELS]
+    assert (moved >= levels).all()
+    assert ddim_levels(4, 3.0).tolist() == [1000, 900, 750, 500, 0]
 
 
 def test_with_the_true_clean_value_a_step_keeps_the_noise(generator):
@@ -44,10 +55,28 @@ def test_with_the_true_clean_value_a_step_keeps_the_noise(generator):
     assert torch.allclose(stepped, add_noise(clean, noise, after), atol=1e-6)
 
 
+@pytest.mark.parametrize("eta", [0.3, 1.0])
+def test_new_noise_leaves_as_much_noise_as_there_should_be(eta, generator):
+    clean, noise, fresh = (torch.randn(200_000, generator=generator, dtype=torch.float64) for _ in range(3))
+    now, after = torch.tensor(700), torch.tensor(300)
+    stepped = ddim_step(add_noise(clean, noise, now), clean, now, after, eta, fresh)
+    left = (stepped - alpha_bar(after).double().sqrt() * clean) / (1 - alpha_bar(after).double()).sqrt()
+    assert left.std() == pytest.approx(1, abs=0.01)
+    assert torch.corrcoef(torch.stack([left, fresh]))[0, 1] > 0.1
+
+
+def test_all_noise_of_the_first_ancestral_step_is_new(generator):
+    clean, noise, fresh = (torch.randn(50, generator=generator) for _ in range(3))
+    now, after = torch.tensor(LEVELS), torch.tensor(600)
+    stepped = ddim_step(noise, clean, now, after, 1.0, fresh)
+    assert torch.allclose(stepped, add_noise(clean, fresh, after), atol=1e-5)
+
+
 def test_what_does_not_move_comes_back_bit_identical(generator):
     noisy, clean = (torch.randn(LEVELS + 1, generator=generator) for _ in range(2))
     levels = torch.arange(LEVELS + 1)
     assert torch.equal(ddim_step(noisy, clean, levels, levels), noisy)
+    assert torch.equal(ddim_step(noisy, clean, levels, levels, 1.0, clean), noisy)
 
 
 def test_what_reaches_level_zero_is_the_prediction(generator):
@@ -55,6 +84,7 @@ def test_what_reaches_level_zero_is_the_prediction(generator):
     levels = torch.arange(LEVELS + 1)
     after = torch.zeros_like(levels)
     assert torch.equal(ddim_step(noisy, clean, levels, after)[1:], clean[1:])
+    assert torch.equal(ddim_step(noisy, clean, levels, after, 1.0, noisy)[1:], clean[1:])
 
 
 def seeded(*seeds: int) -> list[torch.Generator]:
@@ -84,3 +114,35 @@ def test_with_a_generator_each_a_scenes_noise_does_not_depend_on_the_batch():
 def test_generators_are_one_for_each_scene():
     with pytest.raises(ValueError, match="got 1 generators for 2 scenes"):
         NoiseStream((2, 3, 5), seeded(1))
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_the_noise_of_a_step_hangs_on_its_place_alone(each):
+    def stream() -> NoiseStream:
+        return NoiseStream((2, 3, 5), seeded(1, 2) if each else seeded(1)[0], eta=1.0)
+
+    levels = torch.tensor([1000, 1000, 500, 0])[:, None, None].expand(4, 3, 5).clone()
+    levels[2, 1] = 250
+    moves = levels > 0
+    whole, parts = stream(), stream()
+    parts.rows(6)
+    noise = whole.at(10, levels, moves)
+    assert noise.shape == (2, 4, 3, 5)
+    assert torch.equal(noise[:, 1:], parts.at(11, levels[1:], moves[1:]))
+    assert (noise[:, 3] == 0).all()
+    others = [noise[0, 0], noise[1, 0], noise[0, 1], noise[0, 2]]
+    assert not any(torch.equal(a, b) for i, a in enumerate(others) for b in others[:i])
+    again = stream().at(12, torch.full((1, 3, 5), 500), torch.ones(1, 3, 5, dtype=torch.bool))
+    assert torch.equal(noise[:, 2, 0], again[:, 0, 0])
+
+
+def test_with_a_generator_each_a_steps_noise_does_not_depend_on_the_batch():
+    levels = torch.full((2, 3, 5), 700)
+    both = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0).at(0, levels, levels > 0)
+    alone = NoiseStream((1, 3, 5), seeded(2), eta=1.0).at(0, levels, levels > 0)
+    assert torch.equal(both[1:], alone)
+
+
+def test_eta_is_a_share():
+    with pytest.raises(ValueError, match="eta: got 2, expected 0"):
+        NoiseStream((1, 1, 1), eta=2.0)

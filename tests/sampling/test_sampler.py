@@ -90,6 +90,8 @@ def test_agents_have_no_names_in_the_loop(generator):
     noise = torch.randn(2, *tokens.shape, generator=generator)
 
     class Given:
+        eta = 0.0
+
         def __init__(self, both: Tensor) -> None:
             self.both = both
 

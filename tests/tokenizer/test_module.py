@@ -286,6 +286,23 @@ def test_resumed_training_ends_bit_identical(
     assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
 
 
+def test_training_the_decoder_alone_leaves_the_meaning_of_codes(
+    run: tuple[Tokenizer, Path], tmp_path: Path, scene: Scene
+) -> None:
+    before, folder = run
+    start = str(folder / "epoch=3.ckpt")
+    after = tiny(start_from=start, decoder_only=True, joint_weight=0.1, foot_weight=0.1, revive_below=5.0)
+    trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(after, datamodule=Scenes())
+    changed = [name for name, value in after.state_dict().items() if not torch.equal(before.state_dict()[name], value)]
+    assert changed and all(name.startswith("vqvae.decoder.") for name in changed)
+    assert torch.equal(before.eval().encode_scene(scene), after.eval().encode_scene(scene))
+
+
+def test_there_is_no_decoder_alone_without_codes(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="give start_from a trained tokenizer"):
+        trainer(tmp_path, enable_checkpointing=False).fit(tiny(decoder_only=True), datamodule=Scenes())
+
+
 def test_the_learning_rate_falls_to_zero_on_a_cosine(run: tuple[Tokenizer, Path]) -> None:
     checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
     assert checkpoint["lr_schedulers"][0]["_last_lr"] == [pytest.approx(0.0, abs=1e-12)]

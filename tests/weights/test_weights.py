@@ -80,3 +80,18 @@ def test_foreign_code_in_a_checkpoint_is_not_run(tmp_path, capsys):
 def test_an_unknown_name_says_which_there_are():
     with pytest.raises(ValueError, match="no checkpoint no_such: not a file, nor a model"):
         weights.resolve("no_such")
+
+
+def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoint):
+    names = ("vqvae.encoder.a", "vqvae.decoder.b", "vqvae.pose.mean", "codebook.codes", "codebook.ema_count")
+    old = {name: torch.randn(3) for name in names}
+    checkpoint["state_dict"] |= {f"tokenizer.{name}": value for name, value in old.items()}
+    new = {"vqvae.decoder.b": torch.randn(3), "codebook.ema_count": torch.randn(3)}
+    tokenizer = {"state_dict": old | new, "hyper_parameters": {"decoder_only": True}}
+    state = weights.with_decoder(checkpoint, tokenizer)["state_dict"]
+    changed = [name for name, value in state.items() if not torch.equal(checkpoint["state_dict"][name], value)]
+    assert changed == ["tokenizer.vqvae.decoder.b"]
+    for name in ("vqvae.encoder.a", "vqvae.pose.mean", "codebook.codes"):
+        other = tokenizer["state_dict"] | {name: torch.randn(3)}
+        with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
+            weights.with_decoder(checkpoint, tokenizer | {"state_dict": other})
