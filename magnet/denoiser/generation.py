@@ -37,7 +37,8 @@ class SamplerOptions:
         requantise: snap generated latents to the nearest code before decoding, as the reference does.
         paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
-        eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours).
+        eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
+            `shift` and `trust` chosen on validation scenes (docs/results.md).
         shift: over 1, more of the denoising steps at high noise levels, where what has yet to be decided is decided
             (ours); 1 spaces them evenly, as the paper does.
         guidance: motion history guidance (paper A.7), off by default.
@@ -47,12 +48,12 @@ class SamplerOptions:
     stride: int = 4
     rolling: int = 0
     placement: Placement = "fuse"
-    trust: float = 0.003
+    trust: float = 0.02
     requantise: bool = True
     paste: bool = True
     blend: int = 10
-    eta: float = 0.0
-    shift: float = 1.0
+    eta: float = 1.0
+    shift: float = 3.0
     guidance: Guidance = field(default_factory=Guidance)
 
 
