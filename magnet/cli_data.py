@@ -7,12 +7,9 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from magnet.cli_data_shown import bar, file_bars, show_skipped, show_splits
-
-if TYPE_CHECKING:
-    from magnet.datamodules.recording import Reader
+from magnet.cli_data_options import all_reader_options, order_of, reader_parser
+from magnet.cli_data_shown import bar, file_bars, show_persons, show_skipped, show_splits
 
 DESCRIPTION = """\
 Prepare, check, describe, fake and download data sets.
@@ -91,6 +88,13 @@ def add_info(one: argparse.ArgumentParser) -> None:
 def add_work(one: argparse.ArgumentParser) -> None:
     one.add_argument("--body", default="open", help="SMPL-X's npz (register at https://smpl-x.is.tue.mpg.de)")
     one.add_argument(
+        "--bodies",
+        nargs="+",
+        default=(),
+        help="folder or files of gendered bodies (SMPLX_FEMALE.npz ...) that the shape numbers belong to; people are "
+        "expressed in the one --body",
+    )
+    one.add_argument(
         "--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)"
     )
     one.add_argument("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
@@ -142,44 +146,6 @@ def needed(given: argparse.Namespace, *names: str) -> list[str]:
     return [getattr(given, name) for name in names]
 
 
-def all_reader_options(words: Sequence[str]) -> bool:
-    """Whether words are `--reader.OPTION VALUE` or `--reader.OPTION=VALUE` alone."""
-    expected = "flag"
-    for word in words:
-        if word.startswith("--reader."):
-            expected = "value or flag" if "=" not in word else "flag"
-        elif expected == "flag":
-            return False
-    return True
-
-
-def reader_parser(kind: type[Reader]) -> Any:
-    """Options of a data set's reader, from its constructor."""
-    from jsonargparse import ArgumentParser
-
-    options = ArgumentParser(prog="magnet data prepare", exit_on_error=False, add_help=False)
-    options.add_class_arguments(kind, "reader", skip={"root"})
-    return options
-
-
-def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
-    """What was given of them.
-
-    Raises:
-        ValueError: an option that the reader has not, or a value that does not fit.
-    """
-    from jsonargparse import ArgumentError
-
-    options = reader_parser(kind)
-    try:
-        config = options.parse_args(list(words)).as_dict().get("reader", {})
-    except ArgumentError as error:
-        known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
-        raise ValueError(f"{kind.title}: {error}; its options are {', '.join(known) or 'none'}") from error
-    flags = {word.split("=")[0].removeprefix("--reader.") for word in words if word.startswith("--reader.")}
-    return {name: value for name, value in config.items() if name in flags}
-
-
 # -- commands ----------------------------------------------------------------------------------
 
 
@@ -210,7 +176,9 @@ def run_info(given: argparse.Namespace) -> int:
     m = folder.manifest
     out = Console(highlight=False)
     out.print(f"[bold]{m['title']}[/bold]  {m['licence']}\n{m['source']}", soft_wrap=True)
-    out.print(f"body {m['body']['id']} ({m['body']['sha256'][:8]}), {m['fps']:g} fps, store format {m['format']}")
+    genders = "".join(f", from {gender} ones ({digest[:8]})" for gender, digest in m["body"].get("genders", {}).items())
+    body = f"body {m['body']['id']} ({m['body']['sha256'][:8]}){genders}"
+    out.print(f"{body}, {m['fps']:g} fps, store format {m['format']}", soft_wrap=True)
     rows = sum(split["person frames"] for split in m["splits"].values())
     files = [folder.path / name for name in folder.files()]
     size = sum(file.stat().st_size for file in files if file.is_file())
@@ -230,6 +198,7 @@ def run_info(given: argparse.Namespace) -> int:
             for name, split in sorted(m["splits"].items(), key=lambda item: ("train", "val", "test").index(item[0]))
         ]
     )
+    show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
     for entry in m["notes"]:
         out.print(f"note: {entry['note']} ({len(entry['takes'])} takes)", soft_wrap=True, markup=False)
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
@@ -240,8 +209,7 @@ def run_info(given: argparse.Namespace) -> int:
 
 def run_check(given: argparse.Namespace) -> int:
     from magnet.body import load_body
-    from magnet.datamodules import catalogue, check
-    from magnet.datamodules.prepare_takes import Order
+    from magnet.datamodules import check
     from magnet.datamodules.store import MANIFEST, STATE, Folder
 
     path = Path(needed(given, "path")[0]).expanduser()
@@ -255,8 +223,7 @@ def run_check(given: argparse.Namespace) -> int:
         if not path.is_dir():
             raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
         name = given.name or check.recognise(path)
-        options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
-        order = Order(name, str(path), options, given.body, steps_of(given))
+        order = order_of(given, name, str(path))
         body = order.body()
         with bar() as tell:
             found = check.check_download(order, given.workers, given.limit, tell)
@@ -275,11 +242,9 @@ def run_check(given: argparse.Namespace) -> int:
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
     from magnet.datamodules.prepare import prepare, read_splits
-    from magnet.datamodules.prepare_takes import Order
 
     name, root, out = needed(given, "name", "root", "out")
-    options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
-    order = Order(name, root, options, given.body, steps_of(given))
+    order = order_of(given, name, root)
     splits = read_splits(given.splits) if given.splits else None
     with bar() as tell:
         report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
@@ -337,10 +302,3 @@ COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], Callable[[a
     "prepare": (add_prepare, run_prepare, "turn a download into a store, once"),
     "download": (add_download, run_download, "fetch CMU's free recordings"),
 }
-
-
-def steps_of(given: argparse.Namespace) -> Any:
-    """What was chosen about the common steps."""
-    from magnet.datamodules.common import Steps
-
-    return Steps(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)

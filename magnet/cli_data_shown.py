@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SKIPPED_SHOWN = 20
+PERSONS_SHOWN = 8
 
 
 def show_splits(rows: list[tuple[str, ...]], title: str | None = None) -> None:
@@ -29,6 +30,14 @@ def show_skipped(skipped: list[tuple[str, str]]) -> None:
         print(f"  {take}: {why}")
     if len(skipped) > SKIPPED_SHOWN:
         print(f"  ... and {len(skipped) - SKIPPED_SHOWN} more, all of them in the store's manifest.json")
+
+
+def show_persons(groups: list[tuple[list[str], int]]) -> None:
+    """Names or roles of people who were recorded together, the most frequent first."""
+    for names, takes in sorted(groups, key=lambda group: -group[1])[:PERSONS_SHOWN]:
+        print(f"people: {' | '.join(names)} ({takes} takes)")
+    if len(groups) > PERSONS_SHOWN:
+        print(f"  ... and {len(groups) - PERSONS_SHOWN} more groups, all of them in the store's manifest.json")
 
 
 @contextmanager

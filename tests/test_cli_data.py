@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnet import cli, cli_data
+from magnet import cli, cli_data_options
 from magnet.datamodules import catalogue
 
 
@@ -127,7 +127,7 @@ def test_help_shows_a_data_sets_own_options(capsys):
 
 def test_readers_options_are_read_by_their_types():
     kind = catalogue.find("embody3d").load_reader()
-    got = cli_data.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
+    got = cli_data_options.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
     assert got == {"people": [2, 3], "good": 0}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from magnet.body import Body, load_body
 from magnet.datamodules.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
 from magnet.datamodules.loaders import FixedLoader, TrainLoader
+from magnet.datamodules.store_mapped import MappedStore, Piece
 from magnet.datamodules.windows import Clip, Draw, Split, Store
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
@@ -55,6 +56,8 @@ class MotionDataModule(LightningDataModule):
         body_model: "open" or the path of a body file in SMPL-X's npz layout.
         device_resident: keep all frames on the trainer's device; False: gather on the CPU and send batches,
             for data sets larger than the GPU's memory.
+        read_ahead: training batches that threads read from a store on disk while the model computes; 0: none. Nothing
+            is read ahead of clips that are in memory.
 
     Raises:
         ValueError: a number is out of its range.
@@ -85,6 +88,7 @@ class MotionDataModule(LightningDataModule):
         seed: int = 1111,
         body_model: str = "open",
         device_resident: bool = True,
+        read_ahead: int = 2,
     ) -> None:
         super().__init__()
         at_least_one = {
@@ -101,8 +105,9 @@ class MotionDataModule(LightningDataModule):
         for name, number in at_least_one.items():
             if number is not None and number < 1:
                 raise ValueError(f"{name}: got {number}, expected at least 1")
-        if context_frames < 0:
-            raise ValueError(f"context_frames: got {context_frames}, expected 0 (from nothing) or more")
+        for name, number in {"context_frames": context_frames, "read_ahead": read_ahead}.items():
+            if number < 0:
+                raise ValueError(f"{name}: got {number}, expected 0 (none) or more")
         for name, share in {"drop_agent": drop_agent, "compose": compose}.items():
             if not 0 <= share <= 1:
                 raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
@@ -129,6 +134,7 @@ class MotionDataModule(LightningDataModule):
         self.seed = seed
         self.body_model = body_model
         self.device_resident = device_resident
+        self.read_ahead = read_ahead
         self._stores: dict[tuple[str, torch.device], Store] = {}
         self._train_loader: TrainLoader | None = None
         self._resume: dict[str, int] | None = None
@@ -173,11 +179,20 @@ class MotionDataModule(LightningDataModule):
             )
         return Store(clips, self.max_agents)
 
-    def _gather(self, split: Split, frames: int, draw: Draw) -> Scene:
+    def piece(self, split: Split) -> Piece | None:
+        """The clips of a split as rows to be read by memory map; None: there are none."""
+        clips = self.clips(split)
+        return Piece.encoded(clips) if clips else None
+
+    def _placed(self, split: Split) -> Store:
+        """The split's store where the trainer computes."""
         device = torch.device("cpu")
         if self.trainer is not None and (self.device_resident or self.maps_files):
             device = self.trainer.strategy.root_device
-        return self.store(split, device).gather(draw, frames, self.compose_clearance)
+        return self.store(split, device)
+
+    def _gather(self, split: Split, frames: int, draw: Draw) -> Scene:
+        return self._placed(split).gather(draw, frames, self.compose_clearance)
 
     def _shard(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
@@ -190,14 +205,21 @@ class MotionDataModule(LightningDataModule):
         place = self._shard()
         draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
         size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
-        self._train_loader = TrainLoader(
-            draws,
-            lambda draw: self._gather("train", self.window_frames, draw),
-            self.batch_size,
-            size,
-            *place,
-            shared=draws.shared,
-        )
+        placed, frames, clearance = self._placed("train"), self.window_frames, self.compose_clearance
+        if isinstance(placed, MappedStore):
+            self._train_loader = TrainLoader(
+                draws,
+                lambda fetched: placed.finish(fetched, clearance),
+                self.batch_size,
+                size,
+                *place,
+                shared=draws.shared,
+                fetch=lambda draw: placed.fetch(draw, frames, clearance),
+                ahead=self.read_ahead,
+            )
+        else:
+            gather = partial(self._gather, "train", frames)
+            self._train_loader = TrainLoader(draws, gather, self.batch_size, size, *place, shared=draws.shared)
         if self._resume is not None:
             self._train_loader.load_state_dict(self._resume)
             self._resume = None

@@ -28,8 +28,11 @@ TRUNK = (0.2, 0.9)
 """Metres from the middle of the hips to the middle of the shoulders."""
 JUMP = 0.4
 """Metres that no pelvis moves from one frame to the next at 30 fps."""
-RUNNING, PUSH = 8.0, 25.0
-"""m/s and m/s2 that a pelvis stays below for 95 % of the time."""
+RUNNING, PUSH = 8.0, 35.0
+"""m/s and m/s2 that a pelvis stays below for 95 % of the time; leaping dancers reach 31 m/s2."""
+FALL = 21.0
+"""m/s2 of a pelvis downwards, over 0.1 s, for 2 % of the time: nothing but gravity pulls, and leaping dancers, who
+fold their legs, reach 18. Whoever leaps at twice the rate exceeds it."""
 STEP, STEPS = (0.14, 1.1), 4
 """Seconds that a foot is on its way in a step, by the median of at least so many steps."""
 STROLL, SLOWLY = 0.9, 0.7
@@ -138,7 +141,7 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
     """Translations are in metres, as the bodies are that they move. joints (T, P, 22, 3), pelvis (T, P, 3), y up
 
     Raises:
-        DataError: people are too far from each other, from the floor or from where they were, or too near.
+        DataError: people are too far from each other, from the floor or from where they were.
     """
     lowest = joints[:, :, [j for foot in FEET for j in foot], 1].min(axis=-1)
     bob = float(np.ptp(np.percentile(lowest[valid], [5, 95])))
@@ -156,10 +159,19 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
                 f"{what} {length:.0f} m, expected less than {most:.0f} m: translations look like "
                 f"{_unit(max(got / limit for got, limit, _ in measures))}, expected metres"
             )
+
+
+def check_apart(transl: Array, valid: Bools) -> None:
+    """Translations (T, P, 3), before shapes put pelvises in different places, keep people apart.
+
+    Raises:
+        DataError: they put everybody into one place.
+    """
+    apart = _apart(transl, valid)
     if apart is not None and apart < INSIDE:
         raise DataError(
-            f"pelvises of different people are {1000 * apart:.1f} mm apart: translations look too small, perhaps they "
-            f"were divided by 1000 twice; expected metres"
+            f"translations of different people are {1000 * apart:.1f} mm apart: they look too small, perhaps they were "
+            f"divided by 1000 twice; expected metres"
         )
 
 
@@ -204,7 +216,8 @@ def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
 def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None:
     """People move as fast as people do, so that the declared frame rate is the true one. joints of `WALKING`, y up
 
-    Too fast shows in what a pelvis does and in short steps; too slow only in long steps, where anybody walks.
+    Too fast shows in what a pelvis does, in leaps that are steeper than falling, and in short steps; too slow only in
+    long steps, where anybody walks.
 
     Raises:
         DataError: speeds, accelerations or the duration of steps are nobody's; or nothing moves at all.
@@ -218,15 +231,22 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
     if np.linalg.norm(move[fine], axis=-1).max() < 1e-3:
         raise DataError(f"nothing moves in {len(joints)} frames: the file repeats one frame")
     pelvis = move[:, :, 0]
-    push = np.linalg.norm(np.diff(pelvis, axis=0), axis=-1) * fps
+    pull = np.diff(pelvis, axis=0) * fps
+    push = np.linalg.norm(pull, axis=-1)
     speed = float(np.percentile(np.linalg.norm(pelvis[fine], axis=-1), 95))
-    push95 = float(np.percentile(push[fine[1:] & fine[:-1]], 95)) if (fine[1:] & fine[:-1]).any() else 0.0
+    sure = fine[1:] & fine[:-1]
+    push95 = float(np.percentile(push[sure], 95)) if sure.any() else 0.0
+    over = sure[2:] & sure[1:-1] & sure[:-2]
+    down = -(pull[2:, :, 1] + pull[1:-1, :, 1] + pull[:-2, :, 1])[over] / 3
+    fall = float(np.percentile(down, 98)) if over.any() else 0.0
     durations, pace = steps(joints, together, fps)
     seen = f"at the declared {declared:g} frames a second pelvises move at {speed:.1f} m/s with {push95:.0f} m/s2"
     median = float(np.median(durations)) if len(durations) >= STEPS else None
     if median is not None:
         seen += f" and feet take {median:.2f} s for a step"
-    if speed > RUNNING or push95 > PUSH or (median is not None and median < STEP[0]):
+    if fall > FALL:
+        seen += f" and drop with {fall:.0f} m/s2, faster than falling"
+    if speed > RUNNING or push95 > PUSH or fall > FALL or (median is not None and median < STEP[0]):
         raise DataError(f"{seen}: too fast for people; perhaps 30 frames a second are called 120 {KEEP}")
     if median is not None and median > STEP[1] and float(np.median(pace)) < STROLL and speed < SLOWLY:
         raise DataError(f"{seen}: too slow for people; perhaps 120 frames a second are called 30 {KEEP}")
@@ -258,12 +278,12 @@ def steps(joints: Array, together: Bools, fps: float) -> tuple[Array, Array]:
     return np.array(durations), np.array(pace)
 
 
-def _apart(pelvis: Array, valid: Bools) -> float | None:
+def _apart(place: Array, valid: Bools) -> float | None:
     """Median distance of everybody from the first person, metres."""
     both = valid[:, 1:] & valid[:, :1]
     if not both.any():
         return None
-    return float(np.median(np.linalg.norm(pelvis[:, 1:] - pelvis[:, :1], axis=-1)[both]))
+    return float(np.median(np.linalg.norm(place[:, 1:] - place[:, :1], axis=-1)[both]))
 
 
 def _unit(times_too_large: float) -> str:

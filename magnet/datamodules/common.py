@@ -21,7 +21,7 @@ from magnet.datamodules.windows import Clip, Split
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
-STEPS_VERSION = 1
+STEPS_VERSION = 2
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
 FPS = 30.0
 FLOOR_PERCENTILE = 5.0
@@ -116,6 +116,9 @@ def to_clips(
     """
     steps = steps or Steps()
     notes = list(recording.notes)
+    for p, gender in enumerate(recording.genders):  # of a body that nobody gave
+        who = recording.persons[p] if recording.persons else f"person {p}"
+        notes.append(f"{who}: {gender}; the shape is used with the body model given")
     up = steps.up or recording.up
     valid = check_motion.usable(recording)
     if recording.poses is not None and body.id.startswith("open"):
@@ -139,7 +142,7 @@ def to_clips(
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
     motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
     if family == "smpl" and not any("shape" in note for note in notes):
-        notes.append("shape numbers are SMPL's, another basis than SMPL-X's: limb lengths are approximate")
+        notes.append("shape numbers are SMPL's, another basis than SMPL-X's: without --bodies limbs are approximate")
     return Outcome(_cut(motion, jumps, body, name, source, split, steps.min_frames), tuple(notes))
 
 
@@ -187,6 +190,7 @@ def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> Motion
     check_motion.check_angles(recording.poses, valid)
     poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
     transl = check_motion.filled(np.asarray(recording.transl, dtype=np.float64), valid)
+    check_motion.check_apart(transl, valid)
     betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
     quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
     rotations = roma.unitquat_to_rotmat(resample_rotations(quat, recording.fps)).float()

@@ -9,7 +9,16 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from magnet.datamodules.arrays import one_length
-from magnet.datamodules.fields import Person, first_folder, listing, mapping, rows, shape_numbers, side_by_side
+from magnet.datamodules.fields import (
+    Person,
+    first_folder,
+    gender_of,
+    listing,
+    mapping,
+    rows,
+    shape_numbers,
+    side_by_side,
+)
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.unpickle import load_object_npy
@@ -44,6 +53,7 @@ class DD100Reader(Reader):
     source: ClassVar[str] = "https://github.com/lisiyao21/Duolando"
     licence: ClassVar[str] = "NTU S-Lab License 1.0: non-commercial"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    version: ClassVar[int] = 2  # genders are read
 
     def __init__(
         self,
@@ -107,9 +117,8 @@ class DD100Reader(Reader):
         frames = one_length(path, lengths)
         shape, notes = shape_numbers(path, held)
         meta = held.get("meta")
-        if isinstance(meta, dict) and "gender" in meta:
-            notes = (f"{meta['gender']}; the shape is used with the body model given", *notes)
-        return Person(poses[:, :66].reshape(frames, 22, 3), transl, shape, role, notes)
+        gender = gender_of(meta.get("gender")) if isinstance(meta, dict) else None
+        return Person(poses[:, :66].reshape(frames, 22, 3), transl, shape, role, notes, gender)
 
 
 class DD100(Prepared):

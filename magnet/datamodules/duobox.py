@@ -34,7 +34,9 @@ MAP = {
     9: "Spine1", 10: "LeftToeBase", 11: "RightToeBase", 12: "Neck", 15: "Head", 16: "LeftArm", 17: "RightArm",
     18: "LeftForeArm", 19: "RightForeArm", 20: "LeftHand", 21: "RightHand",
 }  # fmt: skip
-"""Our joint: MOTIVE's, by DuoBox's authors: the pelvis and 18 more. Spine2 and the collars have no counterpart."""
+"""Our joint: MOTIVE's, the 19 pairs of DuoBox's authors (reactmotion/utils/skeleton.py): the pelvis and 18 more.
+
+Spine2 and the collars have no counterpart; the authors leave MOTIVE's Left- and RightShoulder out."""
 
 
 class DuoBoxReader(Reader):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from magnet.datamodules.arrays import Doubles, floats, one_length, one_shape, require
-from magnet.datamodules.recording import Axis, DataError, Recording
+from magnet.datamodules.recording import GENDERS, Axis, DataError, Gender, Recording
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Person:
     betas: Doubles  # (10,)
     name: str
     notes: tuple[str, ...] = ()
+    gender: Gender | None = None
 
     @property
     def frames(self) -> int:
@@ -68,16 +69,33 @@ def shape_numbers(where: object, held: Mapping[str, Any], key: str = "betas") ->
     return one_shape(f"{where}: {key}", floats(f"{where}: {key}", value, ("T", "shapes")))
 
 
+def gender_of(said: Any) -> Gender | None:
+    """The gender in a file's own words: text, bytes, or an array of one of them; None: it says something else."""
+    said = said.item() if isinstance(said, np.ndarray) and said.size == 1 else said
+    said = said.decode("latin-1") if isinstance(said, bytes) else said
+    return next((gender for gender in GENDERS if isinstance(said, str) and said.strip().lower() == gender), None)
+
+
 def person(
     where: object,
     held: Mapping[str, Any],
     name: str,
     *,
+    gender: Any = None,
     orient: str = "global_orient",
     body: str = "body_pose",
     transl: str = "transl",
 ) -> Person:
     """One person from a dict with keys of SMPL-X's family: root and 21 body joints in axis-angle, metres.
+
+    Args:
+        where: the file, for messages.
+        held: what it holds.
+        name: of the person.
+        gender: of the body that the shape is of, as the data set says it.
+        orient: the root's key.
+        body: the joints' key.
+        transl: the translation's key.
 
     Raises:
         DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
@@ -87,7 +105,7 @@ def person(
     frames = one_length(where, {key: len(part) for key, part in parts.items()})
     poses = np.concatenate([parts[orient], parts[body]], axis=1).reshape(frames, 22, 3)
     shape, notes = shape_numbers(where, held)
-    return Person(poses, parts[transl], shape, name, notes)
+    return Person(poses, parts[transl], shape, name, notes, gender_of(gender))
 
 
 def side_by_side(
@@ -112,6 +130,7 @@ def side_by_side(
         listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
         said.append(f"unequal numbers of frames ({listed}), cut to the shortest")
     said += [f"{someone.name}: {note}" for someone in people for note in someone.notes]
+    known = any(someone.gender for someone in people)
     return Recording(
         fps=fps,
         up=up,
@@ -120,6 +139,7 @@ def side_by_side(
         betas=np.stack([someone.betas for someone in people]),
         persons=tuple(lengths),
         notes=tuple(said),
+        genders=tuple(someone.gender or "neutral" for someone in people) if known else (),
     )
 
 

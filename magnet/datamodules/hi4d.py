@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.windows import Split
 
-BASIS = "shape numbers are SMPL's, of the person's gender: another basis than SMPL-X's, limbs differ by centimetres"
+BASIS = "shape numbers are SMPL's, another basis than SMPL-X's: without --bodies limbs differ by centimetres"
 SHAPES = {"global_orient": (2, 3), "body_pose": (2, 69), "transl": (2, 3), "betas": (2, 10)}
 
 
@@ -40,6 +40,7 @@ class Hi4DReader(Reader):
     source: ClassVar[str] = "https://yifeiyin04.github.io/Hi4D"
     licence: ClassVar[str] = "non-commercial scientific research only, by form; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    version: ClassVar[int] = 2  # genders are read
 
     def __init__(
         self, root: str | Path, test_pairs: Sequence[int] = (28, 32, 37), val_pairs: Sequence[int] = (23, 27)
@@ -65,14 +66,14 @@ class Hi4DReader(Reader):
     def read(self, take: Take) -> Recording:
         """Both people at 30 fps, y up."""
         meta, *files = take.files
-        notes = self._check_frames(meta, files)
+        notes, genders = self._check_frames(meta, files)
         frames = [self._frame(path) for path in files]
         arrays = {key: np.stack([frame[key] for frame in frames], axis=1) for key in SHAPES}
         arrays["body_pose"] = arrays["body_pose"][..., :63]
         where = meta.parent / "smpl"
         people = [
-            person(f"{where}, person {p}", {key: array[p] for key, array in arrays.items()}, f"person {p}")
-            for p in range(2)
+            person(f"{where}, person {p}", {key: array[p] for key, array in arrays.items()}, f"person {p}", gender=one)
+            for p, one in enumerate(genders)
         ]
         return side_by_side(where, people, 30.0, "+y", notes=[*notes, BASIS])
 
@@ -80,9 +81,9 @@ class Hi4DReader(Reader):
         found = ((re.fullmatch(r"pair(\d+)", path.name), path) for path in sorted(self.root.iterdir()))
         return [(int(match[1]), path) for match, path in found if match and path.is_dir()]
 
-    def _check_frames(self, meta: Path, files: list[Path]) -> list[str]:
-        """Frames are consecutive and those that meta.npz says; whether `end` is one of them is not documented."""
-        said = open_npz(meta, ("start", "end", "num_persons"))
+    def _check_frames(self, meta: Path, files: list[Path]) -> tuple[list[str], list[Any]]:
+        """Notes and genders. Frames are those that meta.npz says; whether `end` is one of them is not documented."""
+        said = open_npz(meta, ("start", "end", "num_persons"), ("genders",))
         start, end, people = (self._number(meta, said, key) for key in ("start", "end", "num_persons"))
         if people != 2:
             raise DataError(f"{meta}: num_persons is {people}, expected 2; {AGAIN}")
@@ -100,7 +101,9 @@ class Hi4DReader(Reader):
                 f"{folder}: {len(files)} frames from {first} to {last}{lacking}, but meta.npz says {start} to {end}; "
                 f"{AGAIN}"
             )
-        return [] if last == end else [f"meta.npz's end {end} is one past the last frame"]
+        genders = np.ravel(said["genders"]).tolist() if "genders" in said else []
+        notes = [] if last == end else [f"meta.npz's end {end} is one past the last frame"]
+        return notes, genders if len(genders) == 2 else [None, None]
 
     def _number(self, path: Path, said: dict[str, np.ndarray], key: str) -> int:
         value = float(floats(f"{path}: {key}", np.ravel(said[key]), (1,))[0])

@@ -18,7 +18,7 @@ from magnet.datamodules.windows import Split
 FPS = 59.94
 PEOPLE = ("person1", "person2")
 LISTS: tuple[Split, ...] = ("train", "val", "test")
-BASIS = "shape numbers are SMPL-H's, another basis than SMPL-X's: limbs differ by centimetres"
+BASIS = "shape numbers are SMPL-H's, another basis than SMPL-X's: without --bodies limbs differ by centimetres"
 
 
 class InterHumanReader(Reader):
@@ -40,6 +40,7 @@ class InterHumanReader(Reader):
     source: ClassVar[str] = "https://github.com/tr3e/InterGen"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    version: ClassVar[int] = 2  # genders are read
 
     def __init__(self, root: str | Path, fps: float = FPS) -> None:
         super().__init__(root)
@@ -65,7 +66,8 @@ class InterHumanReader(Reader):
             )
         notes = [*self._rate(path, said), BASIS]
         keys = {"orient": "root_orient", "body": "pose_body", "transl": "trans"}
-        people = [person(f"{path}, {name}", mapping(f"{path}, {name}", said[name]), name, **keys) for name in PEOPLE]
+        held = {name: mapping(f"{path}, {name}", said[name]) for name in PEOPLE}
+        people = [person(f"{path}, {name}", one, name, gender=one.get("gender"), **keys) for name, one in held.items()]
         scene = side_by_side(path, people, self.fps, "+z", notes=notes)
         frames = said.get("frames")
         if isinstance(frames, int | np.integer) and frames != scene.frames:

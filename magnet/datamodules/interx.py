@@ -45,6 +45,7 @@ class InterXReader(Reader):
     source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    version: ClassVar[int] = 2  # genders are read
 
     def __init__(
         self, root: str | Path, split: Literal["official", "paper"] = "official", lists: str | None = None
@@ -132,18 +133,14 @@ class InterXReader(Reader):
     def read(self, take: Take) -> Recording:
         """P1 and P2 at 120 fps, y up; `persons` are their roles where interaction_order.pkl tells."""
         held = [open_npz(path, KEYS, ("gender",)) for path in take.files]
-        notes = [
-            f"{path.stem}: {one['gender']}; the shape is used with the body model given"
-            for path, one in zip(take.files, held, strict=True)
-            if "gender" in one
-        ]
+        notes: list[str] = []
         names = ("P1", "P2")
         if isinstance(self._order, DataError):
             notes.append(f"roles are unknown: {self._order}")
         elif self._order is not None and (actor := self._order.get(take.name[:16])) in (0, 1):
             names = ("P1, actor", "P2, reactor") if actor == 0 else ("P1, reactor", "P2, actor")
         people: list[Person] = [
-            person(path, one, name, orient="root_orient", body="pose_body", transl="trans")
+            person(path, one, name, gender=one.get("gender"), orient="root_orient", body="pose_body", transl="trans")
             for path, one, name in zip(take.files, held, names, strict=True)
         ]
         return side_by_side(take.files[0].parent, people, FPS, "+y", notes=notes)

@@ -2,18 +2,60 @@
 
 They are plain iterables rather than torch DataLoaders: gathering from tensors in memory is far faster than
 passing batches between processes, Lightning leaves the shards that they cut themselves alone
-(`use_distributed_sampler` has no effect on them), and their state is one number.
+(`use_distributed_sampler` has no effect on them), and their state is one number. What reads from disk reads ahead
+in threads: copying out of maps holds no lock.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 
 from magnet.datamodules.windows import Draw
 from magnet.motion.scene import Scene
 
 Gather = Callable[[Draw], Scene]
+Place = tuple[int, int]
+"""Epoch, and batch in it."""
+
+
+class Ahead:
+    """Batches that threads begin before they are asked for. What is asked for decides; what was begun in vain is lost.
+
+    Args:
+        make: a place's batch; depends on the place alone, and may be called by several threads at once.
+        after: the place that follows.
+        depth: batches begun while the last one given is used, each in a thread of its own.
+    """
+
+    def __init__(self, make: Callable[[Place], Any], after: Callable[[Place], Place], depth: int) -> None:
+        self.make, self.after, self.depth = make, after, depth
+        self.begun: deque[tuple[Place, Future[Any]]] = deque()
+        self.threads = ThreadPoolExecutor(depth, thread_name_prefix="read-ahead")
+
+    def get(self, place: Place) -> Any:
+        """The batch of a place. Whatever went wrong when it was made is raised here."""
+        if self.begun and self.begun[0][0] != place:  # a state was loaded
+            for _, future in self.begun:
+                future.cancel()
+            self.begun.clear()
+        self._begin(place, 1)
+        _, future = self.begun.popleft()
+        self._begin(self.after(place), self.depth)
+        try:
+            return future.result()
+        except BaseException:
+            self.begun.clear()
+            raise
+
+    def _begin(self, place: Place, count: int) -> None:
+        """Have so many batches under way."""
+        while len(self.begun) < count:
+            place = self.after(self.begun[-1][0]) if self.begun else place
+            self.begun.append((place, self.threads.submit(self.make, place)))
 
 
 class TrainLoader:
@@ -25,25 +67,32 @@ class TrainLoader:
 
     Args:
         draw: (epoch, first sample, count) to the windows drawn.
-        gather: windows drawn to the batch.
+        gather: what `fetch` gave to the batch; without it, windows drawn to the batch.
         batch_size: scenes a batch and process.
         epoch_size: samples an epoch, over all processes; rounded down to whole batches, at least one.
         rank: of this process.
         world: number of processes.
         shared: `draw` numbers the samples of this process alone.
+        fetch: windows drawn to what `gather` takes; the part that threads do ahead. Its result must depend on the
+            windows alone.
+        ahead: batches fetched ahead; 0: each when it is asked for. They are no part of the state before they are seen.
     """
 
     def __init__(
         self,
         draw: Callable[[int, int, int], Draw],
-        gather: Gather,
+        gather: Callable[[Any], Scene],
         batch_size: int,
         epoch_size: int,
         rank: int = 0,
         world: int = 1,
         shared: bool = False,
+        fetch: Callable[[Draw], Any] | None = None,
+        ahead: int = 0,
     ) -> None:
         self.draw, self.gather, self.shared = draw, gather, shared
+        self.fetch = fetch or (lambda draw: draw)
+        self.ahead = Ahead(self._fetched, self._after, ahead) if ahead else None
         self.batch_size, self.rank, self.world = batch_size, rank, world
         self.batches = max(1, epoch_size // (batch_size * world))
         self.epoch, self.batch = 0, 0
@@ -54,16 +103,21 @@ class TrainLoader:
     def __iter__(self) -> Iterator[Scene]:
         # Lightning makes the iterator before it restores anything: read the place only when asked for a batch.
         while True:
-            block = self.batch if self.shared else self.batch * self.world + self.rank
-            first = block * self.batch_size
-            batch = self.gather(self.draw(self.epoch, first, self.batch_size))
-            self.batch += 1
-            last = self.batch >= self.batches
-            if last:
-                self.epoch, self.batch = self.epoch + 1, 0
+            place = (self.epoch, self.batch)
+            batch = self.gather(self.ahead.get(place) if self.ahead else self._fetched(place))
+            self.epoch, self.batch = self._after(place)
             yield batch
-            if last:
+            if self._after(place)[1] == 0:
                 return
+
+    def _fetched(self, place: Place) -> Any:
+        epoch, batch = place
+        block = batch if self.shared else batch * self.world + self.rank
+        return self.fetch(self.draw(epoch, block * self.batch_size, self.batch_size))
+
+    def _after(self, place: Place) -> Place:
+        epoch, batch = place
+        return (epoch, batch + 1) if batch + 1 < self.batches else (epoch + 1, 0)
 
     def state_dict(self) -> dict[str, int]:
         """Where the stream stands: what comes next is this sample of this epoch."""

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.store_mapped import MappedStore, Piece
+from magnet.datamodules.windows import Store
 
 
 class Mixed(MotionDataModule):
     """Trains on several data sets at once; tests on one of them, or on all.
 
-    Of each data set only the clips are used: window, batch and augmentation are set here.
+    Of each data set only the clips are used: window, batch and augmentation are set here. Where one of them is a
+    prepared store read by memory map, all are: the frames of the others are held in memory as a store's rows, 188
+    bytes a frame and person. Every process draws from everything.
 
     Args:
         data: the data sets; all of one body.
@@ -36,6 +40,10 @@ class Mixed(MotionDataModule):
             raise ValueError(f"body_model: data sets of one body can be mixed, got {sorted(bodies)}")
         self.data, self.chosen = list(data), {"train": None, "val": val_on, "test": test_on}
 
+    @property
+    def maps_files(self) -> bool:  # type: ignore[override]
+        return any(part.maps_files for part in self.data)
+
     def prepare_data(self) -> None:
         """Let every data set prepare its files."""
         for part in self.data:
@@ -48,6 +56,19 @@ class Mixed(MotionDataModule):
 
     def clips(self, split: Split) -> list[Clip]:
         """Clips of all data sets, or of the one chosen for the split."""
+        return [clip for part in self._used(split) for clip in part.clips(split)]
+
+    def piece(self, split: Split) -> Piece | None:
+        """Rows of all data sets, or of the one chosen for the split."""
+        pieces = [piece for part in self._used(split) if (piece := part.piece(split)) is not None]
+        return Piece.joined(pieces) if pieces else None
+
+    def open_store(self, split: Split) -> Store:
+        """By memory map where a data set is; else all clips in memory."""
+        if self.maps_files and (piece := self.piece(split)) is not None:
+            return MappedStore(piece, self.max_agents, spread=False)
+        return super().open_store(split)
+
+    def _used(self, split: Split) -> list[MotionDataModule]:
         chosen = self.chosen[split]
-        parts = self.data if chosen is None else [self.data[chosen]]
-        return [clip for part in parts for clip in part.clips(split)]
+        return self.data if chosen is None else [self.data[chosen]]

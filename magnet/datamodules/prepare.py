@@ -82,7 +82,7 @@ def prepare(
             "source": reader.source,
             "licence": reader.licence,
             "family": reader.family,
-            "body": {"id": body.id, "sha256": settings["body"]},
+            "body": {"id": body.id, "sha256": settings["body"], "genders": settings["bodies"]},
             "options": {key: settings[key] for key in ("options", "steps", "steps version", "reader version")},
             "splits by": "the data set's rule" if splits is None else "a list given by the user",
             "left out": left_out,

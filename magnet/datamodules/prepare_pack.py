@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from magnet.datamodules.common import FPS
 from magnet.datamodules.prepare_takes import Part
 from magnet.datamodules.recording import Take
-from magnet.datamodules.store import FORMAT, MANIFEST, ROW, SPLITS, Folder, as_json, write_whole
+from magnet.datamodules.store import FORMAT, MANIFEST, SPLITS, Folder, as_json, write_whole
+from magnet.datamodules.store_rows import ROW
 from magnet.datamodules.windows import Split
 
 
@@ -52,6 +53,7 @@ class Source:
             people=tuple(int(part.people[c]) for c in mine),
             betas=np.array(part.betas[low : int(end[first + count - 1])]),
             rows=np.concatenate([part.rows(c).reshape(-1) for c in mine]) if rows else np.zeros(0, dtype=ROW),
+            persons=part.persons_of()[first],
         )
 
 
@@ -65,7 +67,7 @@ def pack(
     heads = [source.head(old) for source in sources]
     if not any(head.names for head in heads):
         return None
-    table: dict[str, list[Any]] = {"name": [], "take": [], "split": [], "frames": [], "people": []}
+    table: dict[str, list[Any]] = {"name": [], "take": [], "split": [], "frames": [], "people": [], "persons": []}
     places: dict[str, dict[str, Any]] = {}
     betas: list[NDArray[np.float32]] = []
     shown: dict[str, Any] = {}
@@ -81,6 +83,7 @@ def pack(
             table["split"] += [split] * count
             table["frames"] += head.frames
             table["people"] += head.people
+            table["persons"] += [head.persons] * count
             betas.append(head.betas)
         shards = [
             write_shard(out, split, number, rows, [source for source, _ in group], old)
@@ -89,6 +92,7 @@ def pack(
         shown[split] = summary(mine, shards)
     failed = {s.take.name: (s.take.split, h.error) for s, h in zip(sources, heads, strict=True) if h.error is not None}
     notes = [(note, s.take.name) for s, h in zip(sources, heads, strict=True) for note in h.notes]
+    persons = [(h.persons, s.take.name) for s, h in zip(sources, heads, strict=True) if h.error is None]
     manifest = {
         **facts,
         "format": FORMAT,
@@ -97,13 +101,19 @@ def pack(
         "betas": write_npy_or_json(out, "betas", np.concatenate(betas).astype("<f4")),
         "splits": shown,
         "skipped": [{"take": name, "split": split, "why": why} for name, (split, why) in failed.items()],
-        "notes": [
-            {"note": note, "takes": [name for other, name in notes if other == note]}
-            for note in dict.fromkeys(note for note, _ in notes)
-        ],
+        "notes": [{"note": note, "takes": takes} for note, takes in by_first(notes)],
+        "persons": [{"persons": names, "takes": takes} for names, takes in by_first(persons) if names],
     }
     write_whole(out, lambda _: MANIFEST, lambda file: file.write(as_json(manifest)))
     return places
+
+
+def by_first(pairs: list[tuple[Any, str]]) -> list[tuple[Any, list[str]]]:
+    """The second ones of each first one, in the order of first ones."""
+    found: dict[Any, list[str]] = {}
+    for first, second in pairs:
+        found.setdefault(first, []).append(second)
+    return list(found.items())
 
 
 def groups(mine: list[tuple[Source, Part]], most: int) -> Iterator[tuple[int, list[tuple[Source, Part]]]]:

@@ -7,7 +7,7 @@ import json
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -23,9 +23,13 @@ from numpy.typing import NDArray
 from magnet.body import Body, load_body
 from magnet.datamodules import catalogue
 from magnet.datamodules.common import STEPS_VERSION, Steps, to_clips
-from magnet.datamodules.recording import Reader, Take
-from magnet.datamodules.store import FORMAT, ROW, body_hash, encode, write_whole
+from magnet.datamodules.genders import load_bodies, one_body
+from magnet.datamodules.recording import Gender, Reader, Take
+from magnet.datamodules.store import FORMAT, body_hash, write_whole
+from magnet.datamodules.store_rows import ROW, encode
 
+PART_VERSION = 2
+"""Raise it whenever a part holds something else: takes prepared before are then made anew."""
 BODY_FROM = {
     "smplx": "https://smpl-x.is.tue.mpg.de (register, then download the model in npz form, such as SMPLX_NEUTRAL.npz)",
     "smpl": "https://smpl-x.is.tue.mpg.de or https://smpl.is.tue.mpg.de (register; npz form)",
@@ -42,6 +46,7 @@ class Order:
         options: of the reader's constructor.
         body_file: path of the body file, or "open".
         steps: what can be chosen about the common steps.
+        body_files: folder or files of gendered bodies that shape numbers belong to; none: all belong to `body_file`.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Order:
     options: dict[str, Any]
     body_file: str
     steps: Steps
+    body_files: tuple[str, ...] = ()
 
     def reader(self) -> Reader:
         """The data set's reader on the download."""
@@ -68,11 +74,20 @@ class Order:
             )
         return load_body(self.body_file)
 
+    def bodies(self) -> dict[Gender, Body]:
+        """Gendered bodies that shape numbers belong to.
+
+        Raises:
+            ValueError: files that are not there, or not to be told apart.
+        """
+        return load_bodies(self.body_files) if self.body_files else {}
+
     def settings(self, body: Body) -> dict[str, Any]:
         """Everything besides a take's files that its part depends on."""
         kind = catalogue.find(self.name).load_reader()
         return {
             "format": FORMAT,
+            "part version": PART_VERSION,
             "steps version": STEPS_VERSION,
             "steps": self.steps.__dict__,
             "reader": self.name,
@@ -80,6 +95,7 @@ class Order:
             # A folder's name and not its place, so that a store's bytes do not depend on the machine.
             "options": {key: Path(str(value)).name for key, value in self.options.items()},
             "body": body_hash(body),
+            "bodies": {gender: body_hash(one) for gender, one in self.bodies().items()},
         }
 
 
@@ -108,6 +124,7 @@ class Part:
     people: tuple[int, ...]
     betas: NDArray[np.float32]  # (people of all its clips, 10)
     rows: NDArray[np.void]  # (rows of all its clips,) of `ROW`
+    persons: tuple[str, ...] = ()  # names or roles of the people in all its clips; (): none are known
 
     @staticmethod
     def failed(error: str) -> Part:
@@ -116,7 +133,7 @@ class Part:
 
     def save(self, path: Path) -> None:
         """All of it or nothing."""
-        facts = {name: getattr(self, name) for name in ("error", "notes", "names", "frames", "people")}
+        facts = {name: getattr(self, name) for name in ("error", "notes", "names", "frames", "people", "persons")}
         text = np.array(json.dumps(facts))
 
         def write(out: Any) -> None:
@@ -141,14 +158,14 @@ class Part:
             facts = json.loads(str(np.lib.format.read_array(file, allow_pickle=False)))
             betas = np.lib.format.read_array(file, allow_pickle=False)
             array = np.lib.format.read_array(file, allow_pickle=False) if rows else np.zeros(0, dtype=ROW)
-        lists = {name: tuple(facts[name]) for name in ("notes", "names", "frames", "people")}
+        lists = {name: tuple(facts[name]) for name in ("notes", "names", "frames", "people", "persons")}
         return Part(error=facts["error"], betas=betas, rows=array, **lists)
 
 
-def convert(reader: Reader, take: Take, body: Body, steps: Steps) -> Part:
+def convert(reader: Reader, take: Take, body: Body, steps: Steps, bodies: Mapping[Gender, Body] | None = None) -> Part:
     """Read a take and put it through the common steps; whatever is wrong with it becomes the part's error."""
     try:
-        recording = reader.read(take)
+        recording = one_body(reader.read(take), bodies or {}, body)
         made = to_clips(recording, body, take.name, reader.name, take.split or "train", reader.family, steps)
     except (ValueError, OSError) as error:
         return Part.failed(relative(str(error) or type(error).__name__, reader.root))
@@ -163,6 +180,7 @@ def convert(reader: Reader, take: Take, body: Body, steps: Steps) -> Part:
         people=tuple(clip.agents for clip in clips),
         betas=np.concatenate([clip.scene.betas[0].float().numpy() for clip in clips]),
         rows=np.concatenate([encode(clip.scene) for clip in clips]),
+        persons=recording.persons,
     )
 
 
@@ -187,7 +205,7 @@ def begin(order: Order) -> None:
     """Set up a worker process: one thread, its own reader and body; it ends when its parent is gone."""
     torch.set_num_threads(1)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    _HERE["order"], _HERE["reader"], _HERE["body"] = order, order.reader(), order.body()
+    _HERE.update(order=order, reader=order.reader(), body=order.body(), bodies=order.bodies())
 
 
 def _follow_parent() -> None:
@@ -199,7 +217,7 @@ def _follow_parent() -> None:
 
 def work(take: Take, path: Path | None) -> Part:
     """Make one part in a worker process, on disk if there is a path. Returns it without its rows if so."""
-    part = convert(_HERE["reader"], take, _HERE["body"], _HERE["order"].steps)
+    part = convert(_HERE["reader"], take, _HERE["body"], _HERE["order"].steps, _HERE["bodies"])
     return part if path is None else part.saved(path)
 
 
@@ -234,10 +252,10 @@ def _converted(
     order: Order, takes: list[Take], file: Callable[[Take], Path | None], workers: int
 ) -> Iterator[tuple[Take, Part]]:
     if workers == 1 or len(takes) < 2:
-        reader, body = order.reader(), order.body()
+        reader, body, bodies = order.reader(), order.body(), order.bodies()
         for take in takes:
             with one_thread():
-                part, path = convert(reader, take, body, order.steps), file(take)
+                part, path = convert(reader, take, body, order.steps, bodies), file(take)
                 part = part if path is None else part.saved(path)
             yield take, part
         return

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.recording import Reader
 from magnet.datamodules.store import Folder, StoreError, body_hash
-from magnet.datamodules.store_mapped import MappedStore
+from magnet.datamodules.store_mapped import MappedStore, Piece
 from magnet.datamodules.windows import Store
 
 
@@ -22,6 +23,8 @@ class Prepared(MotionDataModule):
     Args:
         path: the store's folder, as `magnet data prepare` wrote it.
         spread: let each process read a length of its own, where there are enough clips; False: all draw from all.
+        roles: words such as leader and follower; people whose names in the store hold the first stand in the first
+            slots, and so on, others after them in the order of the recording. To be seen with `shuffle_agents` off.
         device_resident: keep all frames decoded in memory, on the trainer's device; for stores that fit there.
         body_model: "open", or the path of the body file that the store was prepared with.
         max_agents: slots P of every batch; at least the store's largest group.
@@ -39,13 +42,14 @@ class Prepared(MotionDataModule):
         self,
         path: str = "",
         spread: bool = True,
+        roles: Sequence[str] = (),
         device_resident: bool = False,
         body_model: str = "open",
         max_agents: int = 2,
         **kwargs: Any,
     ) -> None:
         super().__init__(device_resident=device_resident, body_model=body_model, max_agents=max_agents, **kwargs)
-        self.path, self.spread = path, spread
+        self.path, self.spread, self.roles = path, spread, tuple(roles)
 
     @property
     def maps_files(self) -> bool:  # type: ignore[override]
@@ -87,10 +91,22 @@ class Prepared(MotionDataModule):
 
     def clips(self, split: Split) -> list[Clip]:
         """All clips of a split in memory, of `self.body`."""
-        return self.folder.clips(split)
+        return self.folder.clips(split, self.roles)
+
+    def piece(self, split: Split) -> Piece | None:
+        """The split's rows on disk."""
+        piece = Piece.stored(self.folder, split, self.roles)
+        return piece if piece.sources else None
 
     def open_store(self, split: Split) -> Store:
         """The split by memory map; in memory if `device_resident`."""
-        if self.device_resident and self.folder.split(split).name:
+        piece = self.piece(split)
+        if piece is None:
+            has = [name for name, facts in self.folder.manifest["splits"].items() if facts["clips"]]
+            raise ValueError(
+                f"{self.folder.path}: split {split} is empty, the store has {', '.join(has)}; prepare it with a list "
+                f"of splits of your own (--splits FILE), or leave out what needs it"
+            )
+        if self.device_resident:
             return super().open_store(split)
-        return MappedStore(self.folder, split, self.max_agents, self.spread)
+        return MappedStore(piece, self.max_agents, self.spread)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from magnet.datamodules.windows import Split
 
 Floats = NDArray[np.floating]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Gender = Literal["neutral", "male", "female"]
+GENDERS: tuple[Gender, ...] = get_args(Gender)
 
 
 class DataError(ValueError):
@@ -56,8 +58,9 @@ class Recording:
     positions: Floats | None = None  # (T, P, M, 3) world
     joints: tuple[int, ...] = ()  # (M,) which of the 22 joints `positions` are of
     valid: NDArray[np.bool_] | None = None  # (T, P), False where tracking failed
-    persons: tuple[str, ...] = ()
+    persons: tuple[str, ...] = ()  # names or roles, such as "leader", which a store keeps
     notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt
+    genders: tuple[Gender, ...] = ()  # (P,) of the body that each one's `betas` belong to; (): not known
 
     def __post_init__(self) -> None:
         if self.poses is not None and self.transl is not None and self.betas is not None:
@@ -73,6 +76,11 @@ class Recording:
         for name, want in expected.items():
             if (got := np.shape(getattr(self, name))) != want:
                 raise DataError(f"{name}: got {got}, expected {want} for {T} frames of {P} people")
+        for name, words in {"persons": self.persons, "genders": self.genders}.items():
+            if words and len(words) != P:
+                raise DataError(f"{name}: got {len(words)} ({', '.join(words)}), expected one for each of {P} people")
+        if strange := [gender for gender in self.genders if gender not in GENDERS]:
+            raise DataError(f"genders: got {strange[0]!r}, expected one of {', '.join(GENDERS)}")
         if not T or not P:
             raise DataError(f"a recording of {T} frames and {P} people")
 

@@ -148,7 +148,8 @@ class ReMoCapReader(Reader):
                 value = held[key]
                 if not isinstance(value, np.ndarray) or value.ndim < 2 or len(value) != 2:
                     got = value.shape if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-                    raise DataError(f"{path}: {key} is {got}, expected (2, T, ..) of both people; {AGAIN}")
+                    alone = ": the partner is missing" if isinstance(value, np.ndarray) and len(value) == 1 else ""
+                    raise DataError(f"{path}: {key} is {got}, expected (2, T, ..) of both people{alone}; {AGAIN}")
                 mine[key] = value[p]
             if mine["body_pose"].ndim == 2:
                 mine["body_pose"] = mine["body_pose"][:, :63]  # hands may follow

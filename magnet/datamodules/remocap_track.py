@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from magnet.datamodules.arrays import AGAIN, Doubles, floats, one_length
-from magnet.datamodules.asf_amc import euler
+from magnet.datamodules.asf import euler
 from magnet.datamodules.bvh_header import BvhHeader, read_bvh_header
 from magnet.datamodules.fields import mapping
 from magnet.datamodules.recording import DataError
@@ -49,7 +49,6 @@ def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
     header = read_bvh_header(file_like(folder, "*.bvh", "motion.bvh"))
     table, clock = _table(file_like(folder, "*worldpos*.csv", "motion_worldpos.csv"))
     one_length(folder, {"motion.bvh": header.frames, table.path.name: len(table.values)})
-    rate = round(1.0 / header.seconds, 2)
     rate = round(1.0 / header.seconds, 2)
     found = "headings" if table.names else "lengths of bones"
     table = min(table.named(header), key=lambda one: _misfit(header, one))
@@ -154,24 +153,49 @@ def _proof(folder: Path, header: BvhHeader, table: _Table, scale: float) -> str:
     positions = {k: table.of(name)[some] for k, name in enumerate(header.names) if name in table.names}
     if 0 not in positions:
         raise DataError(f"{table.path}: no columns of the root, {header.names[0]}; {AGAIN}")
-    best, error = "", np.inf
-    for turns in listed.named(header):
-        angles = {k: np.radians(turns.of(header.names[k])[some]) for k, order in enumerate(header.orders) if order}
-        for order in ("", *map("".join, itertools.permutations("xyz"))):
-            # Channels are turned about in their order and each in the frame of those before: fixed axes backwards.
-            local = {k: euler(turn, (order or header.orders[k])[::-1]) for k, turn in angles.items()}
-            off = scale * _far(header, offsets, local, positions)
-            if off < error:
-                best, error = order or f"{header.orders[0]} as in the BVH", off
-            if error < CLOSE and not order:
-                break
-    if not error < CLOSE:
+    namings = listed.named(header)
+    degrees = [{k: one.of(header.names[k])[some] for k, order in enumerate(header.orders) if order} for one in namings]
+    radians = [{k: np.radians(turns) for k, turns in one.items()} for one in degrees]
+    order, error = _order(header, offsets, radians, positions, CLOSE / scale)
+    if not scale * error < CLOSE:
+        unit = f"lengths are millimetres (scale={scale:g} metres a unit)"
+        advice = f"check that the files belong together and that {unit}"
+        if scale * _order(header, offsets, degrees, positions, CLOSE / scale)[1] < CLOSE:
+            advice = f"{paths[0].name} looks like radians, expected degrees: convert it, or take the published file"
         raise DataError(
             f"{folder}: no Euler order leads from {source} and {paths[0].name} to {table.path.name}: "
-            f"{100 * error:.3g} cm apart at best, expected less than 1 cm; check that the files belong together and "
-            f"that lengths are millimetres (scale={scale:g} metres a unit)"
+            f"{100 * scale * error:.3g} cm apart at best, expected less than 1 cm; {advice}"
         )
-    return f"rotations, Euler order {best}, lead to the positions within {1000 * error:.2g} mm"
+    return f"rotations, Euler order {order}, lead to the positions within {1000 * scale * error:.2g} mm"
+
+
+def _order(
+    header: BvhHeader,
+    offsets: Doubles,
+    namings: list[dict[int, Doubles]],
+    positions: dict[int, Doubles],
+    close: float,
+) -> tuple[str, float]:
+    """The Euler order that leads closest, and how far off in the files' unit.
+
+    Args:
+        header: the joints.
+        offsets: (K, 3) in the parent's frame.
+        namings: angles (T, 3) by joint, for each way of naming the columns.
+        positions: (T, 3) by joint.
+        close: how far off is near enough for the order of the BVH.
+    """
+    best, error = "", np.inf
+    for turns in namings:
+        for order in ("", *map("".join, itertools.permutations("xyz"))):
+            # Channels are turned about in their order and each in the frame of those before: fixed axes backwards.
+            local = {k: euler(turn, (order or header.orders[k])[::-1]) for k, turn in turns.items()}
+            off = _far(header, offsets, local, positions)
+            if off < error:
+                best, error = order or f"{header.orders[0]} as in the BVH", off
+            if error < close and not order:
+                break
+    return best, error
 
 
 def _offsets(folder: Path, header: BvhHeader) -> tuple[Doubles, str]:

@@ -1,13 +1,9 @@
 """A prepared store on disk: rows of frames in shards, an index of clips, and a manifest that is written last.
 
-    manifest.json            what it is made from, with a checksum of every other file; its rename is the commit
-    clips-HASH.json          columns: name, take, split, frames, people, row, of clips in the order of their rows
-    betas-HASH.npy           (people of all clips, 10) float32
-    SPLIT-NNNNN-HASH.npy     (rows,) of `ROW`; a clip's people one after the other, a row a frame; clips in order
-
-A rotation is a unit quaternion in four int16: half the size of float16 6-D and sixteen times as fine (0.03 mrad),
-so that joints come back within 0.2 mm and no noise is added to accelerations; 188 bytes a frame and person instead
-of the 820 that matrices take in memory.
+manifest.json            what it is made from, with a checksum of every other file; its rename is the commit
+clips-HASH.json          columns: name, take, split, frames, people, persons, of clips in the order of their rows
+betas-HASH.npy           (people of all clips, 10) float32
+SPLIT-NNNNN-HASH.npy     (rows,) of `ROW`; a clip's people one after the other, a row a frame; clips in order
 """
 
 from __future__ import annotations
@@ -15,74 +11,34 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from magnet.body import Body
+from magnet.datamodules.store_rows import ROW, SCALE, decode, encode
 from magnet.datamodules.windows import Clip, Ints, Split
-from magnet.motion.frames import rigid
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import Scene
+
+__all__ = ["ROW", "SCALE", "Folder", "Part", "StoreError", "body_hash", "decode", "encode", "file_hash", "write_whole"]
 
 FORMAT = 1
 MANIFEST = "manifest.json"
 STATE = ".prepare"
 """Folder of a store with what a later `prepare` goes on from; not part of the store."""
-SCALE = 32767
-ROW = np.dtype([("rotations", "<i2", (BODY_JOINTS, 4)), ("pelvis", "<f4", (3,))])
-"""One person in one frame: xyzw quaternions times 32767, the pelvis's in the world, others relative to the parent."""
-CACHED = 8192
-"""Rotations decoded at a time on a CPU: twice as fast as all at once, whose steps go through memory."""
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 class StoreError(ValueError):
     """A folder that is no store, is damaged, or is of a later version; says what to do."""
-
-
-# -- rows --------------------------------------------------------------------------------------
-
-
-def encode(scene: Scene) -> NDArray[np.void]:
-    """A scene (B = 1) as rows, person after person. -> (P * T,) of `ROW`"""
-    rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
-    quat = roma.rotmat_to_unitquat(rotations.double())
-    quat = torch.where(quat[..., 3:] < 0, -quat, quat)
-    rows = np.zeros((scene.agents, scene.frames), dtype=ROW)
-    rows["rotations"] = (SCALE * quat).round().to(torch.int16).transpose(0, 1).numpy()
-    rows["pelvis"] = scene.T_world_root[0, :, :, :3, 3].float().transpose(0, 1).numpy()
-    return rows.reshape(-1)
-
-
-def matrices(rotations: Tensor) -> Tensor:
-    """Quaternions of any length to rotation matrices. (..., 4) int16 -> (..., 3, 3) float32"""
-    flat = rotations.reshape(-1, 4)
-    out = torch.empty(len(flat), 9, device=flat.device)
-    piece = CACHED if flat.device.type == "cpu" else max(len(flat), 1)
-    for quat, into in zip(flat.split(piece), out.split(piece), strict=True):
-        q = quat.T.float().contiguous()
-        x, y, z, w = q.unbind(0)
-        sx, sy, sz = q[:3] * (2 / q.square().sum(dim=0))
-        xx, yy, zz, xy, xz, yz = sx * x, sy * y, sz * z, sx * y, sx * z, sy * z
-        wx, wy, wz = sx * w, sy * w, sz * w
-        rows = [1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy]
-        into.copy_(torch.stack(rows).T)
-    return out.view(*rotations.shape[:-1], 3, 3)
-
-
-def decode(rotations: Tensor, pelvis: Tensor) -> tuple[Tensor, Tensor]:
-    """body_rot (..., 21, 3, 3) and T_world_root (..., 4, 4) of rows' (..., 22, 4) int16 and (..., 3) float32."""
-    R = matrices(rotations)
-    return R[..., 1:, :, :], rigid(R[..., 0, :, :], pelvis)
 
 
 def body_hash(body: Body) -> str:
@@ -164,7 +120,44 @@ class Part:
     betas: NDArray[np.float32]  # (people of all clips, 10)
     files: list[Path]
     ends: Ints  # rows up to the end of each shard
+    persons: list[tuple[str, ...]] = field(default_factory=list)  # names or roles; none where none are known
     maps: dict[int, NDArray[np.void]] = field(default_factory=dict, repr=False)
+
+    @staticmethod
+    def joined(parts: Sequence[Part]) -> Part:
+        """Several parts one after the other, each with shards of its own."""
+        before = np.cumsum([0, *(int(part.ends[-1]) for part in parts)])
+        maps: dict[int, NDArray[np.void]] = {}
+        number = 0
+        for part in parts:
+            maps |= {number + k: rows for k, rows in part.maps.items()}
+            number += len(part.files)
+        return Part(
+            name=[name for part in parts for name in part.name],
+            take=[take for part in parts for take in part.take],
+            frames=np.concatenate([part.frames for part in parts]),
+            people=np.concatenate([part.people for part in parts]),
+            betas=np.concatenate([part.betas for part in parts]),
+            files=[file for part in parts for file in part.files],
+            ends=np.concatenate([part.ends + rows for part, rows in zip(parts, before[:-1], strict=True)]),
+            persons=[names for part in parts for names in part.persons_of()],
+            maps=maps,
+        )
+
+    def persons_of(self) -> list[tuple[str, ...]]:
+        """Names or roles of each clip's people; () where the data set gives none."""
+        return self.persons or [()] * len(self.name)
+
+    def seats(self, roles: Sequence[str]) -> Ints:
+        """Each clip's people in the order of their roles: the first whose name holds the first word, and so on. (C, P)
+
+        People of none of the roles come last, in the order of the recording.
+        """
+        order = np.tile(np.arange(int(self.people.max(initial=1))), (len(self.name), 1))
+        for clip, names in enumerate(self.persons_of() if roles else []):
+            rank = [next((r for r, role in enumerate(roles) if role in words(name)), len(roles)) for name in names]
+            order[clip, : len(names)] = np.argsort(rank, kind="stable")
+        return order
 
     def shard(self, number: int) -> NDArray[np.void]:
         """The rows of a shard, mapped when first asked for.
@@ -207,6 +200,11 @@ class Part:
         """A clip's shapes. -> (P, 10)"""
         end = int(self.last_person[clip])
         return self.betas[end - int(self.people[clip]) : end]
+
+
+def words(name: str) -> set[str]:
+    """What a person is called: the whole name and each word of it, so that "P1, actor" is an "actor"."""
+    return {name, *re.findall(r"[^\s,;:()]+", name)}
 
 
 class Folder:
@@ -273,14 +271,17 @@ class Folder:
             betas=self._betas[low:high],
             files=[self.path / shard["file"] for shard in shards],
             ends=np.cumsum([shard["rows"] for shard in shards], dtype=np.int64),
+            persons=[tuple(table["persons"][i]) for i in mine] if "persons" in table else [],
         )
 
-    def clips(self, split: Split) -> list[Clip]:
-        """All clips of a split in memory."""
+    def clips(self, split: Split, roles: Sequence[str] = ()) -> list[Clip]:
+        """All clips of a split in memory, people in the order of `roles`, as `Part.seats` says."""
         part = self.split(split)
+        seats = part.seats(roles)
         clips = []
         for c, name in enumerate(part.name):
-            rows = part.rows(c)
+            order = seats[c, : part.people[c]]
+            rows = part.rows(c)[order]
             body_rot, T_world_root = decode(
                 torch.from_numpy(rows["rotations"].copy()), torch.from_numpy(rows["pelvis"].copy())
             )
@@ -288,7 +289,7 @@ class Folder:
             scene = Scene(
                 body_rot=body_rot.transpose(0, 1)[None],
                 T_world_root=T_world_root.transpose(0, 1)[None],
-                betas=torch.from_numpy(part.betas_of(c).copy())[None],
+                betas=torch.from_numpy(part.betas_of(c)[order])[None],
                 present=torch.ones(1, P, dtype=torch.bool),
                 fps=self.fps,
                 body=self.body,

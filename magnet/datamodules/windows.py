@@ -92,7 +92,7 @@ class Store:
     """All clips of a split as flat tensors on one device; rows are frames of one person.
 
     Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there. What
-    keeps its frames elsewhere overrides `_frames`, `good` and `__init__`, and calls `_index`.
+    keeps its frames elsewhere overrides `gather`, `good`, `to` and `__init__`, and calls `_index`.
 
     Args:
         clips: at least one, all of one fps and body.
@@ -121,7 +121,7 @@ class Store:
             fps=first.scene.fps,
             body=first.scene.body,
         )
-        self.tensors |= {"valid": torch.from_numpy(np.concatenate(goods)), **self._flatten()}
+        self.tensors = {"valid": torch.from_numpy(np.concatenate(goods)), **self._first_rows(), **self._flatten()}
         self.device = self.tensors["body_rot"].device
 
     def _index(
@@ -135,7 +135,7 @@ class Store:
         fps: float,
         body: str,
     ) -> None:
-        """Where each clip's people begin: person after person, one row a frame, from row 1 on."""
+        """What is known of each clip besides its frames."""
         self.names, self.sources = list(names), np.array(sources, dtype=object)
         self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
         self.whole = np.array(whole, dtype=bool)  # every frame is valid
@@ -146,12 +146,15 @@ class Store:
                 f"clip {self.names[most]} has {self.people[most]} people, but max_agents is {max_agents}; raise"
                 " max_agents"
             )
+
+    def _first_rows(self) -> dict[str, Tensor]:
+        """Where each clip's people begin: person after person, one row a frame, from row 1 on."""
         rows = self.length * self.people
-        slot = np.arange(max_agents)
+        slot = np.arange(self.max_agents)
         there = slot < self.people[:, None]
         first_row = 1 + (np.cumsum(rows) - rows)[:, None] + slot * self.length[:, None]
         person = 1 + (np.cumsum(self.people) - self.people)[:, None] + slot
-        self.tensors = {
+        return {
             "first_row": torch.from_numpy(np.where(there, first_row, 0)),
             "person": torch.from_numpy(np.where(there, person, 0)),
             "length": torch.from_numpy(self.length),
@@ -193,47 +196,36 @@ class Store:
         Beyond a clip's end its last frame is repeated with `valid` False.
         """
         t = self.tensors
-        near = t["length"].device  # of the index; a mapped store's is not where the frames go
 
         def to_index(array: Ints) -> Tensor:
-            return torch.from_numpy(array).to(near, non_blocking=True)
+            return torch.from_numpy(array).to(self.device, non_blocking=True)
 
         clips, starts = to_index(np.maximum(draw.clips, 0)), to_index(draw.starts)
         members, groups = to_index(draw.members), to_index(draw.groups)
         there, member = members >= 0, members.clamp_min(0)
 
-        wanted = starts[..., None] + torch.arange(frames, device=near)  # (B, 2, T)
+        wanted = starts[..., None] + torch.arange(frames, device=self.device)  # (B, 2, T)
         last = t["length"][clips][..., None] - 1
         frame = torch.minimum(wanted, last)
-        good = wanted <= last
-        if "valid" in t:
-            good &= t["valid"][t["first_frame"][clips][..., None] + frame]
+        good = (wanted <= last) & t["valid"][t["first_frame"][clips][..., None] + frame]
         valid = (good | to_index(draw.clips)[..., None].lt(0)).all(dim=1)
 
         clip = clips.gather(1, groups)  # (B, P)
         frame_of_slot = frame.gather(1, groups[..., None].expand(-1, -1, frames))  # (B, P, T)
         rows = torch.where(there[..., None], t["first_row"][clip, member][..., None] + frame_of_slot, 0)
         rows = rows.transpose(1, 2)
-        betas = t["betas"][torch.where(there, t["person"][clip, member], 0)]
-        body_rot, T_world_root = self._frames(rows)
-        there, groups = there.to(self.device), groups.to(self.device)
+        T_world_root = t["T_world_root"].index_select(0, rows.flatten()).unflatten(0, rows.shape)
         scene = Scene(
-            body_rot=body_rot,
+            body_rot=t["body_rot"].index_select(0, rows.flatten()).unflatten(0, rows.shape),
             T_world_root=self._compose(T_world_root, there, groups, draw, clearance),
-            betas=betas.to(self.device),
+            betas=t["betas"][torch.where(there, t["person"][clip, member], 0)],
             present=there,
             fps=self.fps,
             body=self.body,
-            valid=valid.to(self.device),
+            valid=valid,
             names=self.labels(draw, frames),
         )
         return self._mirror(scene, draw)
-
-    def _frames(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """body_rot and T_world_root of rows, on `self.device`. rows: (B, T, P) int"""
-        body_rot = self.tensors["body_rot"].index_select(0, rows.flatten())
-        T_world_root = self.tensors["T_world_root"].index_select(0, rows.flatten())
-        return body_rot.unflatten(0, rows.shape), T_world_root.unflatten(0, rows.shape)
 
     def _compose(self, T_world_root: Tensor, there: Tensor, groups: Tensor, draw: Draw, clearance: float) -> Tensor:
         chosen = torch.from_numpy(np.flatnonzero(draw.clips[:, 1] >= 0)).to(self.device)

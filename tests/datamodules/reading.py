@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from magnet.body.base import PARENTS
 from magnet.datamodules.catalogue import NAMES
-from magnet.datamodules.common import to_clips
-from magnet.datamodules.fakes.motion import made_up_body, rest_joints
+from magnet.datamodules.fakes.motion import rest_joints
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 
 
@@ -43,37 +41,6 @@ def world_joints(recording: Recording, family: str) -> NDArray:
     return joints
 
 
-def check_round_trip(name: str, out: Path, takes: int = 5, frames: int = 20) -> list[Recording]:
-    """Write the fake, read it, compare; in the order of takes."""
-    NAMES[name].load_fake()(out, takes, frames, seed=3)
-    written = fake_of(name).scenes(takes, frames, 3)
-    reader = NAMES[name].load_reader()(out)
-    found = reader.takes()
-    assert sorted(take.name for take in found) == sorted(written)
-    recordings = []
-    for take in found:
-        recording, motion = reader.read(take), written[take.name]
-        assert (recording.fps, recording.up) == (motion.fps, motion.up)
-        assert recording.poses is not None and recording.poses.shape == motion.poses.shape
-        np.testing.assert_allclose(world_joints(recording, reader.family), motion.positions, atol=1e-5)
-        np.testing.assert_allclose(recording.betas, motion.betas, atol=1e-6)
-        assert len(recording.persons) == motion.poses.shape[1]
-        assert all(path.is_file() for path in take.files)
-        recordings.append(recording)
-    return recordings
-
-
-def check_splits(name: str, out: Path, takes: int = 12) -> list[Take]:
-    """Every split has takes, no group stands in two, names are unique, and it is the same a second time."""
-    NAMES[name].load_fake()(out, takes, 2, seed=0)
-    found = NAMES[name].load_reader()(out).takes()
-    assert {take.split for take in found} == {"train", "val", "test"}
-    assert len({take.name for take in found}) == takes
-    assert len({(take.group, take.split) for take in found}) == len({take.group for take in found})
-    assert NAMES[name].load_reader()(out).takes() == found
-    return found
-
-
 def refused(reader: Reader, match: str, take: Take | None = None) -> None:
     """Reading fails with a message of ours that names a place under the reader's root and what to do."""
     take = take or reader.takes()[0]
@@ -83,29 +50,16 @@ def refused(reader: Reader, match: str, take: Take | None = None) -> None:
     assert len(str(caught.value)) < 1000
 
 
-WRONG: dict[str, tuple[Callable[[Recording], dict[str, Any]], str]] = {
-    "up axis": (lambda r: {"up": "+z" if r.up == "+y" else "+y"}, r"the declared up axis is .* but people stand along"),
-    "millimetres": (lambda r: {"transl": r.transl * 1000}, r"look like .*millimetres, expected metres"),
-    "degrees": (lambda r: {"poses": np.rad2deg(r.poses)}, r"look like degrees"),
-    "four times the rate": (
-        lambda r: {"fps": 4 * r.fps},
-        r"too fast for people; perhaps 30 frames a second are called",
-    ),
-    "a quarter of the rate": (lambda r: {"fps": r.fps / 4}, r"too slow for people; perhaps 120 frames a second"),
-}
-
-
-def check_wrong_units(name: str, out: Path, frames: int = 400) -> None:
-    """What a reader gives, told with another axis, unit or rate, is refused with what is wrong."""
-    NAMES[name].load_fake()(out, 1, frames)
-    reader = NAMES[name].load_reader()(out)
-    (take,) = reader.takes()
-    recording = reader.read(take)
-    body = made_up_body("smpl" if reader.family == "smpl" else "smplx")
-    assert to_clips(recording, body, take.name, name, "train", reader.family).clips
-    for change, match in WRONG.values():
-        with pytest.raises(DataError, match=match):
-            to_clips(replace(recording, **change(recording)), body, take.name, name, "train", reader.family)
+def check_damaged(
+    reader: Reader, damage: Callable[[Path], Any], match: str, of: Callable[[Take], Path] = lambda take: take.files[0]
+) -> None:
+    """The first take, damaged, is refused with what was found, and the second is read."""
+    one, two, *_ = reader.takes()
+    frames = reader.read(two).frames
+    damage(of(one))
+    one = next((take for take in reader.takes() if take.name == one.name), one)  # its files may be others now
+    refused(reader, match, one)
+    assert reader.read(two).frames == frames
 
 
 def rewritten(path: Path, change: Callable[[Any], Any]) -> None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.body import load_body
 from magnet.datamodules import check_motion
+from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.common import Steps, resample_rotations, resample_valid, stretches, times, to_clips
 from magnet.datamodules.fakes.motion import UP, made_up_body, people, turned
 from magnet.datamodules.recording import DataError
@@ -127,6 +128,31 @@ def test_nothing_that_people_do_is_refused():
         check_motion.check_lengths(joints, joints[:, :, 0], valid)
         check_motion.check_rate(joints[:, :, check_motion.WALKING], valid, 30.0, 30.0)
         assert not len(check_motion.jumps(joints[:, :, 0], valid, 30.0))
+
+
+def recorded_at(cmu_root, take: str, rate: float):
+    """Joints of `check_motion.WALKING` at 30 fps, of a recording called `rate` times as fast as it is."""
+    skeleton = read_asf(cmu_root / f"singles/{take[:2]}.asf")
+    recording = read_amc(cmu_root / f"singles/{take}.amc", skeleton, rate * 120.0)
+    recording = recording.resampled(30.0)
+    end = recording.world()[1]
+    feet = [end[:, skeleton.names.index(bone)] for bone in ("ltibia", "lfoot", "rtibia", "rfoot")]
+    return np.stack([recording.root, *feet], axis=1)[:, None]
+
+
+@pytest.mark.parametrize("take", ["02_04", "05_08", "05_16", "05_20"])
+def test_leaps_are_no_faster_than_falling_at_their_true_rate_alone(cmu_root, take):
+    joints = recorded_at(cmu_root, take, 1.0)
+    check_motion.check_rate(joints, np.ones(joints.shape[:2], dtype=bool), 120.0, 30.0)
+    joints = recorded_at(cmu_root, take, 2.0)
+    with pytest.raises(DataError, match="faster than falling: too fast for people"):
+        check_motion.check_rate(joints, np.ones(joints.shape[:2], dtype=bool), 240.0, 30.0)
+
+
+@pytest.mark.parametrize("take", ["02_01", "05_10", "55_12"])
+def test_the_rate_of_calm_recordings_is_not_refused(cmu_root, take):
+    joints = recorded_at(cmu_root, take, 1.0)
+    check_motion.check_rate(joints, np.ones(joints.shape[:2], dtype=bool), 120.0, 30.0)
 
 
 def test_people_who_lie_are_refused_unless_the_axis_is_confirmed():

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from magnet import cli
 from magnet.datamodules import catalogue
-from magnet.datamodules.common import to_clips
-from magnet.datamodules.fakes.motion import made_up_body
+from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording
-from tests.datamodules.made import SPOILED, in_degrees
+from magnet.datamodules.recording import Reader
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
@@ -23,12 +21,10 @@ SMALL = {
     "max_agents": "7", "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
     "context_frames": "8", "horizon_frames": "8", "test_limit": "2",
 }  # fmt: skip
-FRAMES = {"duobox": 480, "interx": 480, "remocap": 60}
+FRAMES = {"duobox": 480, "interx": 480, "remocap": 40}
 """Of a fake's takes at its own rate, where 150 are too few at 30 fps, or fitting so many takes too long."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""
-LONG = {"duobox": 1200, "interx": 1200, "interhuman": 900}
-"""Of a fake's takes to spoil, where 400 frames are too short for several steps."""
 
 
 def magnet(*words: str) -> None:
@@ -44,10 +40,68 @@ def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     body = () if catalogue.find(name).load_reader().family == "positions" else ("--body", "dl/body.npz")
     magnet("data", "fake", name, "dl", "--frames", str(FRAMES.get(name, 150)), "--takes", str(TAKES.get(name, 4)))
-    magnet("data", "prepare", name, "--root", "dl", "--out", "store", "--workers", "1", *body)
+    few = ("--limit", "1") if body else ("--limit", "1", "--min_frames", "8")  # fits take their time
+    magnet("data", "check", "dl", "--workers", "1", "--picture", "none", *few, *body)
+    assert "all assertions hold" in capsys.readouterr().out
+    prepare_fit_and_test(name, body, (), capsys)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("remocap", ("--reader.fits", "dl/fits")), ("duobox", ("--reader.form", "skeleton", "--reader.phases", "1"))],
+)
+def test_ready_fits_and_bare_skeletons_train_as_well(name, options, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    magnet("data", "fake", name, "dl", "--frames", "30", "--takes", "1" if name == "duobox" else "4")
+    if name == "remocap":
+        fake_remocap.write_fits(tmp_path / "dl/fits", frames=60)
+    body, options = ("--body", "dl/body.npz"), ("--min_frames", "8", *options)
+    magnet("data", "check", "dl", "--name", name, "--workers", "1", "--picture", "none", *options, *body)
+    assert "all assertions hold" in capsys.readouterr().out
+    manifest = prepare_fit_and_test(name, body, options, capsys)
+    fitted = [take for entry in manifest["notes"] if "mean residual" in entry["note"] for take in entry["takes"]]
+    assert sorted(fitted) == ([f"{FIRST}_{part}" for part in ("te0", "tr0", "va0")] if name == "duobox" else [])
+
+
+FIRST = "000_ma_jab_liu_defense"
+
+
+def test_skeletons_that_no_body_fits_are_refused_and_listed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    magnet("data", "fake", "duobox", "dl", "--frames", "30", "--takes", "1")
+    path = tmp_path / f"dl/fbx_export_joints/{FIRST}.npy"
+    held = np.load(path, allow_pickle=True).item()
+    held["ma_position"][:, 1::2] += [0.0, 0.5, 0.0]  # half of the joints half a metre off
+    np.save(path, held)
+    words = ("--root", "dl", "--out", "store", "--workers", "1", "--min_frames", "8", "--reader.form", "skeleton")
+    assert cli.main(["data", "prepare", "duobox", *words, "--limit", "1", "--body", "dl/body.npz"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(rf"none of \d takes could be used.*{FIRST}_tr0: .*mean error of [\d.]+ cm", said, re.S)
+
+
+def test_a_mixed_model_is_tested_on_scenes_of_each_size(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    magnet("data", "fake", "embody3d", "dl", "--frames", "40", "--takes", "12")
+    body = ("--body", "dl/body.npz")
+    mixed = prepare_fit_and_test("embody3d", body, (), capsys)
+    assert set(mixed["splits"]["train"]["clips by people"]) == {"2", "3", "4"}
+    for people in (2, 3, 4):
+        words = ("--root", "dl", "--out", f"of{people}", "--workers", "1", "--reader.people", f"[{people}]")
+        magnet("data", "prepare", "embody3d", *words, *body)
+    held = [
+        json.loads(Path(f"of{people}/manifest.json").read_text())["splits"]["test"]["takes"] for people in (2, 3, 4)
+    ]
+    assert sum(held) == mixed["splits"]["test"]["takes"]
+    people = 2 + next(k for k, takes in enumerate(held) if takes)
+    data = ("--data", "magnet.datamodules.embody3d.Embody3D", "--data.path", f"of{people}")
+    magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", *data, "--out", "each", *CPU)
+    assert json.loads(Path("each/results.json").read_text())
+
+
+def prepare_fit_and_test(name, body, options, capsys):
+    """From `dl` to `store`, two steps of training on it, and a test; returns the store's manifest."""
+    magnet("data", "prepare", name, "--root", "dl", "--out", "store", "--workers", "1", *body, *options)
     assert f"--data {catalogue.find(name).data.partition(':')[2]} --data.path store" in capsys.readouterr().out
-    if body:  # fits are the same again, and take their time
-        magnet("data", "check", "dl", "--workers", "1", "--limit", "1", "--picture", "none", *body)
     magnet("data", "check", "store", "--picture", "none", *body)
     assert "all assertions hold" in capsys.readouterr().out
     manifest = json.loads(Path("store/manifest.json").read_text())
@@ -57,53 +111,8 @@ def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch,
     limits = ("--trainer.max_steps", "2", "--trainer.limit_val_batches", "1")
     magnet("fit", "--model", "Tokenizer", *flags("model", TINY), *data, "--out", "run", *limits, *CPU)
     magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", "--out", "tested", *CPU)
-    results = json.loads(Path("tested/results.json").read_text())
-    assert results
-
-
-@pytest.mark.parametrize("wrong", SPOILED)
-@pytest.mark.parametrize("name", catalogue.NAMES)
-def test_a_wrong_axis_unit_or_rate_is_named_for_every_reader(name, wrong, tmp_path_factory):
-    kind, root = catalogue.find(name).load_reader(), cached_fake(name, tmp_path_factory)
-    reader = kind(root)
-    for take in reader.takes():
-        recording = reader.read(take)
-        if recording.frames > 4 * recording.fps and (wrong != "m for mm" or shown_people(recording) > 1):
-            break
-    if wrong == "30 for 120 fps":  # every fourth frame, called by the rate of all
-        fields = ("poses", "transl", "positions", "valid")
-        cut = {f: getattr(recording, f)[::4] for f in fields if getattr(recording, f) is not None}
-        recording, spoil = replace(recording, **cut), lambda r: r
-    else:
-        spoil = SPOILED[wrong][0]
-    with pytest.raises(DataError, match=SPOILED[wrong][1]):
-        to_clips(spoil(recording), made_up_body(), take.name, name, "train", reader.family)
-
-
-@pytest.mark.parametrize("name", catalogue.NAMES)
-def test_degrees_are_named_for_every_reader_of_rotations(name, tmp_path_factory):
-    kind, root = catalogue.find(name).load_reader(), cached_fake(name, tmp_path_factory)
-    if kind.family == "positions":
-        pytest.skip("no rotations")
-    reader = kind(root)
-    with pytest.raises(DataError, match="look like degrees"):
-        to_clips(in_degrees(reader.read(reader.takes()[0])), made_up_body(), "take", name, "train", kind.family)
-
-
-FAKES: dict[str, Path] = {}
-
-
-def cached_fake(name: str, tmp_path_factory) -> Path:
-    if name not in FAKES:
-        FAKES[name] = tmp_path_factory.mktemp(name)
-        catalogue.find(name).load_fake()(FAKES[name], takes=TAKES.get(name, 2), frames=LONG.get(name, 400))
-    return FAKES[name]
-
-
-def shown_people(recording: Recording) -> int:
-    motion = recording.poses if recording.poses is not None else recording.positions
-    assert motion is not None
-    return motion.shape[1]
+    assert json.loads(Path("tested/results.json").read_text())
+    return manifest
 
 
 @pytest.mark.parametrize("name", catalogue.NAMES)

@@ -4,37 +4,21 @@ from __future__ import annotations
 
 import pickle
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from magnet.datamodules.common import to_clips
 from magnet.datamodules.duobox import FITS, MAP, SKELETONS, SKIPPED, DuoBoxReader
 from magnet.datamodules.fakes import duobox as fake
-from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.recording import DataError, Recording
 from magnet.datamodules.unpickle import load_object_npy
 
-from .reading import WRONG, world_joints
+from .reading import world_joints
 
-FRAMES = 8
+TAKES, FRAMES = 2, 8
 PARTS = ("tr0", "tr1", "tr2", "tr3", "va0", "te0")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("duobox")
-    fake.write(root, takes=2, frames=FRAMES)
-    return root
-
-
-@pytest.fixture
-def copy(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path / "copy")
-    return tmp_path / "copy"
 
 
 def read(root: Path, part: str = "te0", number: int = 0, **options: Any) -> Recording:
@@ -171,12 +155,3 @@ def test_bad_skeletons_are_refused_by_file_and_person(copy: Path, field: Any, sa
 def test_options_out_of_range_are_refused(made: Path, options: dict[str, Any]) -> None:
     with pytest.raises(DataError, match="got"):
         DuoBoxReader(made, **options)
-
-
-def test_a_wrong_axis_unit_or_rate_is_named(tmp_path: Path) -> None:
-    fake.write(tmp_path, takes=1, frames=100)
-    right = read(tmp_path, "tr0")
-    assert to_clips(right, made_up_body(), "boxing", "duobox", "train").clips
-    for change, said in WRONG.values():
-        with pytest.raises(DataError, match=said):
-            to_clips(replace(right, **change(right)), made_up_body(), "boxing", "duobox", "train")

@@ -14,22 +14,7 @@ from magnet.datamodules.fakes import interx as fake
 from magnet.datamodules.interx import InterXReader
 from magnet.datamodules.recording import DataError, Recording
 
-from .reading import check_wrong_units, world_joints
-
-FRAMES = 4
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("interx")
-    fake.write(root, takes=4, frames=FRAMES)
-    return root
-
-
-@pytest.fixture
-def copy(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path / "copy")
-    return tmp_path / "copy"
+TAKES, FRAMES = 4, 4
 
 
 def read(root: Path, number: int = 0, **options: Any) -> Recording:
@@ -43,13 +28,6 @@ def changed(root: Path, **fields: Any) -> None:
     with np.load(path) as file:
         held = dict(file) | fields
     np.savez(path, **{key: value for key, value in held.items() if value is not None})
-
-
-@pytest.mark.parametrize("number", range(4))
-def test_the_fake_is_read_back_to_its_motion(made: Path, number: int) -> None:
-    found, shown = read(made, number), fake.motion(number, FRAMES)
-    assert (found.fps, found.up, found.frames) == (120.0, "+y", 4 * FRAMES)
-    assert np.abs(world_joints(found, "smplx") - shown.positions).max() < 1e-5
 
 
 def test_roles_are_those_of_the_annotations(made: Path) -> None:
@@ -165,7 +143,3 @@ def test_pickled_numbers_are_refused(copy: Path) -> None:
     changed(copy, trans=np.array([Path("x")], dtype=object))
     with pytest.raises(DataError, match=r"P2\.npz"):
         read(copy)
-
-
-def test_a_wrong_axis_unit_or_rate_is_named(tmp_path: Path) -> None:
-    check_wrong_units("interx", tmp_path)

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -37,36 +38,82 @@ def content(store: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in store.iterdir() if path.name != STATE}
 
 
-def slowly(order: Order, out: Path) -> None:
-    """In a process that is going to be killed."""
-    read = made.MadeReader.read
-
-    def slow(self, take):
-        time.sleep(0.2)
-        return read(self, take)
-
-    made.MadeReader.read = slow  # type: ignore[method-assign]
-    prepare(order, out, shard_rows=700)
+@pytest.fixture(scope="module")
+def couples(tmp_path_factory) -> Order:
+    """A fake that worker processes know, too."""
+    root = tmp_path_factory.mktemp("couples")
+    catalogue.find("chi3d").load_fake()(root, takes=5, frames=100)
+    return Order("chi3d", str(root), {}, str(root / "body.npz"), Steps())
 
 
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(order, tmp_path):
-    whole = prepare(order, tmp_path / "whole", shard_rows=700)
-    assert whole.made == 5 and whole.kept == 0
-    out = tmp_path / "killed"
-    process = multiprocessing.get_context("fork").Process(target=slowly, args=(order, out))
-    process.start()
-    for _ in range(2000):
-        if len(list((out / STATE).glob("*.part"))) >= 2:
-            break
+@pytest.fixture(scope="module")
+def undisturbed(couples, tmp_path_factory) -> dict[str, bytes]:
+    out = tmp_path_factory.mktemp("undisturbed") / "store"
+    prepare(couples, out, shard_rows=200)
+    return content(out)
+
+
+def doomed(order: Order, out: Path, during: str, workers: int, reached: Path) -> None:
+    """In a process that is going to be killed: stops after the first take, or half-way through the second file."""
+
+    def stop() -> None:
+        reached.touch()
+        time.sleep(600)
+
+    def tell(_: str, done: int, total: int) -> None:
+        if during == "conversion" and done:
+            stop()
+
+    write, written = prepare_pack.write_whole, []
+
+    def half(folder, name, put):
+        def begin(file):
+            file.write(b"half of it")
+            file.file.flush()
+            stop()
+
+        written.append(name)
+        return write(folder, name, begin if len(written) == 2 else put)
+
+    prepare_pack.write_whole = half
+    prepare(order, out, workers=workers, shard_rows=200, tell=tell)
+
+
+def children(pid: int) -> list[Path]:
+    """Processes that a process started, in /proc."""
+    return [Path("/proc", child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def until(true: Callable[[], bool], seconds: float = 500.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
         time.sleep(0.02)
-    process.kill()
-    process.join()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("during", ["conversion", "packing"])
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp_path, during, workers):
+    out, reached = tmp_path / "killed", tmp_path / "reached"
+    process = multiprocessing.get_context("fork").Process(target=doomed, args=(couples, out, during, workers, reached))
+    process.start()
+    try:
+        until(lambda: reached.exists() or not process.is_alive())
+        started = children(process.pid)
+    finally:
+        process.kill()
+        process.join()
+    until(lambda: not any(child.exists() for child in started))  # workers do not outlive who started them
     assert not (out / "manifest.json").exists()  # nothing that reads as a store
+    left = {path.name.split("-")[0] for path in out.iterdir()}
+    assert left == ({STATE} if during == "conversion" else {STATE, "train", ".new"})
     with pytest.raises(ValueError, match="a prepare that has not finished lies there"):
         Folder(out)
-    again = prepare(order, out, shard_rows=700)
-    assert again.kept >= 2 and again.made + again.kept == 5
-    assert content(out) == content(tmp_path / "whole")
+    again = prepare(couples, out, shard_rows=200)
+    takes = len(couples.reader().takes())
+    assert again.kept == takes or (during == "conversion" and again.kept)
+    assert again.made + again.kept == takes
+    assert content(out) == undisturbed
 
 
 @pytest.mark.parametrize("dies_at", ["first shard", "second shard", "index", "manifest"])
@@ -94,15 +141,11 @@ def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, tmp_pa
     assert content(tmp_path / "store") == content(tmp_path / "new")
 
 
-def test_two_workers_write_the_bytes_of_one(tmp_path):
-    root = tmp_path / "dl"
-    catalogue.find("chi3d").load_fake()(root, takes=3, frames=120)
-    order = Order("chi3d", str(root), {}, str(root / "body.npz"), Steps())
+def test_two_workers_write_the_bytes_of_one(couples, undisturbed, tmp_path):
     told: list[tuple[int, int]] = []
-    for workers in (1, 2):
-        prepare(order, tmp_path / str(workers), workers=workers, tell=lambda _, done, total: told.append((done, total)))
-    assert content(tmp_path / "1") == content(tmp_path / "2")
-    assert told == sorted(told[:4]) + sorted(told[4:]) and told[3][0] == told[3][1] == told[7][0]
+    prepare(couples, tmp_path / "2", workers=2, shard_rows=200, tell=lambda _, done, total: told.append((done, total)))
+    assert content(tmp_path / "2") == undisturbed
+    assert told == sorted(told) and told[-1][0] == told[-1][1] and len(told) == 1 + len(couples.reader().takes())
 
 
 def test_only_what_changed_is_made_again(order, tmp_path):

@@ -1,4 +1,4 @@
-"""Whatever happens to a data set's files, its reader reads them or says what is wrong, in one kind of error."""
+"""Whatever happens to a data set's files, they become clips or an error of one kind says what is wrong."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules.common import Steps, to_clips
+from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.recording import DataError, Reader, Recording
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 TAKES, FRAMES, ROUNDS, FILES = 3, 4, 2, 7
+SHORT = Steps(min_frames=1)
 
 
 def known() -> list[str]:
@@ -87,7 +90,7 @@ def fakes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 
 def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
-    """Read the takes that use a file, or all; how many could be. Raises anything but `DataError`."""
+    """Read and convert the takes that use a file, or all; how many could be. Raises anything but `DataError`."""
     done = 0
     try:
         opened = reader(root)
@@ -107,6 +110,14 @@ def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
         for part in (recording.poses, recording.positions):
             assert part is None or (np.isfinite(part) | ~valid).all()
         done += 1
+        if recording.poses is None:
+            continue  # a fit would take its time
+        try:
+            clips = to_clips(recording, made_up_body(), take.name, reader.name, "train", reader.family, SHORT).clips
+        except DataError as error:
+            assert len(str(error)) > 20
+        else:
+            assert all(clip.scene.T_world_root.isfinite().all() for clip in clips)
     return done
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +20,15 @@ GROUPS = (2, 3, 5, 7)
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Sequences named after a video, first and last frame, and a list a split."""
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by sequence; betas are not written."""
     write_body(out / "body.npz", "smpl")
     (out / "motions_smpl").mkdir(parents=True, exist_ok=True)
     lists: dict[str, list[str]] = {split: [] for split in SPLITS}
-    for index, (name, motion) in enumerate(scenes(takes, frames, seed).items()):
+    for index, (name, motion) in enumerate(scenes.items()):
         T, P = motion.poses.shape[:2]
         poses = np.zeros((P, T, 72), dtype=np.float32)
         poses[..., :66] = motion.poses.transpose(1, 0, 2, 3).reshape(P, T, 66)

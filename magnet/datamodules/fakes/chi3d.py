@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,14 @@ HANDS = {"left_hand_pose": 15, "right_hand_pose": 15, "jaw_pose": 1, "leye_pose"
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Actions of pairs s02, s03 and s04; of the test pair s01 only the folder, as its motion is not given out."""
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by pair and action."""
     write_body(out / "body.npz")
-    (out / "chi3d" / "test" / "s01").mkdir(parents=True)
-    for name, motion in scenes(takes, frames, seed).items():
+    (out / "chi3d" / "test" / "s01").mkdir(parents=True, exist_ok=True)
+    for name, motion in scenes.items():
         pair, action = name.split("_")
         path = out / "chi3d" / "train" / pair / "smplx" / f"{action}.json"
         path.parent.mkdir(parents=True, exist_ok=True)

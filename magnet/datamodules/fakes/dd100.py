@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,11 @@ def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     return turned(people(frames, 2, 30.0, seed + number), "+z")
 
 
+def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
+    """What is written, by take."""
+    return {name(number): motion(number, frames, seed) for number in range(takes)}
+
+
 def name(number: int) -> str:
     """Of take `number`, without the role."""
     genre, choreography, take = NAMES[number % len(NAMES)].split("_")
@@ -36,12 +42,17 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
         frames: of a take at 30 fps.
         seed: of the motion.
     """
+    write_scenes(out, scenes(takes, frames, seed), seed)
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion], seed: int = 0) -> None:
+    """Any motions by take; the seed is of the fingers."""
     folder = out / "data/motion/smplx/all"
     folder.mkdir(parents=True, exist_ok=True)
     write_body(out / "body.npz")
     generator = np.random.default_rng(seed)
-    for number in range(takes):
-        shown = motion(number, frames, seed)
+    for name, shown in scenes.items():
+        frames = shown.frames
         for person, gender in enumerate(GENDERS):
             face = np.zeros((frames, 9))
             hands = generator.normal(0.0, 0.1, (frames, 90))
@@ -53,4 +64,4 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
                 "betas": np.tile(shown.betas[person], (frames, 1)).astype(np.float32),
                 "meta": {"gender": gender},
             }
-            np.save(folder / f"{name(number)}_{person:02}.npy", held, allow_pickle=True)  # type: ignore[arg-type]
+            np.save(folder / f"{name}_{person:02}.npy", held, allow_pickle=True)  # type: ignore[arg-type]

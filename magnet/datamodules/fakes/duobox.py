@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,9 @@ def name(number: int) -> str:
     return f"{number:03}{NAMES[number % len(NAMES)][3:]}"
 
 
-def subjects(number: int) -> tuple[str, str]:
-    """The two people of take `number`, in the order of its files."""
-    words = name(number).split("_")
+def subjects(name: str) -> tuple[str, str]:
+    """The two people of a take, in the order of its files."""
+    words = name.split("_")
     return words[1], words[3]
 
 
@@ -44,6 +45,11 @@ def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     return turned(people(length(frames), 2, FPS, seed + number), "+z")
 
 
+def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
+    """What is written, by take."""
+    return {name(number): motion(number, frames, seed) for number in range(takes)}
+
+
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Write the fake, and out/body.npz; every take has all three splits.
 
@@ -53,13 +59,17 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
         frames: of a take's test part at 30 fps; the take is five times as long.
         seed: of the motion.
     """
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by take."""
     for folder in (FITS, SKELETONS):
         (out / folder).mkdir(parents=True, exist_ok=True)
     write_body(out / "body.npz")
-    for number in range(takes):
-        shown = motion(number, frames, seed)
+    for name, shown in scenes.items():
         fits, skeletons = {}, {}
-        for person, subject in enumerate(subjects(number)):
+        for person, subject in enumerate(subjects(name)):
             fits[subject] = {
                 "transl": shown.transl[:, person].astype(np.float32),
                 "global_orient": shown.poses[:, person, 0].astype(np.float32),
@@ -68,8 +78,8 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
             }
             skeletons[f"{subject}_position"] = shown.positions[:, person, list(SOURCE)].astype(np.float32)
             skeletons[f"{subject}_rotation"] = _local(shown.poses[:, person]).astype(np.float32)
-        np.save(out / FITS / f"{name(number)}.npy", fits, allow_pickle=True)  # type: ignore[arg-type]
-        np.save(out / SKELETONS / f"{name(number)}.npy", skeletons, allow_pickle=True)  # type: ignore[arg-type]
+        np.save(out / FITS / f"{name}.npy", fits, allow_pickle=True)  # type: ignore[arg-type]
+        np.save(out / SKELETONS / f"{name}.npy", skeletons, allow_pickle=True)  # type: ignore[arg-type]
 
 
 def _local(poses: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,14 @@ LOST = 3
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Scenes of 2, 3 and 4 people in acting and daylife, each with a cast and a session of its own."""
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by capture, whose name says the section and the people."""
     write_body(out / "body.npz")
     listed: dict[str, dict[str, dict[str, Any]]] = {section: {} for section in LABELS}
-    for index, (capture, motion) in enumerate(scenes(takes, frames, seed).items()):
+    for index, (capture, motion) in enumerate(scenes.items()):
         section = section_of(capture)
         ids = ids_of(capture)
         for p, person in enumerate(ids):
@@ -36,7 +41,7 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
                 np.save(folder / feature / f"{capture}.npy", array)
             place = f"{ELSEWHERE}/{section}/{capture}/{person}"
             listed[section].setdefault(person, {})[capture] = {
-                "length": frames,
+                "length": motion.frames,
                 "id": sum(map(len, listed[section].values())),
                 "text": f"{place}/text_annotations/{capture}.json",
                 "multiperson": [other for other in ids if other != person],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +17,26 @@ START = 11
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Actions of pairs, each with meta.npz and smpl/000XXX.npz."""
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by pair and action."""
     write_body(out / "body.npz", "smpl")
-    for name, motion in scenes(takes, frames, seed).items():
+    for name, motion in scenes.items():
         folder = out / Path(*name.split("_"))
         (folder / "smpl").mkdir(parents=True)
         np.savez(
             folder / "meta.npz",
             start=START,
-            end=START + frames - 1,
+            end=START + motion.frames - 1,
             num_persons=2,
             genders=np.array(["male", "female"]),
             betas=motion.betas.astype(np.float32),
             contact_ids=np.array([START]),
             mono_cam=4,
         )
-        for t in range(frames):
+        for t in range(motion.frames):
             np.savez(folder / "smpl" / f"{START + t:06}.npz", **_frame(motion, t))  # type: ignore[arg-type]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,17 @@ SPLITS = ("train", "val", "test", "train")
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Takes 1, 2 and so on, with split lists and a line of text each."""
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by take."""
     write_body(out / "body.npz", "smpl")
     for folder in ("motions", "annots", "split"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     lists: dict[str, list[str]] = {split: [] for split in SPLITS}
-    for index, (name, motion) in enumerate(scenes(takes, frames, seed).items()):
-        held: dict[str, Any] = {"mocap_framerate": FPS, "frames": frames}
+    for index, (name, motion) in enumerate(scenes.items()):
+        held: dict[str, Any] = {"mocap_framerate": FPS, "frames": motion.frames}
         held |= {f"person{p + 1}": _person(motion, p) for p in range(2)}
         (out / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(held))
         (out / "annots" / f"{name}.txt").write_text("one person walks behind the other\n")

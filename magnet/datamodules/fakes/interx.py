@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,11 @@ def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     return people(length(frames), 2, FPS, seed + number)
 
 
+def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
+    """What is written, by clip."""
+    return {name(number): motion(number, frames, seed) for number in range(takes)}
+
+
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Write the fake, and out/body.npz; clips are in training, validation and test in turn.
 
@@ -39,17 +45,21 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
         frames: of a clip at 30 fps.
         seed: of the motion.
     """
+    write_scenes(out, scenes(takes, frames, seed), seed)
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion], seed: int = 0) -> None:
+    """Any motions by clip; the seed is of the hands."""
     write_body(out / "body.npz")
     for part in ("splits", "annots"):
         (out / part).mkdir(parents=True, exist_ok=True)
-    listed = [name(number) for number in range(takes)]
+    listed = list(scenes)
     for k, split in enumerate(SPLITS):
         (out / "splits" / f"{split}.txt").write_text("".join(f"{clip}\n" for clip in listed[k::3]))
     (out / "splits" / "all.txt").write_text("".join(f"{clip}\n" for clip in listed))
     (out / "annots" / "interaction_order.pkl").write_bytes(pickle.dumps({c: k % 2 for k, c in enumerate(listed)}))
     generator = np.random.default_rng(seed)
-    for number, clip in enumerate(listed):
-        shown = motion(number, frames, seed)
+    for clip, shown in scenes.items():
         folder = out / "motions" / clip
         folder.mkdir(parents=True, exist_ok=True)
         for person, gender in enumerate(GENDERS):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -107,6 +107,11 @@ def sequence(number: int) -> int:
     return SEQUENCES[number] if number < len(SEQUENCES) else number + 10
 
 
+def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
+    """What is written, by take."""
+    return {f"lindyhop_{sequence(number):03}": motion(number, frames, seed) for number in range(takes)}
+
+
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Write the fake, and out/body.npz; of four takes two train, one validates and one tests, by either split.
 
@@ -116,24 +121,33 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
         frames: of a sequence at 30 fps.
         seed: of the motion.
     """
+    write_scenes(out, scenes(takes, frames, seed))
+
+
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by take."""
     write_body(out / "body.npz")
-    for number in range(takes):
-        shown = motion(number, frames, seed)
-        half = "test" if sequence(number) in TESTED else "train"
+    for name, shown in scenes.items():
+        number = int(name.rpartition("_")[2])
+        half = "test" if number in TESTED else "train"
         for person in range(2):
-            folder = out / "ReMoCap/LindyHop" / half / str(sequence(number)) / str(person)
+            folder = out / "ReMoCap/LindyHop" / half / str(number) / str(person)
             folder.mkdir(parents=True, exist_ok=True)
             _write_person(folder, shown, person)
 
 
 def write_fits(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     """Write ready fits of the same takes: NUMBER.npz with arrays (2, T, ..)."""
+    write_fitted_scenes(out, scenes(takes, frames, seed))
+
+
+def write_fitted_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Ready fits of any motions by take."""
     out.mkdir(parents=True, exist_ok=True)
-    for number in range(takes):
-        shown = motion(number, frames, seed)
+    for name, shown in scenes.items():
         body = shown.poses[:, :, 1:].reshape(shown.frames, 2, 63).swapaxes(0, 1)
         np.savez(
-            out / f"{sequence(number)}.npz",
+            out / f"{int(name.rpartition('_')[2])}.npz",
             body_pose=np.concatenate([body, np.zeros((2, shown.frames, 90))], axis=2).astype(np.float32),
             orient=shown.poses[:, :, 0].swapaxes(0, 1).astype(np.float32),
             trans=shown.transl.swapaxes(0, 1).astype(np.float32),

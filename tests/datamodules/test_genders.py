@@ -1,0 +1,181 @@
+"""Gendered bodies: the pelvis and joints stay where the person's own body has them; what cannot be is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roma
+import torch
+
+from magnet import cli
+from magnet.body import Body, load_body
+from magnet.body.shape import reshaped
+from magnet.datamodules import catalogue
+from magnet.datamodules.common import to_clips
+from magnet.datamodules.fakes.body import arrays
+from magnet.datamodules.fakes.motion import people
+from magnet.datamodules.genders import find_bodies, one_body
+from magnet.datamodules.recording import DataError, Recording
+from magnet.datamodules.store import Folder
+
+SHAPE = {"female": (-1.2, 0.4, 0.3), "male": (1.1, -0.5, -0.2)}
+"""What a gendered body's mean is in the neutral one's shape numbers."""
+AT = {"female": (0.02, -0.31, 0.03), "male": (-0.01, -0.38, 0.0)}
+"""Where its rest pelvis is, metres from the file's origin."""
+
+
+def gendered(path: Path, gender: str, outside: float = 0.0) -> Path:
+    """The made-up body with another mean and rest pelvis; `outside` metres of it that no shape number gives."""
+    held = dict(arrays())
+    regressor, mean = held["J_regressor"].astype(np.float64), held["v_template"].astype(np.float64)
+    for column, amount in enumerate(SHAPE[gender]):
+        mean = mean + amount * held["shapedirs"][..., column]
+    knee = held["weights"][:, 4] > 0.5
+    mean[knee, 2] += outside
+    mean = mean - (regressor @ mean)[0] + AT[gender]
+    held |= {"v_template": mean.astype(np.float32), "body_id": np.array(f"made-up-{gender}")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **held)  # type: ignore[arg-type]
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("bodies")
+    for gender in SHAPE:
+        gendered(folder / f"SMPLX_{gender.upper()}.npz", gender)
+    np.savez(folder / "SMPLX_NEUTRAL.npz", **arrays())  # type: ignore[arg-type]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bodies(folder) -> dict[str, Body]:
+    return {gender: load_body(path) for gender, path in find_bodies([folder]).items()}
+
+
+def joints(recording: Recording, bodies: list[Body]) -> torch.Tensor:
+    """World joints as SMPL's definition gives them, each person by a body of their own. -> (T, P, 22, 3)"""
+    assert recording.poses is not None and recording.transl is not None and recording.betas is not None
+    found = []
+    for p, body in enumerate(bodies):
+        rotations = roma.rotvec_to_rotmat(torch.from_numpy(recording.poses[:, p]))
+        betas = torch.from_numpy(recording.betas[p])
+        T_world_root = torch.eye(4, dtype=torch.float64).repeat(len(rotations), 1, 1)
+        T_world_root[:, :3, :3] = rotations[:, 0]
+        T_world_root[:, :3, 3] = torch.from_numpy(recording.transl[:, p]) + body.rest_joints(betas)[0]
+        found.append(body.forward_kinematics(rotations[:, 1:], T_world_root, betas))
+    return torch.stack(found, dim=1)
+
+
+def couple(seed: int = 3) -> Recording:
+    m = people(60, 2, seed=seed)
+    betas = np.clip(m.betas, -1.5, 1.5)
+    return Recording(m.fps, m.up, poses=m.poses, transl=m.transl, betas=betas, persons=("her", "him"))
+
+
+def test_joints_are_those_of_the_gendered_bodies_within_a_millimetre(bodies):
+    given = replace(couple(), genders=("female", "male"))
+    true = joints(given, [bodies["female"], bodies["male"]])
+    found = one_body(given, bodies, bodies["neutral"])
+    assert (joints(found, [bodies["neutral"]] * 2) - true).norm(dim=-1).max() < 1e-3
+    naive = replace(given, transl=given.transl, betas=given.betas)
+    assert (joints(naive, [bodies["neutral"]] * 2) - true).norm(dim=-1).max() > 0.02  # and would else be far off
+    assert np.array_equal(found.poses, given.poses)
+    assert set(found.notes) == {
+        f"{gender} shapes expressed in body made-up-smplx: joints at rest within 1 mm" for gender in ("female", "male")
+    }
+    outcome = to_clips(found, bodies["neutral"], "take", "made", "train")
+    clip = bodies["neutral"].joints(outcome.clips[0].scene)[0].double()
+    moved = clip - true
+    assert (moved - moved[:1, :1, :1]).norm(dim=-1).max() < 2e-3  # but for the floor and the origin
+
+
+def test_what_the_shape_space_does_not_hold_is_said_in_millimetres(bodies, tmp_path):
+    odd = load_body(gendered(tmp_path / "male.npz", "male", outside=0.012))
+    betas = torch.zeros(1, 10)
+    found, off = reshaped(betas, odd, bodies["neutral"])
+    rest = [body.rest_joints(b)[0] for body, b in ((odd, betas.double()), (bodies["neutral"], found))]
+    seen = ((rest[0] - rest[0][0]) - (rest[1] - rest[1][0])).norm(dim=-1)
+    torch.testing.assert_close(off[0], seen)
+    assert 2e-3 < float(off.max()) < 12e-3
+    given = replace(couple(), genders=("neutral", "male"))
+    noted = one_body(given, {**bodies, "male": odd}, bodies["neutral"]).notes
+    (note,) = noted  # neutral shapes are what they were: nothing to say
+    assert note.startswith("male shapes expressed in body made-up-smplx: joints at rest within ")
+    assert 3 <= int(note.split()[-2]) <= 12
+
+
+def test_shapes_of_the_same_body_stay_bit_for_bit(bodies):
+    given = couple()
+    found = one_body(replace(given, genders=("neutral", "neutral")), bodies, bodies["neutral"])
+    assert np.array_equal(found.betas, given.betas) and np.array_equal(found.transl, given.transl)
+    assert one_body(given, {}, bodies["neutral"]) is given
+
+
+def test_bodies_of_another_model_are_refused(bodies, tmp_path):
+    other = load_body(gendered(tmp_path / "male.npz", "male", outside=0.3))
+    given = replace(couple(), genders=("female", "male"))
+    with pytest.raises(DataError, match=r"him: male joints at rest are up to .* cm off .* expected at most 4 cm"):
+        one_body(given, {**bodies, "male": other}, bodies["neutral"])
+    with pytest.raises(DataError, match="him is male, but the bodies are female, neutral alone; add the male one"):
+        one_body(given, {"female": bodies["female"]}, bodies["neutral"])
+
+
+def test_a_recording_says_one_gender_for_each(bodies):
+    with pytest.raises(DataError, match=r"genders: got 1 \(male\), expected one for each of 2 people"):
+        replace(couple(), genders=("male",))
+    with pytest.raises(DataError, match="genders: got 'man', expected one of neutral, male, female"):
+        replace(couple(), genders=("man", "female"))
+
+
+@pytest.mark.parametrize("names", [("SMPLX_FEMALE.npz", "SMPLX_MALE.npz"), ("female/model.npz", "male/model.npz")])
+def test_bodies_are_told_apart_by_their_names(folder, tmp_path, names):
+    for name, gender in zip(names, SHAPE, strict=True):
+        gendered(tmp_path / name, gender)
+    wanted = {gender: tmp_path / name for name, gender in zip(names, SHAPE, strict=True)}
+    assert find_bodies([tmp_path]) == wanted == find_bodies(list(wanted.values()))
+    (tmp_path / "body.npz").write_bytes(b"")
+    assert find_bodies([tmp_path]) == wanted
+    with pytest.raises(ValueError, match=r"the name of .* says none of neutral, male, female"):
+        find_bodies([tmp_path / "body.npz"])
+    with pytest.raises(ValueError, match="are both female"):
+        find_bodies([folder, tmp_path])
+    with pytest.raises(ValueError, match="does not exist"):
+        find_bodies([tmp_path / "nowhere"])
+
+
+@pytest.mark.parametrize("name", ["interx", "dd100", "hi4d"])
+def test_readers_say_who_is_what(name, tmp_path):
+    catalogue.find(name).load_fake()(tmp_path, takes=1, frames=60)
+    reader = catalogue.find(name).load_reader()(tmp_path)
+    assert sorted(reader.read(reader.takes()[0]).genders) == ["female", "male"]
+
+
+def test_a_store_of_gendered_people_is_made_and_described_through_the_command_line(
+    folder, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", "dd100", "dl", "--frames", "90", "--takes", "4"]) == 0
+    words = ["--bodies", str(folder), "--workers", "1"]
+    assert cli.main(["data", "check", "dl", "--picture", "none", *words]) == 0
+    note = "female shapes expressed in body made-up-smplx: joints at rest within 1 mm (4 takes)"
+    assert f"note: {note}" in capsys.readouterr().out
+    assert cli.main(["data", "prepare", "dd100", "--root", "dl", "--out", "store", *words]) == 0
+    assert f"--data.body_model {folder / 'SMPLX_NEUTRAL.npz'}" in capsys.readouterr().out
+    assert cli.main(["data", "info", "store"]) == 0
+    said = capsys.readouterr().out
+    assert note in said and "from female ones" in said and "people: follower | leader (4 takes)" in said
+    manifest = Folder("store").manifest
+    assert manifest["body"]["genders"].keys() == {"female", "male", "neutral"}
+    assert not any("the shape is used with the body model given" in entry["note"] for entry in manifest["notes"])
+
+
+def test_people_of_no_gender_are_neutral(bodies):
+    given, other = couple(), {"neutral": bodies["female"], "male": bodies["male"]}
+    assert given.genders == ()
+    found = one_body(given, other, bodies["male"])
+    (note,) = found.notes
+    assert note.startswith("neutral shapes expressed in body made-up-male")
