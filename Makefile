@@ -7,7 +7,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-browser test-all check lint type format clean distclean
+.PHONY: help setup demo test test-slow test-browser test-blender test-all check lint type format clean distclean
 
 help:  ## list what make can do
 	@echo "magnet: diffusion forcing for the motion of several people"
@@ -54,6 +54,11 @@ test-browser: $(READY)  ## the viewer in a real headless Chromium, installed fro
 	@command -v chromium >/dev/null || \
 	  { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core; }
 	@$(PY) -m pytest -q -m browser tests/viewer
+
+test-blender: $(READY)  ## our files in Blender, whose bpy gets an environment of its own (Python 3.11)
+	@echo "test-blender: pytest, exported files in Blender"
+	@test -x .venv-bpy/bin/python || { python3.11 -m venv .venv-bpy && .venv-bpy/bin/pip install -qq 'bpy==4.5.*'; }
+	@MAGNET_BLENDER=.venv-bpy/bin/python $(PY) -m pytest -q -s tests/export/test_blender.py
 
 test-all: $(READY)  ## run every test
 	@echo "test-all: pytest, everything"

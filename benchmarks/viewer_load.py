@@ -3,6 +3,8 @@
     python benchmarks/viewer_load.py --people 16 --frames 20000
 
 Chromium runs headless with a software renderer, so its frame rates are the least that a computer without any GPU gives.
+Where the time goes: `server ms` is Python's CPU for a frame that is sent, `script ms` the browser's for its scripts,
+`draw ms` that of the process that draws, which is what a GPU would take over. The last two are for a frame drawn.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import dataclasses
 import os
 import shutil
 import threading
@@ -22,7 +25,7 @@ import torch
 from magnet.body import load_body
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
-from magnet.viewer.rig import STYLES
+from magnet.viewer.rig import VIEWS, Style
 from magnet.viewer.takes import take
 from magnet.viewer.troupe import Look
 from magnet.viewer.watch import Viewer
@@ -32,7 +35,23 @@ FLAGS = (
     "--disable-background-networking --no-first-run --disable-component-update --disable-sync --disable-quic"
 )
 STEPS = 40
-COUNT = "window.frames_drawn = 0; (function f() { window.frames_drawn++; requestAnimationFrame(f) })()"
+WARM = 25
+"""Frames drawn before anything counts: the first ones wait for shaders to be compiled."""
+COUNT = """
+window.drawn = {frames: 0, calls: 0, triangles: 0};
+let ticks = 0, last = -1;
+for (const name of ['drawElements', 'drawElementsInstanced', 'drawArrays', 'drawArraysInstanced']) {
+  const call = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...words) {
+    const times = name.endsWith('Instanced') ? words[words.length - 1] : 1;
+    drawn.calls += 1;
+    drawn.triangles += words[name.startsWith('drawElements') ? 1 : 2] / 3 * times;
+    if (last !== ticks) { last = ticks; drawn.frames += 1; }
+    return call.apply(this, words);
+  };
+}
+(function tick() { ticks += 1; requestAnimationFrame(tick); })();
+"""
 
 
 def crowd(people: int, frames: int) -> Scene:
@@ -85,13 +104,22 @@ class Listener(threading.Thread):
         return self.total
 
 
+HEAD = (
+    f"{'view':10} {'server MB':>9} {'server ms':>9} {'kB/frame':>8} {'sent/s':>6} | {'drawn/s':>7} {'k triangles':>11} "
+    f"{'calls':>5} {'script ms':>9} {'draw ms':>7} {'script MB':>9} {'page MB':>7}"
+)
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--people", type=int, default=16)
     options.add_argument("--frames", type=int, default=20_000)
-    options.add_argument("--seconds", type=float, default=8.0)
+    options.add_argument("--seconds", type=float, default=12.0)
+    options.add_argument("--size", default="1280x720", help="of the window (default: %(default)s)")
+    options.add_argument("--views", nargs="+", choices=VIEWS, default=VIEWS)
     options.add_argument("--shadows", action="store_true", help="true shadows instead of discs")
     options.add_argument("--marks", action="store_true", help="trails, contacts and collisions too")
+    options.add_argument("--full-resolution", action="store_true", help="viser may not lower it where frames are slow")
     options.add_argument("--no-browser", action="store_true")
     asked = options.parse_args()
     torch.set_num_threads(1)
@@ -99,17 +127,19 @@ def main() -> None:
     empty = memory()
     scene = crowd(asked.people, asked.frames)
     print(f"{asked.people} people x {asked.frames} frames; the scene takes {memory() - empty:.0f} MB")
-    print(f"{'style':10} {'MB more':>8} {'server ms':>10} {'kB/frame':>9} {'sent/s':>7} {'drawn/s':>8} {'CPU ms':>7}")
-    for style in STYLES:
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; window {asked.size}")
+    print(HEAD)
+    for style in asked.views:
         measure(asked, scene, body, style)
 
 
-def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Any) -> None:
+def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Style) -> None:
     """One line of the table."""
     before = memory()
     rich = asked.marks
-    look = Look(style=style, trails=rich, contacts=rich, collisions=rich, shadows=asked.shadows)
+    look = Look(style="skeleton", trails=rich, contacts=rich, collisions=rich, shadows=asked.shadows)
     viewer = Viewer([take("crowd", scene)], body, port=0, look=look)
+    viewer.dress(dataclasses.replace(look, style=style))
     listener = Listener(viewer.port)
     listener.start()
     begun, cpu = listener.quiet(), time.process_time()
@@ -125,52 +155,76 @@ def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Any) -> N
     sent = viewer.sent
     time.sleep(asked.seconds)
     rate = (viewer.sent - sent) / asked.seconds
-    drawn, spent = (float("nan"),) * 2 if asked.no_browser else browser_rate(viewer.port, asked.seconds)
-    more = memory() - before
-    print(
-        f"{style:10} {more:8.0f} {1e3 * cost:10.1f} {kilobytes:9.1f} {rate:7.1f} {drawn:8.1f} {spent:7.0f}", flush=True
-    )
+    line = f"{style:10} {memory() - before:9.0f} {1e3 * cost:9.1f} {kilobytes:8.1f} {rate:6.1f}"
+    print(line if asked.no_browser else f"{line} | {in_browser(viewer.port, asked)}", flush=True)
     viewer.stop()
     thread.join(timeout=10)
 
 
-def browser_rate(port: int, seconds: float) -> tuple[float, float]:
-    """Frames a second that a headless Chromium draws while the viewer plays, and its CPU milliseconds a frame."""
+def in_browser(port: int, asked: argparse.Namespace) -> str:
+    """What a headless Chromium makes of it while the viewer plays."""
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("google-chrome")
+    width, height = map(int, asked.size.split("x"))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS.split())
-        page = browser.new_page(viewport={"width": 800, "height": 500})
-        page.goto(f"http://127.0.0.1:{port}")
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.add_init_script(COUNT)
+        page.goto(f"http://127.0.0.1:{port}/{'?fixedDpr=1' if asked.full_resolution else ''}")
         page.get_by_role("button", name="Pause").wait_for(timeout=120_000)
-        page.evaluate(COUNT)  # the first frames wait for shaders to be compiled
-        page.wait_for_function("window.frames_drawn > 25", timeout=240_000)
-        page.evaluate("window.frames_drawn = 0")
-        before = children_cpu()
-        page.wait_for_timeout(1000 * seconds)
-        count = float(page.evaluate("window.frames_drawn"))
-        spent = children_cpu() - before
+        page.wait_for_function(f"window.drawn.frames > {WARM}", timeout=300_000)
+        tools = page.context.new_cdp_session(page)
+        tools.send("Performance.enable")
+
+        def now() -> dict[str, float]:
+            numbers = {each["name"]: each["value"] for each in tools.send("Performance.getMetrics")["metrics"]}
+            count = page.evaluate("({...window.drawn})")
+            used = processes()
+            return {
+                **count,
+                "script": numbers["ScriptDuration"],
+                "heap": numbers["JSHeapUsedSize"] / 1e6,
+                "draw": used.get("gpu-process", (0.0, 0.0))[0],
+                "page": used.get("renderer", (0.0, 0.0))[1],
+                "at": time.perf_counter(),
+            }
+
+        begin = now()
+        page.wait_for_timeout(1000 * asked.seconds)
+        end = now()
         browser.close()
-    return count / seconds, 1e3 * spent / max(count, 1.0)
+    spent = {name: end[name] - begin[name] for name in end}
+    frames = max(spent["frames"], 1.0)
+    triangles, script, draw = (spent[name] / frames for name in ("triangles", "script", "draw"))
+    return (
+        f"{frames / spent['at']:7.1f} {triangles / 1e3:11.1f} {spent['calls'] / frames:5.0f} "
+        f"{1e3 * script:9.1f} {1e3 * draw:7.0f} {end['heap']:9.0f} {end['page']:7.0f}"
+    )
 
 
-def children_cpu() -> float:
-    """Seconds of CPU that all processes under this one have taken."""
-    parents, taken = {}, {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
+def processes() -> dict[str, tuple[float, float]]:
+    """CPU seconds and megabytes of Chromium's processes under this one, by type."""
+    parents, found = {}, {}
+    for path in Path("/proc").glob("[0-9]*"):
         try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
+            fields = (path / "stat").read_text().rpartition(")")[2].split()
+            command = (path / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            pages = int((path / "statm").read_text().split()[1])
+        except (OSError, IndexError):
             continue
-        parents[int(path.parent.name)] = int(fields[1])
-        taken[int(path.parent.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    total = 0.0
-    for process, seconds in taken.items():
-        above = parents[process]
+        parents[int(path.name)] = int(fields[1])
+        kind = next((word[7:] for word in command.split() if word.startswith("--type=")), "")
+        cpu = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        found[int(path.name)] = (kind, cpu, pages * os.sysconf("SC_PAGE_SIZE") / 1e6)
+    total: dict[str, tuple[float, float]] = {}
+    for process, (kind, cpu, megabytes) in found.items():
+        above = process
         while above in parents and above != os.getpid():
             above = parents[above]
-        total += seconds if above == os.getpid() else 0.0
+        if above == os.getpid():
+            before = total.get(kind, (0.0, 0.0))
+            total[kind] = (before[0] + cpu, before[1] + megabytes)
     return total
 
 

@@ -17,16 +17,13 @@ from magnet.body import Body, load_body
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
-from magnet.motion.scene import Scene, absent
+from magnet.motion.scene import FPS, Scene, absent, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 
 if TYPE_CHECKING:
     from magnet.tasks.base import Task
-
-FPS = 30.0
-"""The rate that models are trained at."""
 
 Player = Literal["page", "film"]
 
@@ -67,7 +64,7 @@ def read(
     """
     options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor)
     got = formats.read(list(paths), body, options)
-    return Motion.of(got.scene, got.body, None, got.notes)
+    return Motion.of(got.scene, got.body, got.notes)
 
 
 # -- scenes that show themselves ---------------------------------------------------------------
@@ -75,32 +72,16 @@ def read(
 
 @dataclass(frozen=True)
 class Motion(Scene):
-    """A scene that knows its body, which of its frames were given, and how to show and save itself."""
+    """A scene that knows its body, and how to show and save itself; it can stand wherever a `Scene` can."""
 
     model: Body | None = None  # the body model `betas` belong to; None: the open one
-    known: Tensor | None = None  # (T, P) bool, given to the model and not sampled; None: nothing was
     notes: tuple[str, ...] = ()  # what is worth knowing about how it was read
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.known is not None and tuple(self.known.shape) != (self.frames, self.agents):
-            object.__setattr__(self, "known", None)  # frames or agents were changed by those who know nothing of it
-
     @classmethod
-    def of(
-        cls, scene: Scene, model: Body | None = None, known: Tensor | None = None, notes: Sequence[str] = ()
-    ) -> Motion:
+    def of(cls, scene: Scene, model: Body | None = None, notes: Sequence[str] = ()) -> Motion:
         """The same motion with what this class adds."""
         fields = {**scene.tensors(), "fps": scene.fps, "body": scene.body, "names": scene.names}
-        return cls(**fields, model=model, known=known, notes=tuple(notes))  # type: ignore[arg-type]
-
-    def cut(self, start: int, stop: int | None = None) -> Motion:
-        known = None if self.known is None else self.known[start:stop]
-        return Motion.of(super().cut(start, stop), self.model, known, self.notes)
-
-    def order(self, agents: Tensor) -> Motion:
-        known = None if self.known is None else self.known[:, agents]
-        return Motion.of(super().order(agents), self.model, known, self.notes)
+        return cls(**fields, model=model, notes=tuple(notes))  # type: ignore[arg-type]
 
     def plain(self) -> Scene:
         """The scene without what this class adds."""
@@ -129,13 +110,17 @@ class Motion(Scene):
         path = Path(path)
         if path.suffix == ".npz" and not options:
             return super().save(path)
-        given = {"known": self.known, "context_frames": self.context, **options}
+        known = None if self.given is None else self.given[0]
+        given = {"known": known, "context_frames": self.context, **options}
         return formats.write(self.plain(), path, self._body(), **given)[0]
 
     @property
     def context(self) -> int:
         """How many first frames were given of everybody."""
-        return 0 if self.known is None else int(self.known.all(dim=1).long().cumprod(dim=0).sum())
+        if self.given is None:
+            return 0
+        whole = (self.given | ~self.present[:, None]).all(dim=0).all(dim=1)
+        return int(whole.long().cumprod(dim=0).sum())
 
     def show(self, scene: int = 0, player: Player = "page", **options: Any) -> Shown:
         """Something a notebook plays inline.
@@ -145,7 +130,7 @@ class Motion(Scene):
             player: `page`, an interactive player that works without a server, or `film`, an animated picture.
             options: of `save` for that kind: style, title, fps.
         """
-        one = Motion.of(self.pick([scene]), self.model, self.known)
+        one = Motion.of(self.pick([scene]), self.model)
         with tempfile.TemporaryDirectory() as folder:
             kind = {"page": ".html", "film": ".webp"}[player]
             if player == "film":
@@ -267,11 +252,7 @@ class Model:
             ValueError: no such task, or a scene it makes no sense on; says what to do.
         """
         kind = registry.get(task)
-        if abs(scene.fps - FPS) > 1e-3:
-            raise ValueError(
-                f"the scene runs at {scene.fps:g} fps, the model at {FPS:g}: "
-                f"use magnet.export.resampled(scene, {FPS:g})"
-            )
+        require_rate(scene)
         slots = scene.agents
         if slots > self.most_people:
             raise ValueError(f"the scene has {slots} agents, the model takes 1 to {self.most_people}")
@@ -293,8 +274,9 @@ class Model:
             self.sampler.stride,
         )
         known = chosen.schedule(grid).known.repeat_interleave(STRIDE, dim=0)[: context + frames, :slots]
-        model = scene.model if isinstance(scene, Motion) else None
-        return Motion.of(sampled.order(torch.arange(slots)), model, known)
+        sampled = sampled.order(torch.arange(slots))
+        given = known[None] & sampled.present[:, None]
+        return Motion.of(sampled.replace(given=given), scene.model if isinstance(scene, Motion) else None)
 
     def _with_room(self, scene: Scene, slots: int) -> Scene:
         if slots > self.most_people:

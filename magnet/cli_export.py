@@ -23,6 +23,7 @@ for example:
   magnet export demo/quartet.npz duet.glb --scene 0
   magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
   magnet export duet.npz duet.bvh --unit cm
+  magnet export duet.npz leader.glb --person 0
 """
 
 
@@ -33,12 +34,21 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
     options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
     options.add_argument("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
+    options.add_argument(
+        "--person", type=int, action="append", default=[], metavar="N", help="only this person, from 0; may be repeated"
+    )
     options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
     options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
     pictures = options.add_argument_group("pictures, films and pages")
-    pictures.add_argument("--context", type=int, default=0, metavar="FRAMES", help="first frames that were given")
+    pictures.add_argument(
+        "--context",
+        type=int,
+        default=0,
+        metavar="FRAMES",
+        help="first frames that a model was given, in files that do not say",
+    )
     pictures.add_argument("--style", choices=("body", "capsules", "skeleton"), default="body", help="how people look")
     pictures.add_argument("--title", help="written above")
     bvh = options.add_argument_group("reading .bvh of other programs")
@@ -85,6 +95,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         if not 0 <= options.scene < scene.scenes:
             raise CommandError(f"--scene {options.scene}: the file has scenes 0 to {scene.scenes - 1}")
         scene = scene.pick([options.scene])
+    if options.person:
+        scene = only(scene, options.person)
     print(described(scene))
     written = formats.write(
         scene,
@@ -104,6 +116,24 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 FBX = "; for .fbx write .glb and let Blender convert it (docs/export.md)"
+
+
+def only(scene: Scene, people: Sequence[int]) -> Scene:
+    """The scene with these people alone, who keep their slots and so their colours.
+
+    Raises:
+        CommandError: nobody of that number is there.
+    """
+    import torch
+
+    from magnet.cli import CommandError
+
+    there = scene.present.any(dim=0).nonzero()[:, 0].tolist()
+    if missing := [p for p in people if p not in there]:
+        raise CommandError(f"--person {missing[0]}: the scene has {', '.join(map(str, there))}")
+    chosen = torch.zeros_like(scene.present)
+    chosen[:, list(people)] = True
+    return scene.replace(present=scene.present & chosen)
 
 
 def described(scene: Scene) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,11 +35,21 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
         "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
     )
     look = parser.add_argument_group("what is shown")
-    look.add_argument("--truth", metavar="FILE", help="a scene shown as ghosts in each of the others")
-    look.add_argument("--context", type=int, default=0, metavar="N", help="first frames that the model was given")
+    look.add_argument(
+        "--truth", metavar="FILE", help="a scene shown as ghosts in each of the others; without it there are none"
+    )
+    look.add_argument(
+        "--context",
+        type=int,
+        default=0,
+        metavar="N",
+        help="first frames that a model was given, in files that do not say",
+    )
     look.add_argument("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     look.add_argument("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
-    look.add_argument("--style", choices=("body", "capsules", "skeleton"), help="default: body, capsules for crowds")
+    look.add_argument(
+        "--style", choices=("body", "light", "capsules", "skeleton"), help="default: body, light for crowds"
+    )
     look.add_argument(
         "--no-shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
     )
@@ -81,6 +93,15 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
+def show_at_the_end(words: Sequence[str]) -> None:
+    """`magnet view` after a run that has written its results: what keeps it from showing them is said, no failure."""
+    try:
+        main(words)
+    except (ImportError, OSError, ValueError) as error:
+        print(f"not shown: {error}", file=sys.stderr)
+        print(f"later: magnet view {shlex.join(words)}", file=sys.stderr)
+
+
 def announce(port: int, host: str, quiet: bool) -> None:
     """Say where the viewer is, and open the browser if there is one."""
     from magnet.viewer.server import open_browser
@@ -111,23 +132,31 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     return read_takes(options.files, body, options.context, options.samples)
 
 
-def _write_page(options: argparse.Namespace) -> int:
-    from magnet.viewer.html import save_html
+def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
+    """The first scene of --truth, or None."""
     from magnet.viewer.takes import read_takes
 
+    if not options.truth:
+        return None
+    truth = read_takes([options.truth], body, samples=1)[0][0]
+    if abs(truth.scene.fps - fps) > 1e-3:
+        raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
+    return truth
+
+
+def _write_page(options: argparse.Namespace) -> int:
+    from magnet.viewer.html import save_html
+
+    if options.style == "light":
+        raise ValueError("--style light is for the viewer; a page draws body, capsules or skeleton")
     takes, body = _read(options)
-    truth = None
-    if options.truth:
-        truth = read_takes([options.truth], body, samples=1)[0][0].scene
-        if abs(truth.fps - takes[0].scene.fps) > 1e-3:
-            raise ValueError(f"{options.truth}: {truth.fps:g} frames a second, the scene has {takes[0].scene.fps:g}")
+    truth = _truth(options, body, takes[0].scene.fps)
     styles = (options.style,) if options.style else None
     path = save_html(
         takes[0].scene,
         options.html,
         body,
-        context=options.context,
-        truth=truth,
+        truth=None if truth is None else truth.scene,
         title=takes[0].label,
         styles=styles,
     )
@@ -146,11 +175,7 @@ def _watch(options: argparse.Namespace) -> Any:
     if options.record is not None:
         _record(options, takes[0].scene)
         takes, _ = read_takes([options.record], body, options.context)
-    truth = None
-    if options.truth:
-        truth = read_takes([options.truth], body, samples=1)[0][0]
-        if truth.scene.fps != takes[0].scene.fps:
-            raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {takes[0].scene.fps:g}")
+    truth = _truth(options, body, takes[0].scene.fps)
     look = first_look(takes, options.style, not options.no_shadows)
     return Viewer(takes, body, truth, options.host, options.port, look)
 

@@ -39,7 +39,7 @@ def test_importing_the_package_loads_neither_torch_nor_the_api():
 def test_scenes_from_nothing_have_the_people_and_frames_asked_for(model: Model):
     motion = model.generate(people=3, frames=30, seed=1, samples=2)
     assert (motion.scenes, motion.frames, motion.agents) == (2, 30, 3)
-    assert motion.present.all() and motion.known is not None and not motion.known.any() and motion.context == 0
+    assert motion.present.all() and motion.given is not None and not motion.given.any() and motion.context == 0
     assert not torch.equal(motion.T_world_root[0], motion.T_world_root[1])
 
 
@@ -59,7 +59,7 @@ def test_a_continuation_begins_with_the_end_of_what_was_given(model: Model, duet
 def test_a_filled_in_agent_owes_nothing_to_its_own_motion(model: Model, duet: Scene):
     filled = model.inpaint(duet, agent=0, seed=1)
     assert filled.frames == 48
-    assert filled.known is not None and filled.known.all(dim=0).tolist() == [False, True]
+    assert filled.given is not None and filled.given[0].all(dim=0).tolist() == [False, True]
     assert torch.allclose(filled.T_world_root[:, :, 1], duet.T_world_root[:, :48, 1], atol=1e-5)
     other = duet.replace(T_world_root=torch.cat([duet.T_world_root[:, :, :1].flip(1), duet.T_world_root[:, :, 1:]], 2))
     assert torch.equal(model.inpaint(other, agent=0, seed=1).T_world_root, filled.T_world_root)
@@ -74,8 +74,9 @@ def test_somebody_alone_is_given_a_partner(model: Model, duet: Scene):
 
 def test_a_reaction_keeps_everybodys_past_and_the_others_future(model: Model, duet: Scene):
     answer = model.react(duet, agent=1, context=16, seed=1)
-    assert answer.known is not None
-    assert answer.known[:16].all() and answer.known[16:, 0].all() and not answer.known[16:, 1].any()
+    assert answer.given is not None
+    given = answer.given[0]
+    assert given[:16].all() and given[16:, 0].all() and not given[16:, 1].any()
 
 
 @pytest.mark.parametrize("task", registry.names())
@@ -84,13 +85,13 @@ def test_every_task_can_be_asked_for_by_name(task, model: Model, duet: Scene):
     motion = model.predict(duet, task, context=context, frames=16, seed=1)
     assert (motion.frames, motion.agents) == (context + 16, 2)
     schedule = registry.get(task)().schedule(Grid((context + 16) // 4, 3, context // 4, 2, 8, 4))
-    assert motion.known is not None
-    assert torch.equal(motion.known[::4], schedule.known[:, :2])
+    assert motion.given is not None
+    assert torch.equal(motion.given[0, ::4], schedule.known[:, :2])
 
 
 def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
     motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
-    assert motion.known is not None and not motion.known[16:].any()
+    assert motion.given is not None and not motion.given[:, 16:].any()
 
 
 def test_scenes_keep_what_they_know_when_cut_and_ordered(model: Model, duet: Scene):
@@ -99,7 +100,7 @@ def test_scenes_keep_what_they_know_when_cut_and_ordered(model: Model, duet: Sce
     assert isinstance(part, Motion) and part.context == 8
     assert isinstance(longer.pick([0]), Motion) and longer.pick([0]).context == 48
     filled = model.inpaint(duet, agent=0, seed=1).order(torch.tensor([1, 0]))
-    assert filled.known is not None and filled.known.all(dim=0).tolist() == [True, False]
+    assert filled.given is not None and filled.given[0].all(dim=0).tolist() == [True, False]
     assert longer.pad_agents(3).agents == 3 and longer.held(2).frames == 64
     assert longer.joints().shape == (1, 60, 2, 22, 3)
 
@@ -111,6 +112,26 @@ def test_a_scene_saves_itself_by_suffix(suffix, model: Model, tmp_path: Path):
     assert path.stat().st_size > 1000
     if suffix == ".npz":
         assert torch.equal(Scene.load(path).T_world_root, motion.T_world_root)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".html"])
+def test_a_saved_scene_tells_which_frames_were_given(suffix, model: Model, duet: Scene, tmp_path: Path):
+    filled = model.inpaint(duet, agent=0, seed=1)
+    path = filled.save(tmp_path / f"scene{suffix}")
+    if suffix == ".npz":
+        assert torch.equal(magnet.read(path).given, filled.given)
+        assert magnet.read(path).context == 0 and model.continue_(duet, frames=8, context=16, seed=1).context == 16
+    else:
+        assert "given" in path.read_text()
+
+
+def test_the_issues_three_calls_give_scenes_that_show_and_save_themselves(model: Model, duet: Scene, tmp_path: Path):
+    for got in (model.generate(people=2, frames=12), model.continue_(duet), model.inpaint(duet, agent=0)):
+        assert isinstance(got, Scene)
+        assert "<iframe" in got.show()._repr_html_()
+        assert got.save(tmp_path / "got.npz").exists()
+    again = model.continue_(Scene.load(tmp_path / "got.npz"), frames=8)
+    assert again.given is not None and not again.given[:, -8:].any()
 
 
 def test_a_notebook_plays_a_page_or_a_film(model: Model, tmp_path: Path):

@@ -46,6 +46,11 @@ class Cast:
     def frames(self) -> int:
         return len(self.joints)
 
+    @property
+    def context(self) -> int:
+        """First frames that are known of everybody."""
+        return int(self.known.all(axis=1).cumprod().sum())
+
     def vertices(self, frame: int) -> Array:
         """(P, V, 3)"""
         return self.body.vertices(self.scene.cut(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
@@ -128,7 +133,7 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
 
 
 def known_frames(scene: Scene, context_frames: int, known: Tensor | None) -> Tensor:
-    """(T, P) bool: the mask given, or the first `context_frames` of everybody.
+    """(T, P) bool: what `known` says of a scene (B = 1), else the scene itself, else the first frames of everybody.
 
     Raises:
         ValueError: the mask has another shape, or more context than frames.
@@ -139,4 +144,6 @@ def known_frames(scene: Scene, context_frames: int, known: Tensor | None) -> Ten
         return known
     if not 0 <= context_frames <= scene.frames:
         raise ValueError(f"context_frames: got {context_frames}, expected 0 to {scene.frames}, the scene's frames")
+    if scene.given is not None:
+        return scene.given[0]
     return (torch.arange(scene.frames) < context_frames)[:, None].expand(scene.frames, scene.agents)

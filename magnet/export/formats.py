@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +102,8 @@ def read(
         )
         notes = [str(source) for source in imported.sources]
         if imported.floor:
-            notes.append(f"everybody was lowered by {100 * imported.floor:.1f} cm onto the floor")
+            way = "lowered" if imported.floor > 0 else "raised"
+            notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
         return Read(imported.scene, body, tuple(notes))
     scenes, notes = [], []
     for file in files:
@@ -168,8 +169,8 @@ def write(
         fps: frames a second of what is written; None: the scene's.
         unit: of lengths in BVH.
         smplx: npz with SMPL-X's conventional keys.
-        context_frames: how many first frames were given to a model; pictures mark them.
-        known: (T, P) bool instead, for pictures.
+        context_frames: how many first frames were given to a model, where the scene does not say; pictures mark them.
+        known: (T, P) bool instead, whatever the scene says.
         style: how pictures show people: `body`, `capsules` or `skeleton`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function told (done, all).
@@ -188,21 +189,12 @@ def write(
     body = body or load_body("open")
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
-    look: dict[str, Any] = {"context_frames": context_frames, "known": known, "body": body, "style": style}
-    if suffix in PICTURES:
-        from magnet.export.video import render_video
-
-        return [render_video(scene, path, fps=fps or scene.fps, title=title, progress=progress, **look)]
-    if suffix == ".png":
-        from magnet.export.picture import contact_sheet
-
-        return [contact_sheet(scene, path, title=title, **look)]
+    given = _Given(context_frames, known, style, title)
+    if suffix == ".png" or suffix in PICTURES:
+        return [_save_picture(scene, path, body, given, fps, progress)]
     if fps is not None and abs(fps - scene.fps) > 1e-6:
-        context_frames = round(context_frames * fps / scene.fps)
-        frames, rate = scene.frames, scene.fps
+        given = given.resampled(scene, fps)
         scene = resampled(scene, fps)
-        if known is not None:
-            known = known[(torch.arange(scene.frames) * rate / fps).round().long().clamp(max=frames - 1)]
     if suffix == ".csv":
         return [save_csv(scene, path, body)]
     if suffix == ".npz" and not smplx:
@@ -211,21 +203,57 @@ def write(
         ".npz": lambda one, to: save_smplx(one, to, body),
         ".bvh": lambda one, to: save_bvh(one, to, body, unit=unit),
         ".glb": lambda one, to: [save_glb(one, to, body)],
-        ".html": lambda one, to: [_save_page(one, to, body, context_frames, known, style, title)],
+        ".html": lambda one, to: [_save_page(one, to, body, given)],
     }
     if scene.scenes == 1:
         return each[suffix](scene, path)
-    written = []
-    for b in range(scene.scenes):
-        written += each[suffix](scene.pick([b]), path.with_name(f"{path.stem}_scene{b}{suffix}"))
-    return written
+    places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]
+    return [written for b, place in enumerate(places) for written in each[suffix](scene.pick([b]), place)]
 
 
-def _save_page(
-    scene: Scene, path: Path, body: Body, context: int, known: Tensor | None, style: str, title: str | None
+@dataclass(frozen=True)
+class _Given:
+    """What pictures and pages show beyond the scene."""
+
+    context: int
+    known: Tensor | None
+    style: Style
+    title: str | None
+
+    def resampled(self, scene: Scene, fps: float) -> _Given:
+        """The same moments at another rate, as `retime.resampled` makes them."""
+        context = round(self.context * fps / scene.fps)
+        if self.known is None:
+            return replace(self, context=context)
+        frames = resampled(scene, fps).frames
+        nearest = (torch.arange(frames) * scene.fps / fps).round().long().clamp(max=scene.frames - 1)
+        return replace(self, context=context, known=self.known[nearest])
+
+
+def _save_picture(
+    scene: Scene, path: Path, body: Body, given: _Given, fps: float | None, progress: bool | Report
 ) -> Path:
+    look: dict[str, Any] = {
+        "context_frames": given.context,
+        "known": given.known,
+        "body": body,
+        "style": given.style,
+        "title": given.title,
+    }
+    if path.suffix.lower() == ".png":
+        from magnet.export.picture import contact_sheet
+
+        return contact_sheet(scene, path, **look)
+    from magnet.export.video import render_video
+
+    return render_video(scene, path, fps=fps or scene.fps, progress=progress, **look)
+
+
+def _save_page(scene: Scene, path: Path, body: Body, given: _Given) -> Path:
     from magnet.viewer.html import save_html  # late: the viewer stands on this room
 
     # A body's skin is only written where the page itself thinks it may be.
-    styles: Any = None if style == "body" else (style,)
-    return save_html(scene, path, body, context=context, known=known, title=title or "", styles=styles)
+    styles: Any = None if given.style == "body" else (given.style,)
+    return save_html(
+        scene, path, body, context=given.context, known=given.known, title=given.title or "", styles=styles
+    )

@@ -29,8 +29,9 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
     """Write one scene (B = 1, present agents) with SMPL-X's conventional keys.
 
     poses (P, T, 165) axis-angle in radians, fingers, jaw and eyes at rest; transl and its other name trans (P, T, 3) =
-    pelvis - J0(betas), metres, y up; betas (P, 10); gender, mocap_frame_rate, surface_model_type; `body` says which
-    body model the betas belong to. Only SMPL-X's own betas look right in SMPL-X tools.
+    pelvis - J0(betas), metres, y up; betas (P, 10); gender, mocap_frame_rate, surface_model_type. Beside these `body`
+    says which body model the betas belong to, and `given` (P, T), where the scene has it, what a model was given.
+    Only SMPL-X's own betas look right in SMPL-X tools.
 
     Args:
         apart: one file a person (path_0.npz, ...) without the axis P, as most tools read them.
@@ -53,6 +54,8 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
     rest_pelvis = body.rest_joints(scene.betas[0])[:, 0].double()
     transl = (T_world_root[..., :3, 3] - rest_pelvis[:, None]).cpu().numpy()
     arrays = {"poses": poses.numpy(), "transl": transl, "trans": transl, "betas": scene.betas[0].cpu().numpy()}
+    if scene.given is not None:
+        arrays["given"] = scene.given[0].T.cpu().numpy()
     facts = {
         "gender": np.array("neutral"),
         "surface_model_type": np.array("smplx"),
@@ -118,6 +121,7 @@ def load_smplx(path: str | Path, body: Shaped, up: str | None = None) -> Scene:
         fps=fps,
         body=body.id,
         names=(name,) if name else (),
+        given=None if "given" not in arrays else arrays["given"].view(P, T).T[None],
     )
 
 
@@ -149,10 +153,16 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
             betas = file["betas"] if "betas" in there else np.zeros((*poses.shape[:-2], 10))
             written_for = str(file["body"]) if "body" in there else None
             name = str(file["name"]) if "name" in there else ""
+            given = file["given"] if written_for is not None and "given" in there else None
     except (OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     arrays = {"poses": poses, "transl": transl, "betas": betas}
     bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
     if bad or not fps > 0:
         raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
-    return {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}, fps, written_for, name
+    tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
+    if given is not None:
+        if given.dtype != bool or given.shape != poses.shape[:-1]:
+            raise ValueError(f"{path}: given: got {given.dtype} {given.shape}, expected bool {poses.shape[:-1]}")
+        tensors["given"] = torch.from_numpy(given)
+    return tensors, fps, written_for, name

@@ -60,10 +60,11 @@ def contact_sheet(
     draw = ImageDraw.Draw(page)
     if title:
         draw.text((12 * unit, 22 * unit), title, fill=INK, font=font(20 * unit), anchor="lm")
+    context = context_frames or people[0].context
     for i, moment in enumerate(moments):
-        ink = PINK if moment < context_frames else GENERATED
+        ink = PINK if moment < context else GENERATED
         place = (left + (i + 0.5) * cell[0], top - 13 * unit)
-        draw.text(place, _time(moment, context_frames, first.fps), fill=ink, font=font(15 * unit), anchor="mm")
+        draw.text(place, _time(moment, context, first.fps), fill=ink, font=font(15 * unit), anchor="mm")
         for row, group in enumerate(people):
             page.paste(paint(group, views[row][moment], moment), (left + i * cell[0], top + row * cell[1]))
     for row, (label, _) in enumerate(rows):

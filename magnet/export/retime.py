@@ -16,7 +16,8 @@ from magnet.motion.scene import Scene
 def resampled(scene: Scene, fps: float) -> Scene:
     """The same motion at exact times t = i / fps: slerp between rotations, straight lines between positions.
 
-    A frame between two of which one is not valid is not valid.
+    A frame between two of which one is not valid is not valid; one between two of which one was not given to a model
+    was not given either.
 
     Raises:
         ValueError: the rate is not positive.
@@ -35,9 +36,11 @@ def resampled(scene: Scene, fps: float) -> Scene:
     place = scene.T_world_root[..., :3, 3]
     moved = torch.lerp(place[:, low], place[:, high], share[:, None, None])
     turned = _slerp(scene.T_world_root[..., :3, :3], low, high, share)
-    valid = None if scene.valid is None else scene.valid[:, low] & (scene.valid[:, high] | (share == 0))
+    exact = share == 0
+    valid = None if scene.valid is None else scene.valid[:, low] & (scene.valid[:, high] | exact)
+    given = None if scene.given is None else scene.given[:, low] & (scene.given[:, high] | exact[:, None])
     body_rot = _slerp(scene.body_rot, low, high, share)
-    return scene.replace(body_rot=body_rot, T_world_root=rigid(turned, moved), valid=valid, fps=float(fps))
+    return scene.replace(body_rot=body_rot, T_world_root=rigid(turned, moved), valid=valid, given=given, fps=float(fps))
 
 
 def _slerp(rotation: Tensor, low: Tensor, high: Tensor, share: Tensor) -> Tensor:
@@ -86,12 +89,19 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
     if any(person.valid is not None for person in people):
         all_good = torch.ones(1, shortest, dtype=torch.bool)
         valid = torch.stack([all_good if p.valid is None else p.valid for p in people]).all(dim=0)
+    given = None
+    if any(person.given is not None for person in people):
+        given = [
+            torch.zeros_like(p.T_world_root[..., 0, 0], dtype=torch.bool) if p.given is None else p.given
+            for p in people
+        ]
     return people[0].replace(
         body_rot=torch.cat([person.body_rot for person in people], dim=2),
         T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
         betas=torch.cat([person.betas for person in people], dim=1),
         present=torch.cat([person.present for person in people], dim=1),
         valid=valid,
+        given=None if given is None else torch.cat(given, dim=2),
         names=people[0].names,
     )
 

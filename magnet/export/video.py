@@ -119,7 +119,7 @@ class Film:
         self.columns = len(labelled) if len(labelled) <= 3 else math.ceil(math.sqrt(len(labelled)))
         self.rows = math.ceil(len(labelled) / self.columns)
         self.header = 0 if title is None else round(0.08 * size[1] / 2) * 2
-        self.context_end = int(self.casts[0].known.all(axis=1).cumprod().sum())
+        self.context_end = self.casts[0].context
         self.size_all = (self.columns * size[0], self.rows * size[1] + self.header)
 
     def draw(self, index: int) -> Image.Image:

@@ -18,7 +18,13 @@ from torch import Tensor
 BODY_JOINTS = 22
 """The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
 
+FPS = 30.0
+"""Frames a second of what models are trained on, and so of what they take and make."""
+
 SCENE_FORMAT = 1
+
+TENSORS = ("body_rot", "T_world_root", "betas", "present", "valid", "given")
+"""Fields of a scene that are tensors; the last two may be absent."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class Scene:
     body: str = "open-1"  # id of the body model that `betas` belong to
     valid: Tensor | None = None  # (B, T) bool, False where a frame is padding or was masked; None: all good
     names: tuple[str, ...] = ()  # one label a scene, for reports
+    given: Tensor | None = None  # (B, T, P) bool, frames that a model was given and did not make; None: unsaid
 
     def __post_init__(self) -> None:
         shape = self.T_world_root.shape
@@ -48,6 +55,8 @@ class Scene:
         expected = {"body_rot": (B, T, P, BODY_JOINTS - 1, 3, 3), "betas": (B, P, 10), "present": (B, P)}
         if self.valid is not None:
             expected["valid"] = (B, T)
+        if self.given is not None:
+            expected["given"] = (B, T, P)
         for field, want in expected.items():
             got = tuple(getattr(self, field).shape)
             if got != want:
@@ -74,10 +83,16 @@ class Scene:
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensor fields that are set, by name."""
-        fields = ("body_rot", "T_world_root", "betas", "present", "valid")
-        return {f: value for f in fields if (value := getattr(self, f)) is not None}
+        return {f: value for f in TENSORS if (value := getattr(self, f)) is not None}
 
     def replace(self, **changes: object) -> Scene:
+        """The scene with other fields.
+
+        `given` is forgotten, unless named, where the number of scenes, frames or agents changes.
+        """
+        roots = changes.get("T_world_root")
+        if isinstance(roots, Tensor) and self.given is not None and roots.shape[:3] != self.given.shape:
+            changes.setdefault("given", None)
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
     def to(self, device: torch.device | str | int) -> Scene:
@@ -86,10 +101,7 @@ class Scene:
 
     def cut(self, start: int, stop: int | None = None) -> Scene:
         """Frames `start:stop` of every scene."""
-        valid = None if self.valid is None else self.valid[:, start:stop]
-        return self.replace(
-            body_rot=self.body_rot[:, start:stop], T_world_root=self.T_world_root[:, start:stop], valid=valid
-        )
+        return self.picked(slice(start, stop))
 
     def pick(self, scenes: Tensor | Sequence[int] | slice) -> Scene:
         """Some of the B scenes, in the order given."""
@@ -113,6 +125,7 @@ class Scene:
             T_world_root=self.T_world_root[:, :, agents],
             betas=self.betas[:, agents],
             present=self.present[:, agents],
+            given=None if self.given is None else self.given[:, :, agents],
         )
 
     def people(self) -> Scene:
@@ -126,17 +139,18 @@ class Scene:
             fps=self.fps,
             body=self.body,
             valid=None if self.valid is None else self.valid[:, None].expand(-1, self.agents, -1)[there],
+            given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
         )
 
     def held(self, frames: int) -> Scene:
         """The scene with its first and its last frame held for so many frames more, in front and behind."""
         T = self.frames
-        frame = torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1)
-        return self.replace(
-            body_rot=self.body_rot[:, frame],
-            T_world_root=self.T_world_root[:, frame],
-            valid=None if self.valid is None else self.valid[:, frame],
-        )
+        return self.picked(torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1))
+
+    def picked(self, frames: slice | Tensor) -> Scene:
+        """Some of the frames, in the order given. frames (F,) int, or a slice"""
+        timed = ("body_rot", "T_world_root", "valid", "given")
+        return self.replace(**{name: value[:, frames] for name, value in self.tensors().items() if name in timed})
 
     def pad_agents(self, agents: int) -> Scene:
         """The same people in `agents` slots; the new slots are absent.
@@ -155,6 +169,7 @@ class Scene:
             T_world_root=torch.cat([self.T_world_root, empty.T_world_root], dim=2),
             betas=torch.cat([self.betas, empty.betas], dim=1),
             present=torch.cat([self.present, empty.present], dim=1),
+            given=None if self.given is None else torch.nn.functional.pad(self.given, (0, extra)),
         )
 
     def moved(self, T_new_world: Tensor) -> Scene:
@@ -182,7 +197,7 @@ class Scene:
         try:
             with np.load(path, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
-                arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
+                arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in TENSORS if name in file.files}
             version = meta["format"]
             arrays |= {"fps": meta["fps"], "body": meta["body"], "names": tuple(meta["names"])}
         except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
@@ -221,12 +236,8 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
     padded = [scene.pad_agents(agents) for scene in scenes]
     valid = None
     if any(scene.valid is not None for scene in scenes):
-        valid = torch.cat(
-            [
-                torch.ones(s.scenes, s.frames, dtype=torch.bool, device=s.device) if s.valid is None else s.valid
-                for s in padded
-            ]
-        )
+        valid = torch.cat([all_valid(s) if s.valid is None else s.valid for s in padded])
+    given = [s.given for s in padded if s.given is not None]
     named = all(scene.names for scene in scenes)
     return Scene(
         body_rot=torch.cat([s.body_rot for s in padded]),
@@ -237,4 +248,39 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
         body=first.body,
         valid=valid,
         names=tuple(name for s in scenes for name in s.names) if named else (),
+        given=torch.cat(given) if len(given) == len(padded) else None,
     )
+
+
+def joined(pieces: Sequence[Scene]) -> Scene:
+    """Consecutive pieces of the same scenes as one; what was given is kept if all of them say it."""
+    if len(pieces) == 1:
+        return pieces[0]
+    valid = None
+    if any(piece.valid is not None for piece in pieces):
+        valid = torch.cat([all_valid(p) if p.valid is None else p.valid for p in pieces], dim=1)
+    given = [piece.given for piece in pieces if piece.given is not None]
+    return pieces[0].replace(
+        body_rot=torch.cat([piece.body_rot for piece in pieces], dim=1),
+        T_world_root=torch.cat([piece.T_world_root for piece in pieces], dim=1),
+        valid=valid,
+        given=torch.cat(given, dim=1) if len(given) == len(pieces) else None,
+    )
+
+
+def all_valid(scene: Scene) -> Tensor:
+    """(B, T) bool, True throughout."""
+    return torch.ones(scene.scenes, scene.frames, dtype=torch.bool, device=scene.device)
+
+
+def require_rate(scene: Scene, label: str = "the scene") -> None:
+    """Refuse a scene of another frame rate than the models'.
+
+    Raises:
+        ValueError: it has another; says how to bring it there.
+    """
+    if abs(scene.fps - FPS) > 1e-3:
+        raise ValueError(
+            f"{label} runs at {scene.fps:g} fps, the model at {FPS:g}: bring it there with "
+            f"magnet export IN.npz OUT.npz --fps {FPS:g}, or magnet.export.resampled(scene, {FPS:g})"
+        )

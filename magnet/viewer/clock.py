@@ -16,7 +16,7 @@ class Clock:
     speed: float = 1.0
     playing: bool = True
     loop: bool = True
-    growing: bool = False  # more frames may come: wait for them at the end
+    growing: bool = False  # more frames may come: wait for them at the end, unless it loops
     at: float = 0.0  # frames
 
     @property
@@ -28,10 +28,10 @@ class Clock:
         if self.playing and self.frames > 0:
             self.at += seconds * self.fps * self.speed
             if self.at >= self.frames:
-                if self.growing:
-                    self.at = float(self.frames - 1)
-                elif self.loop:
+                if self.loop:
                     self.at %= self.frames
+                elif self.growing:
+                    self.at = float(self.frames - 1)
                 else:
                     self.at, self.playing = float(self.frames - 1), False
         return self.frame
@@ -44,7 +44,7 @@ class Clock:
         """Stop, and go so many frames on or back; round the ends where it loops."""
         self.playing = False
         goal = self.frame + frames
-        self.seek(goal % self.frames if self.loop and not self.growing and self.frames else goal)
+        self.seek(goal % self.frames if self.loop and self.frames else goal)
 
     def play(self, on: bool) -> None:
         """Play or stop; at the end, play from the start."""

@@ -39,8 +39,8 @@ def save_html(
     """Write a scene (B = 1) as a self-contained web page with its own small player.
 
     Args:
-        context: first frames, shown paler as given to the model.
-        known: (T, P) bool, the frames of whom to show paler, instead of `context`.
+        context: first frames, shown paler as given to the model, where the scene does not say which were.
+        known: (T, P) bool, the frames of whom to show paler, whatever the scene says.
         truth: a scene (B = 1) shown as ghosts; held or cut to the scene's length.
         styles: looks to choose from, the first one first. By default all, but no skin of a body that is not the
             open one: the file would carry a model that its owner may not pass on. Name "body" to have it all the same.
@@ -124,7 +124,6 @@ def _contents(
     meta = {
         "fps": shown.scene.fps,
         "frames": shown.frames,
-        "context": int(shown.known.all(axis=1).cumprod().sum()),
         "people": people,
         "parents": list(PARENTS),
         "styles": list(styles),

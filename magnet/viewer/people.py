@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +15,15 @@ from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs
 from magnet.motion.scene import BODY_JOINTS, Scene
 from magnet.viewer.palette import Colours, for_batches
 from magnet.viewer.rig import Array, Rig, Style, capsule, rigs, turn_to
+
+MANY = 8
+"""People above whom a limb has a quarter of the triangles."""
+FINE, COARSE = (14, 6), (8, 3)
+"""Sectors and rings of a limb."""
+
+
+Poser = Callable[[Array, Array], None]
+"""Takes turns (22, 4) wxyz and places (22, 3) in metres."""
 
 
 class People(Protocol):
@@ -33,8 +43,8 @@ def add_people(
     server: Any, name: str, body: Body, scene: Scene, style: Style, colours: Colours, opacity: float | None = None
 ) -> People:
     """Put the people of a scene (B = 1) into the browser's scene below the node `name`."""
-    if style == "body":
-        return Skinned(server, name, rigs(body, scene), colours, opacity)
+    if style in ("body", "light"):
+        return Skinned(server, name, rigs(body, scene, style), colours, opacity)
     rest = body.rest_joints(scene.betas[0].float().cpu()).numpy()
     return Jointed(server, name, rest, CAPSULES if style == "capsules" else STICKS, colours, opacity)
 
@@ -61,10 +71,11 @@ class Skinned:
             for p, rig in enumerate(people)
         ]
 
+        self.posers = [quick_poser(mesh) or poser(mesh) for mesh in self.meshes]
+
     def pose(self, turns: Array, places: Array) -> None:
-        for mesh, own_turns, own_places in zip(self.meshes, turns, places, strict=True):
-            for bone, turn, place in zip(mesh.bones, own_turns, own_places, strict=True):
-                bone.wxyz, bone.position = turn, place
+        for pose, own_turns, own_places in zip(self.posers, turns, places, strict=True):
+            pose(own_turns, own_places)
 
     def paint(self, colours: Colours) -> None:
         for p in np.nonzero((colours != self.colours).any(axis=1))[0]:
@@ -75,6 +86,40 @@ class Skinned:
         # Hidden, never removed: viser 1.1's browser part fails while it takes a skinned mesh apart.
         for mesh in self.meshes:
             mesh.visible = on
+
+
+def poser(mesh: Any) -> Poser:
+    """Poses the bones of a skinned mesh."""
+
+    def pose(turns: Array, places: Array) -> None:
+        for bone, turn, place in zip(mesh.bones, turns, places, strict=True):
+            bone.wxyz, bone.position = turn, place
+
+    return pose
+
+
+def quick_poser(mesh: Any) -> Poser | None:
+    """The same in an eighth of the time, or None where viser is not built as it was (1.1).
+
+    Before it sends a bone's pose, viser compares it with the last one by `numpy.allclose`: for 16 people that takes
+    20 ms a frame. In motion all bones differ, so here they are sent as they are.
+    """
+    try:
+        from viser._messages import SetBoneOrientationMessage, SetBonePositionMessage
+
+        states = [bone._impl for bone in mesh.bones]
+        bones = [(state.name, state.bone_index, state.wxyz, state.position) for state in states]
+        queue = mesh._impl.api._queue_scene_message
+    except (ImportError, AttributeError):
+        return None
+
+    def pose(turns: Array, places: Array) -> None:
+        for (name, index, wxyz, position), turn, place in zip(bones, turns.tolist(), places.tolist(), strict=True):
+            wxyz[:], position[:] = turn, place
+            queue(SetBoneOrientationMessage(name, index, tuple(turn)))
+            queue(SetBonePositionMessage(name, index, tuple(place)))
+
+    return pose
 
 
 class Jointed:
@@ -89,9 +134,10 @@ class Jointed:
         turns, places = stand(start, end)
         self.colours = colours.copy()
         self.batches = []
+        sectors, rings = COARSE if len(rest) > MANY else FINE
         for m in range(len(table)):
             size, thick = length[:, m].mean(), radii[:, m].mean(axis=0)
-            vertices, faces, _ = capsule(float(size), float(thick[0]), float(thick[1]))
+            vertices, faces, _ = capsule(float(size), float(thick[0]), float(thick[1]), sectors, rings)
             wide = radii[:, m, 0] / thick[0]
             scales = np.stack([wide, wide, length[:, m] / size], axis=1).astype(np.float32)
             self.batches.append(

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
-from magnet.motion.frames import canonical_frame
 from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.clock import Clock
-from magnet.viewer.live import Goal, Live, Worker
+from magnet.viewer.handles import Keys, Steering
+from magnet.viewer.live import Live, Piece
 from magnet.viewer.stage import Stage
 from magnet.viewer.takes import Take, take
 from magnet.viewer.troupe import Look, Troupe
+from magnet.viewer.worker import Worker
 
 KINDS = ("none", "history", "self", "partner")
-NOBODY = "nobody"
 WHAT = {
     "motion_control": "Choose whom to steer: the others answer to that person's way.",
     "inbetweening": "Choose whom to steer: the arrows are that person's next keyframe, a second ahead.",
@@ -46,17 +46,18 @@ class Playground(Stage):
         self.live = live
         self.version = live.version
         self.clock = Clock(live.scene.frames, live.scene.fps, growing=True, loop=False)
-        self.worker = Worker(live, ahead, self._refused)
-        self.refusal = ""
-        self.goal: Any = None
+        self.worker = Worker(live, ahead, self._refused, self._made)
+        self.refusal, self.news = "", ""
+        self.again: int | None = None  # the frame to play from, once what has been made anew is on the stage
         self.casts: dict[tuple[float, ...], Troupe] = {}
         with self.server.atomic():
             self._cast()
             self.frame_all()
             self.add_timeline()
             self._add_model()
-            self._add_steering()
-            self.add_looks(ghosts=False)
+            self.steering = Steering(self)
+            self.keys = Keys(self)
+            self.add_looks(ghosts=None)
             self.add_saving()
         self.draw()
         self.worker.start()
@@ -87,7 +88,9 @@ class Playground(Stage):
             if self.version != self.live.version:
                 self.version, self.shown = self.live.version, -1
                 self.clock.frames = scene.frames
-                self.clock.seek(min(self.clock.frame, scene.frames - 1))
+                self.clock.seek(min(self.clock.frame if self.again is None else self.again, scene.frames - 1))
+                self.again = None
+                self.slider.max = scene.frames - 1
                 self._cast()
             if scene.frames != self.troupes[0].take.frames:
                 self.troupes[0].take = self._take()
@@ -99,13 +102,29 @@ class Playground(Stage):
         """What the panel says about a frame."""
         live, rate = self.live, self.live.scene.fps
         speed = f"{live.fps:.0f} frames/s, {live.fps / rate:.1f}x real time" if live.made else "not generated yet"
-        waits = " · **waiting for the model**" if frame >= live.scene.frames - 1 and not self.worker.paused else ""
-        lines = [super().caption(frame), f"generates {speed}{waits}"]
-        return "  \n".join([*lines, f"**{self.refusal}**"] if self.refusal else lines)
+        ended = frame >= live.scene.frames - 1
+        waits = " · **waiting for the model**" if ended and not self.worker.paused else ""
+        rests = " · the model rests while it loops" if self.clock.loop else ""
+        lines = [super().caption(frame), f"generates {speed}{waits}{rests}", self.news]
+        return "  \n".join([line for line in lines if line] + [f"**{self.refusal}**"] * bool(self.refusal))
+
+    def say(self, news: str) -> None:
+        """Put a line under the clock."""
+        self.news, self.refusal = news, ""
+        self.shown = -1
 
     def _refused(self, message: str) -> None:
-        self.refusal = message
+        self.refusal, self.news = message, ""
+        self.keys.go.disabled = False
         self.shown = -1
+
+    def _made(self, piece: Piece) -> None:
+        if piece.between:
+            self.keys.go.disabled = False
+            if piece.frames:
+                self.again = max(piece.start - 16, 0)
+                self.clock.play(True)
+            self.say(f"in-betweening made {piece.frames} frames in {piece.seconds:.1f} s")
 
     # -- controls ------------------------------------------------------------------------------
 
@@ -119,10 +138,11 @@ class Playground(Stage):
             steps = gui.add_slider("denoising steps", 2, 30, 1, settings.steps)
             kind = gui.add_dropdown("guidance", KINDS, initial_value=settings.guidance.kind)
             weight = gui.add_slider("weight", 0.0, 3.0, 0.1, settings.guidance.weight)
+            smooth = gui.add_slider("smoothing", 0.0, 0.1, 0.01, settings.guidance.smooth, hint="smoother, and slower")
             offset = gui.add_slider("offset of turns", 0.0, 1.0, 0.25, 1.0, visible=False)
             block = gui.add_slider("tokens at a time", 1, 4, 1, 2, hint="a token is 4 frames")
             running = gui.add_checkbox("generate", True)
-            number = gui.add_slider("people", 1, slots, 1, people)
+            number = gui.add_slider("how many people", 1, slots, 1, people)
             anew = gui.add_button("Start anew", icon="refresh")
             again = gui.add_button("Restart from this frame", icon="player-track-prev")
 
@@ -133,21 +153,23 @@ class Playground(Stage):
             with self.live.lock:
                 settings.task = task.value
                 settings.steps = int(steps.value)
-                settings.guidance = Guidance(kind.value, float(weight.value))
-                settings.fields = {"offset": float(offset.value), "block": int(block.value), **self._target()}
-            self.refusal, self.worker.paused = "", not running.value
-            self.worker.wake()
+                settings.guidance = Guidance(kind.value, float(weight.value), smooth=float(smooth.value))
+                settings.fields = {"offset": float(offset.value), "block": int(block.value)}
+            self.refusal = ""
+            self._rest()
 
         def begin(_: Any) -> None:
-            anew.disabled = True
+            anew.disabled, self.worker.paused = True, True
             try:
+                self.steering.nobody()
+                self.keys.clear()
                 self.live.begin(int(number.value))
                 with self.lock:
-                    self.clock.seek(0)
+                    self.again = 0
                     self.clock.play(True)
             finally:
                 anew.disabled = False
-            apply()
+                apply()
 
         def restart(_: Any) -> None:
             self.live.restart(self.clock.frame)
@@ -156,65 +178,27 @@ class Playground(Stage):
             self._update_play()
             apply()
 
-        for control in (task, steps, kind, weight, offset, block, running):
+        for control in (task, steps, kind, weight, smooth, offset, block, running):
             control.on_update(apply)
         anew.on_click(begin)
         again.on_click(restart)
-        self.apply, self.task = apply, task
+        self.apply, self.task, self.running = apply, task, running
         apply()
 
-    def _target(self) -> dict[str, Any]:
-        """Whom a task that is given somebody generates: all but whoever is steered, by default the last one."""
-        people = range(self.live.scene.agents)
-        steered = [agent for agent in self.live.settings.goals if agent in people] or people[-1:]
-        return {"target": tuple(agent for agent in people if agent not in steered) or (0,)}
+    def set_loop(self, on: bool) -> None:
+        """Play what there is round and round while the model rests, or go on with it."""
+        super().set_loop(on)
+        self._rest()
 
-    def _add_steering(self) -> None:
-        gui = self.server.gui
-        slots = self.live.model.layout.agents
-        with gui.add_folder("Steer"):
-            who = gui.add_dropdown("whom", (NOBODY, *(f"person {p + 1}" for p in range(slots))), initial_value=NOBODY)
-            gui.add_markdown("Drag the arrows on the floor; the ring turns.")
+    def _rest(self) -> None:
+        self.worker.paused = self.clock.loop or not self.running.value
+        self.worker.wake()
 
-        def choose(_: Any) -> None:
-            if self.goal is not None:
-                self.goal.remove()
-                self.goal = None
-            self.live.settings.goals = {}
-            if who.value != NOBODY:
-                agent = int(who.value.split()[1]) - 1
-                if agent < self.live.scene.agents:
-                    self.steer(agent)
-                    if self.task.value not in WHAT:
-                        self.task.value = "motion_control"
-            self.apply()
-
-        who.on_update(choose)
-        self.who = who
-
-    def steer(self, agent: int) -> None:
-        """Put a handle where somebody stands and heads, and let it be that person's goal."""
-        scene = self.live.scene
-        T_world_can = canonical_frame(scene.T_world_root[:, -1:])[0, 0, agent]
-        heading = float(np.arctan2(float(T_world_can[0, 2]), float(T_world_can[2, 2])))
-        x, z = float(T_world_can[0, 3]), float(T_world_can[2, 3])
-        self.goal = self.server.scene.add_transform_controls(
-            "/stage/goal",
-            scale=0.7,
-            active_axes=(True, False, True),
-            depth_test=False,
-            position=(x, 0.03, z),
-            wxyz=(float(np.cos(heading / 2)), 0.0, float(np.sin(heading / 2)), 0.0),
-        )
-
-        def moved(_: Any = None) -> None:
-            place, turn = self.goal.position, self.goal.wxyz
-            at = Goal(float(place[0]), float(place[2]), float(2 * np.arctan2(turn[2], turn[0])))
-            with self.live.lock:
-                self.live.settings.goals = {agent: at}
-
-        self.goal.on_update(moved)
-        moved()
+    def steered(self, agent: int) -> None:
+        """Somebody is steered from now on (nobody: -1), which needs a task that listens."""
+        if agent >= 0 and self.task.value not in WHAT:
+            self.task.value = "motion_control"
+        self.apply()
 
     def stop(self) -> None:
         """End the model's thread and the server."""

@@ -391,6 +391,7 @@ class View {
   constructor(canvas, meta, arrays) {
     this.known = arrays.known; // (T, M)
     this.people = meta.people.length;
+    this.shown = meta.people.flatMap((person, index) => (person.ghost ? [] : [{ ...person, index }]));
     this.style = meta.styles[0];
     this.ghosts = true;
     this.follow = true;
@@ -402,6 +403,31 @@ class View {
 
   given(frame, person) {
     return this.known[frame * this.people + person] > 0;
+  }
+
+  // Whose motion was given in a frame; nothing where none of the scene was.
+  said(frame) {
+    if (!this.known.some((given) => given)) return "";
+    const those = this.shown.filter((person) => this.given(frame, person.index));
+    if (those.length === this.shown.length) return "given";
+    return those.length ? `given: ${those.map((person) => `person ${person.index + 1}`).join(", ")}` : "generated";
+  }
+
+  // A stripe a person for the timeline, pale where the motion was given: backgrounds of CSS, and their height.
+  ribbon(frames) {
+    const height = Math.min(24, Math.max(6, 4 * this.shown.length));
+    const stripes = this.shown.map((person, row) => {
+      const stops = [];
+      for (let from = 0, to; from < frames; from = to) {
+        const given = this.given(from, person.index);
+        for (to = from + 1; to < frames && this.given(to, person.index) === given; ) to++;
+        const colour = `rgb(${given ? person.pale : person.colour})`;
+        stops.push(`${colour} ${(100 * from) / frames}% ${(100 * to) / frames}%`);
+      }
+      const each = height / this.shown.length;
+      return `linear-gradient(90deg, ${stops.join(", ")}) 0 ${row * each}px / 100% ${each}px no-repeat`;
+    });
+    return [stripes.join(", "), `${height}px`];
   }
 
   preset(name) {
@@ -537,16 +563,14 @@ class Player {
     get("play").textContent = this.playing ? "Pause" : "Play";
     if (document.activeElement !== get("time") || this.playing) get("time").value = frame;
     get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
-    get("state").textContent = meta.context ? (frame < meta.context ? "given" : "generated") : "";
+    get("state").textContent = this.view.said(frame);
   }
 
   controls() {
     const get = (id) => document.getElementById(id);
     const { meta, view } = this;
-    const border = (100 * meta.context) / Math.max(meta.frames - 1, 1);
-    const [pale, own] = [meta.people[0].pale, meta.people[0].colour].map((c) => `rgb(${c})`);
     get("time").max = meta.frames - 1;
-    get("time").style.background = `linear-gradient(90deg, ${pale} ${border}%, ${own} ${border}%)`;
+    [get("time").style.background, get("time").style.height] = view.ribbon(meta.frames);
     get("time").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     get("play").addEventListener("click", () => this.play(!this.playing));
     get("back").addEventListener("click", () => this.seek(this.frame - 1));

@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.denoiser.seams import joined
 from magnet.denoiser.stream import Stream
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, joined, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Stage, initial_levels
@@ -65,11 +64,7 @@ class Recording:
         start, estimate = int(self.start[step]), self.estimates.pick([step])
         stop = min(start + estimate.frames, self.scene.frames)
         front, window = self.scene.cut(0, start), estimate.cut(0, stop - start)
-        return self.scene.replace(
-            body_rot=torch.cat([front.body_rot, window.body_rot], dim=1),
-            T_world_root=torch.cat([front.T_world_root, window.T_world_root], dim=1),
-            valid=None,
-        )
+        return joined([front, window])
 
     def save(self, path: str | Path) -> Path:
         """Write one npz that needs no unpickling. Returns the path written."""
@@ -104,6 +99,7 @@ class Recording:
                 fps=float(meta["fps"]),
                 body=str(meta["body"]),
                 names=tuple(meta["names"]),
+                given=arrays.get("given"),
             )
             R = len(arrays["levels"])
             estimates = scene.repeat(R).replace(
@@ -135,17 +131,19 @@ def record(
         every: so many denoising steps lie between two that are kept; the last one of each window always is.
 
     Raises:
-        ValueError: several scenes, or whatever `Denoiser.generate` refuses.
+        ValueError: several scenes, another frame rate than the model's, or whatever `Denoiser.generate` refuses.
     """
     if scene.scenes != 1:
         raise ValueError(f"got {scene.scenes} scenes, expected one; record each of scene.pick([b])")
+    require_rate(scene)
     stream = RecordedStream(model, scene, task, context, frames, options, generator, every)
     with torch.no_grad():
         done = joined(list(stream.pieces())).to("cpu")
     slots = torch.arange(scene.agents)
     longest = max(window.frames for window in stream.windows)
     windows = [window.order(slots).held(longest).cut(longest, 2 * longest) for window in stream.windows]
-    finished = done.order(slots)
+    known = stream.known.repeat_interleave(STRIDE, dim=0)[: done.frames].cpu()
+    finished = done.replace(given=known[None] & done.present[:, None]).order(slots)
     estimates = finished.repeat(len(windows)).replace(
         body_rot=torch.cat([window.body_rot for window in windows]),
         T_world_root=torch.cat([window.T_world_root for window in windows]),

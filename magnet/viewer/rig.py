@@ -18,11 +18,15 @@ from torch import Tensor
 from magnet.body.base import PARENTS, Body
 from magnet.export.limbs import CAPSULES, CROWN, L_HAND, L_HEEL, L_TOE, R_HAND, R_HEEL, R_TOE, STICKS, Limb, limbs
 from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.viewer.light import light
 
 Array = NDArray[np.floating]
 Index = NDArray[np.integer]
-Style = Literal["body", "capsules", "skeleton"]
+Style = Literal["body", "light", "capsules", "skeleton"]
 STYLES: tuple[Style, ...] = ("body", "capsules", "skeleton")
+"""What a page of its own can hold."""
+VIEWS: tuple[Style, ...] = ("body", "light", "capsules", "skeleton")
+"""What the viewer can show; `light` is the body with a twentieth of its vertices."""
 
 INFLUENCES = 4
 """Bones that a vertex can follow in a browser."""
@@ -59,15 +63,19 @@ def rigs(body: Body, scene: Scene, style: Style = "body") -> list[Rig]:
     """A rig for each of the P people of a scene (B = 1)."""
     betas = scene.betas[0].float().cpu()
     rest = body.rest_joints(betas).numpy().astype(np.float32)
-    if style != "body":
+    if style not in ("body", "light"):
         table = CAPSULES if style == "capsules" else STICKS
         return [Rig(joints, limb_skin(joints, table)) for joints in rest]
     shape = body.v_template[None] + torch.einsum("vck,pk->pvc", body.shapedirs, betas.to(body.shapedirs))
     bones, weights = strongest(body.weights)
-    faces = body.faces.cpu().numpy().astype(np.uint32)
+    faces = body.faces.cpu().numpy()
+    points = shape.cpu().numpy().astype(np.float32)
+    if style == "light":
+        few = light(body)
+        points, bones, weights, faces = points[:, few.keep], bones[few.keep], weights[few.keep], few.faces
     return [
-        Rig(joints, Skin(vertices, faces, bones, weights))
-        for joints, vertices in zip(rest, shape.cpu().numpy().astype(np.float32), strict=True)
+        Rig(joints, Skin(vertices, faces.astype(np.uint32), bones, weights))
+        for joints, vertices in zip(rest, points, strict=True)
     ]
 
 

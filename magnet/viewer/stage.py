@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from magnet.body.base import Body
-from magnet.motion.scene import Scene
 from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.palette import PAPER
-from magnet.viewer.rig import STYLES, Array
+from magnet.viewer.rig import VIEWS, Array
+from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start
-from magnet.viewer.takes import Take
 from magnet.viewer.troupe import Look, Troupe
 
 RATE = 30.0
@@ -72,7 +69,7 @@ class Stage:
             self.play = gui.add_button("Pause", icon="player-pause")
             steps = gui.add_button_group("step", ("|<", "-10", "-1", "+1", "+10", ">|"))
             speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
-            loop = gui.add_checkbox("loop", True)
+            loop = gui.add_checkbox("loop", self.clock.loop)
             self.clock_text = gui.add_markdown("")
 
         def seek(event: Any) -> None:
@@ -97,25 +94,29 @@ class Stage:
         def set_speed(_: Any) -> None:
             self.clock.speed = float(speed.value[:-1])
 
-        def set_loop(_: Any) -> None:
-            self.clock.loop = bool(loop.value)
-
         self.slider.on_update(seek)
         self.play.on_click(press)
         steps.on_click(step)
         speed.on_update(set_speed)
-        loop.on_update(set_loop)
+        loop.on_update(lambda _: self.set_loop(bool(loop.value)))
+
+    def set_loop(self, on: bool) -> None:
+        """Play what there is round and round, or stop at its end."""
+        self.clock.loop = on
 
     def _update_play(self) -> None:
         self.play.label = "Pause" if self.clock.playing else "Play"
         self.play.icon = "player-pause" if self.clock.playing else "player-play"
 
-    def add_looks(self, ghosts: bool) -> None:
-        """What is shown, and from where."""
+    def add_looks(self, ghosts: bool | None) -> None:
+        """What is shown, and from where. ghosts: None where there can be no ground truth at all."""
         gui = self.server.gui
         with gui.add_folder("Look"):
-            style = gui.add_dropdown("people", STYLES, initial_value=self.look.style)
+            style = gui.add_dropdown("people", VIEWS, initial_value=self.look.style)
             shown = {"ghosts": gui.add_checkbox("ground truth", self.look.ghosts)} if ghosts else {}
+            if ghosts is False:
+                hint = "magnet view FILE --truth RECORDED.npz shows it as ghosts"
+                gui.add_checkbox("ground truth: none given", False, disabled=True, hint=hint)
             shown |= {
                 "shadows": gui.add_checkbox("shadows", self.look.shadows, hint="off where there is no GPU"),
                 "trails": gui.add_checkbox("trails", self.look.trails),
@@ -156,21 +157,22 @@ class Stage:
         names = tuple(troupe.take.label or "scene" for troupe in self.troupes)
         with gui.add_folder("Save", expand_by_default=False):
             which = gui.add_dropdown("take", names, initial_value=names[0]) if len(names) > 1 else None
-            buttons = {kind: gui.add_button(f".{kind}", icon="download") for kind in ("html", "npz", "gif")}
+            kind = gui.add_dropdown("format", FORMATS, initial_value=FORMATS[0])
+            button = gui.add_button("Download", icon="download")
 
-        def save(kind: str, client: Any) -> None:
+        def save(event: Any) -> None:
             troupe = self.troupes[names.index(which.value) if which is not None else 0]
-            button = buttons[kind]
             button.disabled = True
             try:
-                content = saved(troupe.take, self.body, kind, troupe.truth)
+                suffix, content = saved(troupe.take, self.body, kind.value, troupe.truth)
                 name = "".join(c if c.isalnum() else "_" for c in troupe.take.label) or "scene"
-                client.send_file_download(f"{name}.{kind}", content)
+                event.client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
+            except (ValueError, OSError, ImportError) as error:
+                event.client.add_notification("Not saved", str(error), color="red", auto_close_seconds=15.0)
             finally:
                 button.disabled = False
 
-        for kind, button in buttons.items():
-            button.on_click(lambda event, kind=kind: save(kind, event.client))
+        button.on_click(save)
 
     # -- camera --------------------------------------------------------------------------------
 
@@ -232,8 +234,7 @@ class Stage:
         """What the panel says about a frame."""
         lines = [f"{frame / self.clock.fps:.2f} s of {self.clock.frames / self.clock.fps:.1f} s"]
         for troupe in self.troupes:
-            known = troupe.take.known[min(frame, len(troupe.take.known) - 1)]
-            state = "given" if known.all() else "partly given" if known.any() else ""
+            state = troupe.take.said(frame)
             facts = troupe.facts
             if self.look.contacts:
                 state += f" · standing feet: {facts.get('feet', 0):.0f} · touching hands: {facts.get('hands', 0):.0f}"
@@ -272,26 +273,3 @@ class Stage:
         self._stop.set()
         with self.lock:
             self.server.stop()
-
-
-def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> bytes:
-    """A take as the content of a file: html, npz or gif."""
-    import tempfile
-
-    import torch
-
-    context = int(take.known.all(axis=1).cumprod().sum())
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"scene.{kind}"
-        if kind == "html":
-            from magnet.viewer.html import save_html
-
-            known = torch.from_numpy(take.known)
-            save_html(take.scene, path, body, known=known, truth=truth, title=take.label)
-        elif kind == "gif":
-            from magnet.export.video import render_video
-
-            render_video(take.scene, path, context_frames=context, body=body, fps=15.0, size=(480, 360), ghosts=truth)
-        else:
-            take.scene.save(path)
-        return io.BytesIO(path.read_bytes()).getvalue()

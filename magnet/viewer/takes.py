@@ -28,7 +28,7 @@ class Take:
 
     Attributes:
         slots: the people's slots, which say their colours.
-        known: (T, P) bool, frames that the model was given.
+        known: (T, P) bool, frames that the model was given; the scene's own `given`, or False where that says nothing.
         recording: its denoising steps, if they were recorded.
     """
 
@@ -42,13 +42,22 @@ class Take:
     def frames(self) -> int:
         return self.scene.frames
 
+    def said(self, frame: int) -> str:
+        """Whose motion a model was given in a frame, after the last one in that; empty where nobody's."""
+        known = self.known[min(frame, len(self.known) - 1)]
+        if known.all():
+            return "given"
+        those = ", ".join(f"person {slot + 1}" for slot, here in zip(self.slots, known, strict=True) if here)
+        return f"given: {those}" if those else ""
+
 
 def take(
     label: str, scene: Scene, context: int = 0, recording: Recording | None = None, known: Tensor | None = None
 ) -> Take:
     """A scene (B = 1) made ready to be shown.
 
-    context: first frames that a model was given; known (T, P) bool: the given frames instead, of everybody.
+    Which frames a model was given say `known` (T, P) bool, else the scene's own `given`, else `context`, so many first
+    frames of everybody.
 
     Raises:
         ValueError: nobody is there, no frames, or numbers that are not finite.
@@ -62,12 +71,14 @@ def take(
         if bool(broken.any()):
             first = int(broken.int().argmax())
             raise ValueError(f"{label}: {name} is not finite in {int(broken.sum())} frames, the first is frame {first}")
-    given = np.zeros((scene.frames, len(slots)), dtype=bool)
-    given[: max(context, 0)] = True
     if known is not None:
         if tuple(known.shape) != (scene.frames, scene.agents):
             raise ValueError(f"known: got {tuple(known.shape)}, expected (T, P) = {(scene.frames, scene.agents)}")
-        given = known[:, slots].cpu().numpy().astype(bool)
+        shown = shown.replace(given=known[None, :, slots].bool().cpu())
+    elif scene.given is None and context > 0:
+        past = torch.arange(scene.frames) < context
+        shown = shown.replace(given=past[None, :, None].expand(1, -1, len(slots)))
+    given = np.zeros((scene.frames, len(slots)), dtype=bool) if shown.given is None else shown.given[0].numpy()
     return Take(label, shown, tuple(slots.tolist()), given, recording)
 
 
@@ -150,4 +161,4 @@ def same_length(one: Take, other: Take) -> Scene:
     """The scene of `one`, cut or held so that it has the frames of `other`."""
     frame = torch.arange(other.frames).clamp(max=one.frames - 1)
     scene = one.scene
-    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=None)
+    return scene.picked(frame)

@@ -21,8 +21,10 @@ APART = 0.5
 WIDEST = 8.0
 """Metres of the row that one take takes up at most."""
 CROWD = 8
-"""People in all from which the light view is the first choice."""
+"""People in all above whom light bodies are the first choice."""
 HEAD_HIGH = 2.1
+EVEN = 1.2
+"""Strength of the light that stands in for surroundings."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class Troupe:
         self.shades = Shades(server, f"{self.name}/shades", len(take.slots))
         self.label = server.scene.add_label(f"{self.name}/label", take.label) if label and take.label else None
         self.facts: dict[str, float] = {}
+        self.plainly_lit = False
         self.estimate: Scene | None = None
         self.dress(look)
 
@@ -91,6 +94,9 @@ class Troupe:
         self.marks.clear(not look.contacts, not look.collisions)
         if look.shadows:
             self.shades.clear()
+        if (look.style == "body") == self.plainly_lit:
+            self.plainly_lit = not self.plainly_lit
+            light_up(self.server, self.plainly_lit)
 
     def _dressed(self, style: Style, ghosts: bool) -> People:
         if (style, ghosts) not in self.wardrobe:
@@ -142,6 +148,17 @@ class Troupe:
     def appear(self, on: bool) -> None:
         """Leave the stage, or come back."""
         self.root.visible = on
+
+
+def light_up(server: Any, plain: bool) -> None:
+    """Light of surroundings, or an even one: without a GPU, surroundings cost more than all limbs of a crowd."""
+    server.scene.configure_environment_map(None if plain else "city")  # viser's own choice, which it sends whole
+    server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)
+
+
+def first_style(people: int) -> Style:
+    """What people are shown as when nobody says: whole bodies, or light ones of a crowd."""
+    return "light" if people > CROWD else "body"
 
 
 def _node(label: str) -> str:

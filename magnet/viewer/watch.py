@@ -10,7 +10,7 @@ from magnet.viewer.levels import level_image
 from magnet.viewer.rig import Style
 from magnet.viewer.stage import Stage
 from magnet.viewer.takes import Take, same_length
-from magnet.viewer.troupe import CROWD, Look, Troupe, in_a_row, numbered
+from magnet.viewer.troupe import CROWD, Look, Troupe, first_style, in_a_row, numbered
 
 
 class Viewer(Stage):
@@ -53,7 +53,7 @@ class Viewer(Stage):
         assert recording is not None
         gui = self.server.gui
         with gui.add_folder("Denoising"):
-            step = gui.add_slider("step", 0, recording.steps, 1, recording.steps)
+            step = gui.add_slider("denoising step", 0, recording.steps, 1, recording.steps)
             picture = gui.add_image(level_image(recording, recording.steps - 1), label="levels: time, people")
             text = gui.add_markdown("")
 
@@ -73,6 +73,6 @@ class Viewer(Stage):
 def first_look(takes: list[Take], style: Style | None = None, shadows: bool = True) -> Look:
     """What is shown at first: of a crowd what is light, unless a style is asked for."""
     crowd = sum(len(each.slots) for each in takes) > CROWD
-    style = style or ("capsules" if crowd else "body")
+    style = style or first_style(sum(len(each.slots) for each in takes))
     rich = not crowd
     return Look(style=style, trails=rich, contacts=rich, collisions=rich, shadows=shadows and rich)

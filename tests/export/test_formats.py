@@ -136,3 +136,20 @@ def test_pictures_mark_what_was_given(duet: Scene, body: Body, tmp_path: Path, p
 def test_the_open_body_is_the_default(duet: Scene, tmp_path: Path):
     (path,) = formats.write(duet, tmp_path / "a.glb")
     assert path.read_bytes() == formats.write(duet, tmp_path / "b.glb", load_body("open"))[0].read_bytes()
+
+
+def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, body: Body, tmp_path: Path, pixels_like):
+    from magnet.export.cast import known_frames
+    from magnet.export.stage import CONTEXT
+
+    given = torch.zeros(1, 12, 2, dtype=torch.bool)
+    given[:, :6, 0] = True
+    said = duet.replace(given=given)
+    plain, marked = (Image.open(formats.write(s, tmp_path / f"{i}.png", body)[0]) for i, s in enumerate((duet, said)))
+    assert pixels_like(marked, CONTEXT[0]) > 5 * pixels_like(plain, CONTEXT[0])
+    assert torch.equal(known_frames(said, 3, None), given[0])
+    assert torch.equal(known_frames(said, 3, ~given[0]), ~given[0])
+    twice = resampled(said, 60.0).given
+    assert twice is not None and twice[0].sum(dim=0).tolist() == [11, 0]  # frame 5.5 is half generated
+    both = formats.together([said.order([0]), duet.order([1])], ["a", "b"])
+    assert torch.equal(both.given, given)  # type: ignore[arg-type]

@@ -143,6 +143,22 @@ def test_people_of_one_shape_share_their_mesh(trio: Scene, body: Body, tmp_path:
     assert len(positions) == 1
 
 
+def test_trimesh_opens_it_and_finds_everybody_at_rest(trio: Scene, body: Body, tmp_path: Path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+    opened = trimesh.load(save_glb(trio, tmp_path / "trio.glb", body))
+    assert sorted(opened.geometry) == [f"person_{p}_body" for p in range(3)]
+    resting = body.v_template + torch.einsum("vck,pk->pvc", body.shapedirs, trio.betas[0])
+    for person in range(3):
+        mesh = opened.geometry[f"person_{person}_body"]
+        assert mesh.faces.shape == tuple(body.faces.shape) and mesh.is_watertight
+        assert np.abs(mesh.vertices - resting[person].numpy()).max() < 1e-5
+    # trimesh reads no animations: nodes are as they rest, and people after the first have theirs numbered.
+    nodes = {name: opened.graph.get(name)[0][:3, 3] for name in opened.graph.nodes}
+    for person, rest in enumerate(body.rest_joints(trio.betas[0]).numpy()):
+        there = np.stack([nodes[f"{name}_{person}" if person else name] for name in JOINT_NAMES])
+        assert np.abs(there - rest).max() < 1e-5
+
+
 def test_weights_sum_to_one_exactly(body: Body):
     joints, shares = influences(body.weights.double().numpy())
     assert (shares.sum(axis=1) == 65535).all() and (shares >= 0).all()

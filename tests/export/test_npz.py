@@ -53,6 +53,19 @@ def test_one_file_a_person_holds_that_person(trio: Scene, body: Body, tmp_path: 
     assert (body.joints(back) - body.joints(trio)[:, :, 2:]).abs().max() < 1e-4
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_what_was_given_comes_back_beside_the_conventional_keys(trio: Scene, body: Body, tmp_path, apart) -> None:
+    given = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(1)) > 0.5
+    (plain, *_) = save_smplx(trio, tmp_path / "plain", body, apart=apart)
+    paths = save_smplx(trio.replace(given=given), tmp_path / "told", body, apart=apart)
+    for p, path in enumerate(paths):
+        with np.load(plain) as without, np.load(path) as file:
+            assert set(file.files) - set(without.files) == {"given"}
+        wanted = given[:, :, p : p + 1] if apart else given
+        assert torch.equal(load_smplx(path, body).given, wanted)
+    assert load_smplx(plain, body).given is None
+
+
 def test_what_does_not_fit_is_named(trio: Scene, body: Body, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="got 2 scenes"):
         save_smplx(trio.repeat(2), tmp_path / "a.npz", body)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.motion.scene import Scene, concatenate
+from magnet.motion.scene import Scene, concatenate, joined
 from magnet.testing import random_scene
 
 
@@ -51,6 +51,58 @@ def test_repeat_keeps_samples_of_a_scene_together(scene: Scene):
     repeated = scene.replace(names=("a", "b")).repeat(3)
     assert repeated.names == ("a", "a", "a", "b", "b", "b")
     assert torch.equal(repeated.T_world_root[4], scene.T_world_root[1])
+
+
+@pytest.fixture
+def told(scene: Scene, generator) -> Scene:
+    """A scene that says what a model was given."""
+    shape = (scene.scenes, scene.frames, scene.agents)
+    return scene.replace(given=torch.rand(shape, generator=generator) > 0.5)
+
+
+def test_what_was_given_follows_its_frames_people_and_scenes(told: Scene):
+    given = told.given
+    assert torch.equal(told.cut(3, 9).given, given[:, 3:9])
+    assert torch.equal(told.picked(torch.tensor([5, 5, 0])).given, given[:, [5, 5, 0]])
+    assert torch.equal(told.order(torch.tensor([2, 0])).given, given[:, :, [2, 0]])
+    assert torch.equal(told.pick([1]).given, given[1:]) and torch.equal(told.repeat(2).given[1], given[0])
+    assert torch.equal(told.held(2).given[:, :3], given[:, [0, 0, 0]])
+    padded = told.pad_agents(4)
+    assert torch.equal(padded.given[:, :, :3], given) and not padded.given[:, :, 3].any()
+    assert torch.equal(told.people().given[0, :, 0], given[0, :, 0])
+    assert torch.equal(joined([told.cut(0, 20), told.cut(20)]).given, given)
+    assert torch.equal(concatenate([told, told]).given[2:], given)
+
+
+def test_what_is_said_of_only_a_part_is_not_said_of_the_whole(scene: Scene, told: Scene):
+    assert concatenate([told, scene]).given is None
+    assert joined([told, scene]).given is None
+
+
+def test_other_frames_forget_what_was_given_and_wrong_shapes_are_named(told: Scene):
+    longer = told.held(4)
+    assert told.replace(body_rot=longer.body_rot, T_world_root=longer.T_world_root).given is None
+    assert told.replace(T_world_root=told.T_world_root + 1).given is not None
+    with pytest.raises(ValueError, match=r"given: got \(2, 64\), expected \(2, 64, 3\)"):
+        told.replace(given=told.given[..., 0])
+
+
+def test_what_was_given_is_saved_and_files_that_do_not_say_are_read(told: Scene, scene: Scene, tmp_path):
+    assert torch.equal(Scene.load(told.save(tmp_path / "told.npz")).given, told.given)
+    assert Scene.load(scene.save(tmp_path / "scene.npz")).given is None
+
+
+def test_arrays_that_a_later_version_adds_are_passed_over(scene: Scene, tmp_path):
+    with np.load(scene.save(tmp_path / "scene.npz")) as file:
+        np.savez(tmp_path / "later.npz", later=np.zeros(3), **dict(file))
+    assert torch.equal(Scene.load(tmp_path / "later.npz").betas, scene.betas)
+
+
+def test_pieces_joined_are_the_whole(scene: Scene):
+    whole = joined([scene.cut(0, 10), scene.cut(10, 11), scene.cut(11)])
+    assert torch.equal(whole.T_world_root, scene.T_world_root) and torch.equal(whole.body_rot, scene.body_rot)
+    half = scene.replace(valid=torch.rand(2, 64) > 0.5).cut(0, 10)
+    assert joined([half, scene.cut(10)]).valid[:, 10:].all()
 
 
 def test_absent_agents_are_not_moved(generator):

@@ -1,11 +1,31 @@
-"""Scenes and a body for the viewer's tests."""
+"""Scenes, a body and a browser for the viewer's tests."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
 
 from magnet.body import Body, load_body
 from magnet.motion.scene import Scene
+from magnet.synthesis.generate import synthesize
 from magnet.testing import random_scene
+
+SIZE = {"width": 800, "height": 500}
+FLAGS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--no-first-run",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-quic",
+)
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +37,36 @@ def body() -> Body:
 def duet(generator: torch.Generator) -> Scene:
     """One scene of two people, 24 frames."""
     return random_scene(1, 24, 2, generator)
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """Debian's Chromium, driven by Playwright, with a profile of its own."""
+    api = pytest.importorskip("playwright.sync_api", reason='needs playwright: pip install "magnet-motion[browser]"')
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("needs Chromium: apt-get install chromium")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, headless=True, args=list(FLAGS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@pytest.fixture
+def page(chromium: Any) -> Iterator[Any]:
+    """An empty page; errors in its scripts fail the test."""
+    errors: list[str] = []
+    page = chromium.new_page(viewport=SIZE, accept_downloads=True)
+    page.set_default_timeout(300_000)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page
+    page.close()
+    assert not errors
+
+
+@pytest.fixture(scope="session")
+def handshake(body: Body) -> Scene:
+    """Two people who meet and shake hands, 128 frames."""
+    return synthesize("handshake", 2, 128, torch.Generator().manual_seed(3), body).scene

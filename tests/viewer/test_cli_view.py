@@ -65,6 +65,19 @@ def test_mixed_frame_rates_are_named_for_the_truth_too(tmp_path: Path, duet: Sce
     assert "--truth has 60 frames a second" in said(capsys, str(slow), "--truth", str(fast), "--port", "0")
 
 
+def test_rates_of_the_truth_are_compared_for_pages_too(tmp_path: Path, duet: Scene, capsys) -> None:
+    slow, fast = duet.save(tmp_path / "a.npz"), duet.replace(fps=60.0).save(tmp_path / "b.npz")
+    line = said(capsys, str(slow), "--truth", str(fast), "--html", str(tmp_path / "a.html"))
+    assert "--truth has 60 frames a second, the scenes 30" in line
+
+
+def test_after_a_run_what_cannot_be_shown_is_said_and_is_no_failure(tmp_path: Path, duet: Scene, capsys) -> None:
+    cli_view.show_at_the_end([str(tmp_path / "gone.npz"), "--port", "0", "--no-browser"])
+    err = capsys.readouterr().err
+    assert "not shown: " in err and "later: magnet view " in err
+    assert len(err.strip().splitlines()) == 2
+
+
 def test_an_unknown_host_is_named() -> None:
     with pytest.raises(OSError, match=r"--host no\.such\.host\.invalid"):
         server.free_port("no.such.host.invalid", 0)

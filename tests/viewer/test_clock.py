@@ -37,11 +37,17 @@ def test_looping_goes_round_and_not_looping_stops_at_the_end() -> None:
 
 
 def test_a_growing_motion_waits_for_more_at_its_end() -> None:
-    clock = Clock(30, 30.0, growing=True)
+    clock = Clock(30, 30.0, growing=True, loop=False)
     assert clock.tick(5.0) == 29
     assert clock.playing
     clock.frames = 60
     assert clock.tick(0.5) > 29
+
+
+def test_a_growing_motion_that_loops_goes_round_what_there_is() -> None:
+    clock = Clock(30, 30.0, growing=True, loop=True)
+    assert clock.tick(1.5) == 15
+    assert clock.playing
 
 
 @pytest.mark.parametrize(("start", "by", "end"), [(0, 1, 1), (0, -1, 29), (29, 1, 0), (5, -10, 25)])

@@ -75,12 +75,18 @@ def test_the_page_asks_for_nothing_from_elsewhere(duet: Scene, body: Body) -> No
 
 def test_context_truth_and_title_are_there(duet: Scene, body: Body) -> None:
     meta, arrays = contents(page(duet, body, context=8, truth=duet.cut(0, 12), title="</script><b>"))
-    assert meta["context"] == 8
     assert [person["ghost"] for person in meta["people"]] == [False, False, True, True]
     known = arrays["known"].reshape(24, 4)
     assert known[:8, :2].all()
     assert not known[8:].any()
     assert "</script><b>" not in page(duet, body, title="</script><b>")
+
+
+def test_the_page_marks_what_the_scene_says_was_given(duet: Scene, body: Body) -> None:
+    given = torch.zeros(1, 24, 2, dtype=torch.bool)
+    given[:, :, 1] = True
+    _, arrays = contents(page(duet.replace(given=given), body, context=8))
+    assert (arrays["known"].reshape(24, 2) == given[0].numpy()).all()
 
 
 def test_two_people_for_six_seconds_take_less_than_two_megabytes(tmp_path: Path, body: Body) -> None:

@@ -6,12 +6,14 @@ import time
 import pytest
 import torch
 
+from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene
-from magnet.sampling.schedule import Grid
+from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
-from magnet.tasks.agentic import AgenticAsync
 from magnet.testing import random_scene, tiny_denoiser
-from magnet.viewer.live import CONTEXT, FIRST, REACH, Among, Goal, Live, Worker, reached
+from magnet.viewer.keyframes import Goal, keyframe, reached, speeds, with_keyframes
+from magnet.viewer.live import CONTEXT, FIRST, REACH, Live, Piece
+from magnet.viewer.worker import Worker
 
 
 @pytest.fixture(scope="module")
@@ -124,20 +126,118 @@ def test_a_partners_recording_is_given_as_it_is(model) -> None:
 
 def test_nobody_is_asked_to_run_faster_than_people_do() -> None:
     here = torch.eye(4)
-    far = reached(here, Goal(100.0, 0.0, 0.0), 1.0)
-    assert far[0, 3] == pytest.approx(1.6)
+    assert reached(here, Goal(100.0, 0.0, 0.0), 1.0).x == pytest.approx(1.6)
     near = reached(here, Goal(0.3, 0.4, 1.5), 1.0)
-    assert near[:3, 3].tolist() == pytest.approx([0.3, 0.0, 0.4])
-    assert (near[:3, :3] @ torch.tensor([0.0, 0.0, 1.0]))[0] == pytest.approx(torch.tensor(1.5).sin().item())
+    assert (near.x, near.z, near.heading) == (0.3, 0.4, 1.5)
+    assert (near.frame()[:3, :3] @ torch.tensor([0.0, 0.0, 1.0]))[0] == pytest.approx(torch.tensor(1.5).sin().item())
 
 
-def test_nobody_waits_for_the_turns_of_empty_slots() -> None:
-    grid = Grid(12, 4, 8, steps=5)
-    two = Among(AgenticAsync(), 2).schedule(grid)
-    assert two.evaluations == AgenticAsync().schedule(dataclasses.replace(grid, agents=2)).evaluations
-    assert two.evaluations < AgenticAsync().schedule(grid).evaluations
-    assert not two.known[:, 2:].any()
-    assert bool(two.finished[:, :2].all())
+def test_a_live_scene_says_what_the_model_did_not_make(model, live: Live) -> None:
+    assert not live.scene.given.any()
+    at = live.scene.T_world_root[0, -1, 1, :3, 3]
+    live.settings.task, live.settings.goals = "inbetweening", {1: Goal(float(at[0]), float(at[2]), 0.0)}
+    live.advance()
+    assert live.scene.given[0, FIRST:].nonzero().tolist() == [[REACH - 4 + t, 1] for t in range(4)]
+    recorded = random_scene(1, 80, 2, torch.Generator().manual_seed(2))
+    led = Live(model, start=recorded.cut(0, 40), partner=recorded, generator=torch.Generator().manual_seed(2))
+    led.settings.task, led.settings.steps = "motion_control", 2
+    led.advance()
+    assert led.scene.given[0, :40].all() and led.scene.given[0, 40:].all(dim=0).tolist() == [False, True]
+    assert not led.scene.given[0, 40:, 0].any()
+
+
+def test_somebody_who_is_gone_is_neither_steered_nor_given_nor_generated(live: Live) -> None:
+    live.begin(3)
+    live.settings.task, live.settings.goals = "motion_control", {2: Goal(0.0, 0.0, 0.0)}
+    live.keys = [keyframe(live.scene, 2, 60)]
+    assert live.task().target == (0, 1)
+    live.begin(2)
+    assert (live.settings.goals, live.keys, live.task().target) == ({}, [], (0,))
+    live.advance()
+
+
+# -- keyframes ---------------------------------------------------------------------------------
+
+
+def test_a_keyframe_holds_four_frames_of_motion_wherever_it_is_put(live: Live) -> None:
+    scene = live.scene
+    key = keyframe(scene, 1, 42)
+    assert key.frame == 40
+    there = with_keyframes(scene, [key])
+    torch.testing.assert_close(there.T_world_root, scene.T_world_root, atol=1e-5, rtol=0)
+    assert there.given[0].nonzero().tolist() == [[t, 1] for t in range(40, 44)]
+    moved = dataclasses.replace(keyframe(scene, 1, 40, pose=10), goal=Goal(3.0, -1.0, 0.5))
+    root = with_keyframes(scene, [moved]).T_world_root[0, 40:44, 1]
+    heading = canonical_frame(root[:, None])[0, 0]
+    assert Goal.of(heading) == Goal(*[pytest.approx(v, abs=1e-5) for v in (3.0, -1.0, 0.5)])
+    steps = (root[1:, :3, 3] - root[:-1, :3, 3]).norm(dim=-1)
+    own = scene.T_world_root[0, 10:14, 1, :3, 3]
+    torch.testing.assert_close(steps, (own[1:] - own[:-1]).norm(dim=-1), atol=1e-4, rtol=0)
+
+
+def test_in_betweening_goes_through_every_keyframe_and_keeps_what_comes_before(live: Live) -> None:
+    live.advance()
+    before = live.scene
+    first = keyframe(before, 0, 72)
+    last = dataclasses.replace(keyframe(before, 1, 79, pose=8), frame=120, goal=Goal(1.0, 1.0, 1.0))
+    live.keys, live.asked = [last, first], True
+    piece = live.advance()
+    assert (piece.between, piece.start, piece.frames) == (True, 72 - REACH, 124 - 72 + REACH)
+    scene = live.scene
+    assert scene.frames == 124 and not live.asked
+    assert torch.equal(scene.cut(0, 40).T_world_root, before.cut(0, 40).T_world_root)
+    wanted = with_keyframes(scene, [first, last])
+    torch.testing.assert_close(scene.T_world_root, wanted.T_world_root, atol=1e-4, rtol=0)
+    torch.testing.assert_close(scene.body_rot, wanted.body_rot, atol=1e-4, rtol=0)
+    expected = [[t, 0] for t in range(72, 76)] + [[t, 1] for t in range(120, 124)]
+    assert scene.given[0].nonzero().tolist() == expected
+    live.settings.task = "joint_future"
+    assert live.advance().start == 124
+
+
+def test_keyframes_where_they_cannot_be_are_refused(live: Live) -> None:
+    with pytest.raises(ValueError, match="no keyframes: add one first"):
+        live.between()
+    live.keys = [keyframe(live.scene, 0, 33)]
+    with pytest.raises(ValueError, match=r"a keyframe at frame 32: .* lies at 36 or later"):
+        live.between()
+    with pytest.raises(ValueError, match="person 3 is not there: the scene has 2"):
+        keyframe(live.scene, 2, 40)
+    with pytest.raises(ValueError, match="with the pose of frame 99: the scene has frames 0 to 63"):
+        keyframe(live.scene, 0, 40, pose=99)
+
+
+def test_how_fast_keyframes_must_be_reached_is_known_beforehand(live: Live) -> None:
+    here = live.scene.T_world_root[0, 31, 0, [0, 2], 3].tolist()
+    one = dataclasses.replace(keyframe(live.scene, 0, 60), frame=61, goal=Goal(here[0] + 3.0, here[1], 0.0))
+    two = dataclasses.replace(one, frame=91, goal=Goal(here[0] + 3.0, here[1] + 1.0, 0.0))
+    found = speeds([two, one], live.scene, 31)
+    assert found == {(0, 61): pytest.approx(3.0, abs=1e-4), (0, 91): pytest.approx(1.0, abs=1e-4)}
+
+
+def test_smoothing_guidance_reaches_the_sampler(live: Live) -> None:
+    live.settings.guidance = Guidance(smooth=0.05)
+    live.advance()
+    assert bool(live.scene.T_world_root.isfinite().all())
+
+
+# -- the thread --------------------------------------------------------------------------------
+
+
+def test_what_was_asked_for_is_made_while_the_worker_rests(live: Live) -> None:
+    made: list[Piece] = []
+    worker = Worker(live, done=made.append)
+    worker.paused = True
+    worker.start()
+    try:
+        live.keys, live.asked = [keyframe(live.scene, 0, 60)], True
+        worker.wake()
+        wait(lambda: bool(made))
+        assert made[0].between
+        time.sleep(0.3)
+        assert len(made) == 1
+    finally:
+        worker.stop()
 
 
 def test_a_piece_that_went_on_from_a_forgotten_past_is_dropped(live: Live, monkeypatch) -> None:
@@ -180,5 +280,5 @@ def wait(done, seconds: float = 20.0) -> None:
 def test_a_start_at_another_rate_is_refused():
     model = tiny_denoiser(max_agents=2)
     start = random_scene(1, 40, 2, torch.Generator().manual_seed(0)).replace(fps=60.0)
-    with pytest.raises(ValueError, match="60 frames a second, the model makes 30"):
+    with pytest.raises(ValueError, match=r"start runs at 60 fps, the model at 30: .*magnet export"):
         Live(model).begin(2, start)

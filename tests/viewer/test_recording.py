@@ -10,6 +10,7 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.sampling.guidance import Guidance
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.joint import JointFuture
+from magnet.tasks.partner import PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser
 from magnet.viewer.levels import level_image
 from magnet.viewer.recording import Recording, record
@@ -65,6 +66,21 @@ def test_saved_and_read_back_it_is_the_same(model, start, tmp_path: Path) -> Non
     assert torch.equal(again.levels, recording.levels)
     assert torch.equal(again.scene.body_rot, recording.scene.body_rot)
     torch.testing.assert_close(again.estimates.body_rot, recording.estimates.body_rot, atol=1e-3, rtol=0)
+
+
+def test_a_recording_says_what_was_given(model, start, tmp_path: Path) -> None:
+    recording = record(model, start, PartnerPrediction(target=(1,)), 16, 16, SamplerOptions(steps=2), generator())
+    given = Recording.load(recording.save(tmp_path / "steps")).scene.given
+    assert given is not None
+    assert (
+        given[0, :16].all() and given[0, 16:].any(dim=0).tolist() == recording.scene.given[0, 16:].any(dim=0).tolist()
+    )
+    assert not given[0, 16:, 1].any()
+
+
+def test_another_frame_rate_is_refused(start) -> None:
+    with pytest.raises(ValueError, match="the scene runs at 60 fps, the model at 30: bring it there"):
+        record(None, start.replace(fps=60.0), JointFuture(), 16, 16)  # type: ignore[arg-type]
 
 
 def test_other_files_are_refused(tmp_path: Path, start) -> None:

@@ -7,7 +7,7 @@ import torch
 from magnet.body import Body
 from magnet.export.limbs import CAPSULES, STICKS, limbs
 from magnet.motion.scene import Scene
-from magnet.viewer.rig import STYLES, bend, bone_poses, capsule, rigs, strongest, turn_to, world_rotations
+from magnet.viewer.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest, turn_to, world_rotations
 
 MILLIMETRE = 1e-3
 
@@ -73,7 +73,7 @@ def test_world_rotations_of_a_body_at_rest_are_its_pelvis_rotation(duet: Scene) 
     torch.testing.assert_close(rotations, still.T_world_root[..., None, :3, :3].expand_as(rotations))
 
 
-@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("style", VIEWS)
 def test_each_style_has_whole_meshes_with_weights_that_sum_to_one(duet: Scene, body: Body, style) -> None:
     for rig in rigs(body, duet, style):
         skin = rig.skin

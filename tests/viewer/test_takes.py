@@ -44,6 +44,18 @@ def test_known_says_who_was_given_which_frames(duet: Scene) -> None:
         take("x", duet, known=known[:3])
 
 
+def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scene) -> None:
+    given = torch.zeros(1, duet.frames, 2, dtype=torch.bool)
+    given[:, 5, 0] = True
+    said = duet.replace(given=given)
+    shown = take("x", said, context=8)
+    assert (shown.known == given[0].numpy()).all()
+    assert [shown.said(frame) for frame in (4, 5)] == ["", "given: person 1"]
+    assert (take("x", said, known=~given[0]).known == ~given[0].numpy()).all()
+    assert take("x", duet, context=8).scene.given.sum() == 16
+    assert take("x", duet).scene.given is None
+
+
 def test_same_length_cuts_or_holds(duet: Scene) -> None:
     short, long = take("a", duet.cut(0, 10)), take("b", duet)
     assert same_length(long, short).frames == 10

@@ -1,0 +1,255 @@
+"""Handles on the floor that people drag, and the panels that go with them: a goal to steer to, and keyframes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magnet.motion.frames import canonical_frame
+from magnet.viewer.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
+from magnet.viewer.palette import agent_colours
+from magnet.viewer.people import People, add_people
+from magnet.viewer.rig import bone_poses
+
+if TYPE_CHECKING:
+    from magnet.viewer.play import Playground
+
+NOBODY = "nobody"
+NO_KEYS = "no keyframe"
+HURRIED = 3.0
+"""Metres a second from which a keyframe is called out as too far away to be walked to."""
+HERE = -1
+"""For the frame that is seen."""
+
+
+def floor_handle(server: Any, name: str, goal: Goal, moved: Callable[[Goal], None], scale: float = 0.7) -> Any:
+    """Arrows on the floor and a ring that turns; whoever drags them has `moved` called."""
+    handle = server.scene.add_transform_controls(
+        name,
+        scale=scale,
+        active_axes=(True, False, True),
+        depth_test=False,
+        position=(goal.x, 0.03, goal.z),
+        wxyz=(float(np.cos(goal.heading / 2)), 0.0, float(np.sin(goal.heading / 2)), 0.0),
+    )
+
+    def changed(_: Any) -> None:
+        place, turn = handle.position, handle.wxyz
+        moved(Goal(float(place[0]), float(place[2]), float(2 * np.arctan2(turn[2], turn[0]))))
+
+    handle.on_update(changed)
+    return handle
+
+
+def people_names(slots: int) -> tuple[str, ...]:
+    return tuple(f"person {p + 1}" for p in range(slots))
+
+
+class Steering:
+    """Whom to steer, and the handle of that person's goal."""
+
+    def __init__(self, playground: Playground) -> None:
+        self.playground, self.live = playground, playground.live
+        self.handle: Any = None
+        gui = playground.server.gui
+        with gui.add_folder("Steer"):
+            slots = self.live.model.layout.agents
+            self.who = gui.add_dropdown("whom", (NOBODY, *people_names(slots)), initial_value=NOBODY)
+            gui.add_markdown("Drag the arrows on the floor; the ring turns.")
+        self.who.on_update(self._choose)
+
+    def _choose(self, _: Any) -> None:
+        if self.handle is not None:
+            self.handle.remove()
+            self.handle = None
+        with self.live.lock:
+            self.live.settings.goals = {}
+        agent = -1 if self.who.value == NOBODY else int(self.who.value.split()[1]) - 1
+        if 0 <= agent < self.live.scene.agents:
+            self.steer(agent)
+        self.playground.steered(agent)
+
+    def steer(self, agent: int) -> None:
+        """Put a handle where somebody stands and heads, and let it be that person's goal."""
+
+        def moved(goal: Goal) -> None:
+            with self.live.lock:
+                self.live.settings.goals = {agent: goal}
+
+        goal = Goal.of(canonical_frame(self.live.scene.T_world_root[:, -1:])[0, 0, agent])
+        self.handle = floor_handle(self.playground.server, "/stage/goal", goal, moved)
+        moved(goal)
+
+    def nobody(self) -> None:
+        """Steer nobody any more."""
+        self.who.value = NOBODY  # runs `_choose`
+
+
+@dataclass
+class Entry:
+    """A keyframe on the stage."""
+
+    key: Keyframe
+    handle: Any
+    statue: People
+
+    @property
+    def label(self) -> str:
+        return f"person {self.key.agent + 1} at {self.key.frame}"
+
+
+class Keys:
+    """Keyframes: added where the clock stands, dragged, moved in time, removed, and gone through by in-betweening."""
+
+    def __init__(self, playground: Playground) -> None:
+        self.playground, self.live = playground, playground.live
+        self.entries: list[Entry] = []
+        self.made = 0
+        gui = playground.server.gui
+        with gui.add_folder("Keyframes", expand_by_default=False):
+            self.of = gui.add_dropdown("of", people_names(self.live.model.layout.agents))
+            self.pose = gui.add_number(
+                "pose of frame", HERE, min=HERE, step=1, hint="-1: of the frame you see; else of any that is there"
+            )
+            add = gui.add_button("Add keyframe here", icon="plus")
+            self.which = gui.add_dropdown("keyframe", (NO_KEYS,))
+            self.at = gui.add_number("at frame", 0, min=0, step=4, hint="later than the last frame there is, too")
+            remove = gui.add_button("Remove this keyframe", icon="minus")
+            self.list = gui.add_markdown("")
+            self.go = gui.add_button("Generate between", icon="route")
+        add.on_click(lambda event: self._told(event.client, self._add))
+        remove.on_click(lambda event: self._told(event.client, self._remove))
+        self.which.on_update(lambda _: self._shown())
+        self.at.on_update(self._moved_in_time)
+        self.go.on_click(lambda event: self._told(event.client, self._generate))
+        self._listed()
+
+    # -- what buttons do -----------------------------------------------------------------------
+
+    def _told(self, client: Any, action: Callable[[], None]) -> None:
+        """Do it; what cannot be done is said to who pressed the button."""
+        try:
+            action()
+        except ValueError as error:
+            client.add_notification("Keyframes", str(error), color="red", auto_close_seconds=12.0)
+
+    def _add(self) -> None:
+        agent, pose = int(self.of.value.split()[1]) - 1, int(self.pose.value)
+        self.add(keyframe(self.live.scene, agent, self.playground.clock.frame, None if pose == HERE else pose))
+
+    def add(self, key: Keyframe) -> None:
+        """Put a keyframe on the stage; one of the same person and frame makes room."""
+        for entry in self.entries:
+            if (entry.key.agent, entry.key.frame) == (key.agent, key.frame):
+                self._drop(entry)
+        self.made += 1
+        server, name = self.playground.server, f"/stage/key_{self.made}"
+        scene = self.live.scene.cut(0, 1).order(key_slot(key))
+        statue = add_people(
+            server, f"{name}_pose", self.playground.body, scene, "skeleton", agent_colours((key.agent,)), opacity=0.55
+        )
+        entry = Entry(key, None, statue)
+
+        def moved(goal: Goal) -> None:
+            self._change(entry, goal=goal)
+
+        entry.handle = floor_handle(server, f"{name}_handle", key.goal, moved, scale=0.5)
+        self.entries.append(entry)
+        self._pose(entry)
+        self._listed(entry)
+
+    def _remove(self) -> None:
+        entry = self._chosen()
+        if entry is None:
+            raise ValueError("no keyframe to remove")
+        self._drop(entry)
+        self._listed()
+
+    def clear(self) -> None:
+        """Remove all."""
+        for entry in list(self.entries):
+            self._drop(entry)
+        self._listed()
+
+    def _drop(self, entry: Entry) -> None:
+        entry.handle.remove()
+        entry.statue.show(False)
+        self.entries = [each for each in self.entries if each is not entry]
+
+    def _moved_in_time(self, event: Any) -> None:
+        entry = self._chosen()
+        if event.client_id is None or entry is None:  # by the panel itself
+            return
+        frame = max(int(self.at.value), 0) // 4 * 4
+        taken = any(e is not entry and (e.key.agent, e.key.frame) == (entry.key.agent, frame) for e in self.entries)
+        if frame != entry.key.frame and not taken:
+            self._change(entry, frame=frame)
+            self._listed(entry)
+
+    def _generate(self) -> None:
+        start = self.live.between_from()
+        last = max(entry.key.frame for entry in self.entries) + 4
+        with self.live.lock:
+            self.live.asked = True
+        self.go.disabled = True
+        self.playground.say(f"in-betweening makes frames {start} to {last - 1} anew ...")
+        self.playground.worker.wake()
+
+    # -- what is shown -------------------------------------------------------------------------
+
+    def _chosen(self) -> Entry | None:
+        return next((entry for entry in self.entries if entry.label == self.which.value), None)
+
+    def _change(self, entry: Entry, **changes: Any) -> None:
+        entry.key = dataclasses.replace(entry.key, **changes)
+        self._pose(entry)
+        self._tell()
+
+    def _pose(self, entry: Entry) -> None:
+        """Stand the statue where the keyframe is."""
+        first = dataclasses.replace(entry.key, agent=0, frame=0)
+        scene = self.live.scene.cut(0, 1).order(key_slot(entry.key)).held(4).cut(0, 4)
+        turns, places = bone_poses(self.playground.body, with_keyframes(scene, [first]).cut(0, 1))
+        with self.playground.server.atomic():
+            entry.statue.pose(turns[0], places[0])
+
+    def _listed(self, chosen: Entry | None = None) -> None:
+        """Bring lists up to date, and choose a keyframe in them."""
+        self.entries.sort(key=lambda entry: (entry.key.frame, entry.key.agent))
+        chosen = chosen or (self.entries[-1] if self.entries else None)
+        self.which.options = tuple(entry.label for entry in self.entries) or (NO_KEYS,)
+        self.which.value = NO_KEYS if chosen is None else chosen.label
+        self._shown()
+        self._tell()
+
+    def _shown(self) -> None:
+        entry = self._chosen()
+        self.at.value = 0 if entry is None else entry.key.frame
+
+    def _tell(self) -> None:
+        """Hand the keyframes to the engine, and say how fast people must go to reach them."""
+        with self.live.lock:
+            self.live.keys = [entry.key for entry in self.entries]
+            try:
+                start, scene = self.live.between_from(), self.live.scene
+                needed = speeds(self.live.keys, scene, start - 1)
+            except ValueError as error:
+                self.list.content = "" if not self.entries else f"**{error}**"
+                return
+        lines = []
+        for entry in self.entries:
+            speed = needed[entry.key.agent, entry.key.frame]
+            text = f"{entry.label}: {entry.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
+            lines.append(f"**{text}: too far**" if speed > HURRIED else text)
+        self.list.content = "  \n".join([*lines, f"from frame {start} on all is made anew"])
+
+
+def key_slot(key: Keyframe) -> Any:
+    """The keyframe's person alone, for `Scene.order`."""
+    import torch
+
+    return torch.tensor([key.agent])

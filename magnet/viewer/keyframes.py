@@ -1,0 +1,118 @@
+"""Where people are asked to be: goals on the floor, keyframes at a time, and scenes in which they are put there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import STRIDE
+
+FASTEST = 1.6
+"""Metres a second that steering may ask of somebody."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A place on the floor in metres and a heading in radians (0 looks along +z)."""
+
+    x: float
+    z: float
+    heading: float
+
+    @staticmethod
+    def of(T_world_can: Tensor) -> Goal:
+        """Where a canonical frame (4, 4) stands."""
+        yaw, ground = to_planar(T_world_can)
+        return Goal(float(ground[0]), float(ground[1]), float(yaw))
+
+    def frame(self) -> Tensor:
+        """T_world_can (4, 4)."""
+        return from_planar(torch.tensor(self.heading), torch.tensor([self.x, self.z]))
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A token of motion that somebody is to make at a time and a place.
+
+    Attributes:
+        agent: slot.
+        frame: its first frame, a multiple of 4.
+        goal: where that frame's canonical frame stands.
+        body_rot: (4, 21, 3, 3).
+        T_key_root: (4, 4, 4) pelvis poses seen from the first frame's canonical frame.
+    """
+
+    agent: int
+    frame: int
+    goal: Goal
+    body_rot: Tensor
+    T_key_root: Tensor
+
+
+def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held: bool = False) -> Keyframe:
+    """What somebody does in a scene (B = 1) as a keyframe: of the token that `frame` is in, at its place there.
+
+    Args:
+        pose: the frame that the motion is taken from, brought to the place of `frame`; None: `frame` itself.
+        held: one pose for all of the token instead of four frames of motion.
+
+    Raises:
+        ValueError: no such agent or frame.
+    """
+    last = scene.frames - 1
+    frame, pose = frame // STRIDE * STRIDE, frame // STRIDE * STRIDE if pose is None else pose
+    if not 0 <= agent < scene.agents:
+        raise ValueError(f"person {agent + 1} is not there: the scene has {scene.agents}")
+    if frame < 0 or not 0 <= pose <= last:
+        raise ValueError(f"keyframe at frame {frame} with the pose of frame {pose}: the scene has frames 0 to {last}")
+    own = scene.T_world_root[0, :, agent : agent + 1].cpu()
+    T_world_can = canonical_frame(own)[:, 0]
+    frames = torch.full((STRIDE,), pose) if held else torch.arange(pose, pose + STRIDE).clamp(max=last)
+    return Keyframe(
+        agent,
+        frame,
+        Goal.of(T_world_can[min(frame, last)]),
+        scene.body_rot[0, frames, agent].cpu(),
+        inverse(T_world_can[pose]) @ own[frames, 0],
+    )
+
+
+def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
+    """A scene (B = 1) in which people are as their keyframes say, marked as given there."""
+    roots, body_rot = scene.T_world_root.clone(), scene.body_rot.clone()
+    given = torch.zeros(roots.shape[:3], dtype=torch.bool) if scene.given is None else scene.given.clone()
+    for key in keys:
+        frames = slice(key.frame, key.frame + STRIDE)
+        roots[0, frames, key.agent] = key.goal.frame() @ key.T_key_root
+        body_rot[0, frames, key.agent] = key.body_rot
+        given[0, frames, key.agent] = True
+    return scene.replace(T_world_root=roots, body_rot=body_rot, given=given)
+
+
+def reached(T_world_can: Tensor, goal: Goal, seconds: float) -> Goal:
+    """The goal, or where on the way to it somebody gets in that time. T_world_can (4, 4)"""
+    here = Goal.of(T_world_can)
+    length = math.hypot(goal.x - here.x, goal.z - here.z)
+    share = min(1.0, FASTEST * seconds / length) if length > 0 else 1.0
+    return Goal(here.x + share * (goal.x - here.x), here.z + share * (goal.z - here.z), goal.heading)
+
+
+def speeds(keys: Iterable[Keyframe], scene: Scene, start: int) -> dict[tuple[int, int], float]:
+    """Metres a second at which each keyframe is reached from its agent's one before, the first from frame `start`.
+
+    -> by (agent, frame)
+    """
+    at = {a: (start, scene.T_world_root[0, start, a, [0, 2], 3].tolist()) for a in range(scene.agents)}
+    found = {}
+    for key in sorted(keys, key=lambda key: key.frame):
+        before, (x, z) = at[key.agent]
+        seconds = max(key.frame - before, 1) / scene.fps
+        found[key.agent, key.frame] = math.hypot(key.goal.x - x, key.goal.z - z) / seconds
+        at[key.agent] = (key.frame, [key.goal.x, key.goal.z])
+    return found

@@ -1,0 +1,51 @@
+"""Takes as files, for the viewer's downloads."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from pathlib import Path
+
+import torch
+
+from magnet.body.base import Body
+from magnet.motion.scene import Scene
+from magnet.viewer.takes import Take
+
+FORMATS = ("npz", "html", "glb", "bvh", "csv", "gif", "mp4", "png")
+"""What a take can be saved as; see `magnet.export.formats.WRITTEN`."""
+
+
+def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
+    """A take as a file: its suffix without the dot and its content. Several files, as one BVH a person, come as a zip.
+
+    Raises:
+        ImportError: the format needs an optional package; says which.
+    """
+    from magnet.export import formats  # late: it brings every format's code
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene.{kind}"
+        known = torch.from_numpy(take.known)
+        context = int(take.known.all(axis=1).cumprod().sum())
+        if kind == "html":
+            from magnet.viewer.html import save_html
+
+            written = [save_html(take.scene, path, body, known=known, truth=truth, title=take.label)]
+        elif kind in ("gif", "mp4"):
+            from magnet.export.video import render_video
+
+            look = {"fps": 15.0, "size": (480, 360)} if kind == "gif" else {"fps": take.scene.fps}
+            written = [
+                render_video(take.scene, path, context_frames=context, known=known, body=body, ghosts=truth, **look)
+            ]
+        else:
+            written = formats.write(take.scene, path, body, known=known, context_frames=context)
+        if len(written) == 1:
+            return kind, written[0].read_bytes()
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for each in written:
+                archive.write(each, each.name)
+        return "zip", packed.getvalue()

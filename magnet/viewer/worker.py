@@ -1,0 +1,71 @@
+"""A thread that keeps a live scene a little ahead of who watches it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from magnet.viewer.live import Live, Piece
+
+
+class Worker:
+    """Runs `Live.advance` in a thread, never more than `ahead` frames in front of what is watched.
+
+    What has been asked for (`Live.asked`) is done at once, also while `paused`.
+
+    Args:
+        live: the engine.
+        ahead: fewer answer sooner to steering, more outlast a slow moment.
+        failed: told a message when the task refuses; the worker then waits for `wake`.
+        done: told each piece.
+    """
+
+    def __init__(
+        self,
+        live: Live,
+        ahead: int = 32,
+        failed: Callable[[str], None] | None = None,
+        done: Callable[[Piece], None] | None = None,
+    ) -> None:
+        self.live, self.ahead, self.failed, self.done = live, ahead, failed, done
+        self.watched = 0
+        self.paused = False
+        self._wake, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="magnet-live", daemon=True)
+
+    def start(self) -> Worker:
+        self._thread.start()
+        return self
+
+    def watch(self, frame: int) -> None:
+        """Say which frame is shown now."""
+        self.watched = frame
+        self._wake.set()
+
+    def wake(self) -> None:
+        """Try again after settings have changed."""
+        self._wake.set()
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            waits = self.paused or self.live.scene.frames - self.watched > self.ahead
+            if waits and not self.live.asked:
+                self._wake.wait(timeout=0.5)
+                self._wake.clear()
+                continue
+            try:
+                piece = self.live.advance()
+                if self.done is not None:
+                    self.done(piece)
+            except Exception as error:  # whatever a task or its options raise: the page says so, and goes on
+                if self.failed is not None:
+                    self.failed(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
+                self._wake.clear()
+                self._wake.wait(timeout=2.0)

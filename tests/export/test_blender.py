@@ -1,0 +1,92 @@
+"""Blender's own importers put joints and skin where the body has them; see `make test-blender`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import Body
+from magnet.body.base import JOINT_NAMES
+from magnet.export import save_bvh, save_glb
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+pytestmark = pytest.mark.slow
+
+FRAMES = (0, 1, 17, 59)
+MILLIMETRE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def blender() -> str:
+    """A Python that has Blender as its module `bpy`: this one, or the one that MAGNET_BLENDER names.
+
+    bpy asks for one Python version and an older NumPy than ours, so it mostly lives in an environment of its own.
+    """
+    python = os.environ.get("MAGNET_BLENDER")
+    if python is None:
+        if importlib.util.find_spec("bpy") is None:
+            pytest.skip("needs Blender's bpy: make test-blender, or MAGNET_BLENDER=PYTHON_WITH_BPY")
+        python = sys.executable
+    return python
+
+
+@pytest.fixture(scope="module")
+def duo() -> Scene:
+    """Two people of different shapes who wander for two seconds."""
+    return random_scene(1, 60, 2, torch.Generator().manual_seed(11))
+
+
+def seen(blender: str, path: Path, *fbx: Path) -> dict[str, Any]:
+    """What Blender makes of a file."""
+    out = path.with_suffix(f"{path.suffix}.json")
+    script = Path(__file__).with_name("in_blender.py")
+    words = [blender, str(script), str(path), str(out), ",".join(map(str, FRAMES)), *map(str, fbx)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert out.exists(), done.stdout[-2000:] + done.stderr[-2000:]
+    found: dict[str, Any] = json.loads(out.read_text())
+    return found
+
+
+def joints(found: dict[str, Any]) -> np.ndarray:
+    """(frames, P, 22, 3)"""
+    return np.array([[[person[name] for name in JOINT_NAMES] for person in moment] for moment in found["joints"]])
+
+
+def report(what: str, found: dict[str, Any], away: float) -> None:
+    print(f"Blender {found['version']}, {what}: {1e3 * away:.5f} mm")
+
+
+def test_a_glb_and_the_fbx_that_blender_makes_of_it_hold_the_bodys_joints_and_skin(blender, duo, body: Body, tmp_path):
+    path = save_glb(duo, tmp_path / "duo.glb", body)
+    fbx = path.with_suffix(".fbx")
+    found = seen(blender, path, fbx)
+    assert found["people"] == ["person_0", "person_1"] and found["last"] == duo.frames - 1
+    truth = body.joints(duo)[0, list(FRAMES)].numpy()
+    skin = body.vertices(duo)[0, list(FRAMES)].numpy()
+    away, off = np.abs(joints(found) - truth).max(), np.abs(np.array(found["vertices"]) - skin).max()
+    report("GLB joints", found, away)
+    report("GLB vertices", found, off)
+    assert away < 0.01 * MILLIMETRE and off < 0.05 * MILLIMETRE
+    again = seen(blender, fbx)
+    away = np.abs(joints(again) - truth).max()
+    report("FBX joints", again, away)
+    assert away < 0.05 * MILLIMETRE
+
+
+def test_a_bvh_holds_the_bodys_joints(blender, duo: Scene, body: Body, tmp_path: Path):
+    truth = body.joints(duo)[0, list(FRAMES)].numpy()
+    for person, path in enumerate(save_bvh(duo, tmp_path / "duo.bvh", body)):
+        found = seen(blender, path)
+        away = np.abs(joints(found)[:, 0] - truth[:, person]).max()
+        report(f"BVH {person} joints", found, away)
+        assert away < 0.01 * MILLIMETRE and found["last"] == duo.frames - 1

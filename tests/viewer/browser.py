@@ -1,0 +1,180 @@
+"""What tests in a real browser share: waiting, looking, pressing."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magnet.testing import tiny_denoiser
+
+SHOTS = Path(__file__).parents[2] / "runs" / "viewer"
+
+
+def wait(done: Callable[[], Any], seconds: float = 300.0) -> Any:
+    """What `done` returns, as soon as that is true."""
+    end = time.monotonic() + seconds
+    while not (result := done()):
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.1)
+    return result
+
+
+def shot(page: Any, name: str) -> np.ndarray:
+    """A screenshot, kept. -> (H, W, 3) 0 to 255"""
+    from PIL import Image
+
+    undisturbed(page)
+    SHOTS.mkdir(parents=True, exist_ok=True)
+    raw = page.screenshot(path=SHOTS / f"{name}.png")
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)
+
+
+def blue(image: np.ndarray) -> np.ndarray:
+    """Pixels of the first person."""
+    return (image[..., 2] > image[..., 0] + 60) & (image[..., 2] > 90)
+
+
+def orange(image: np.ndarray, least: int = 70) -> np.ndarray:
+    """Pixels of the second person; with `least` 130 only where the motion was not given."""
+    return (image[..., 0] > image[..., 2] + least) & (image[..., 0] > 110)
+
+
+def undisturbed(page: Any, seconds: float = 0.0) -> None:
+    """Close the notice that there is no GPU, if it comes within so many seconds."""
+    notice = page.get_by_text("Software WebGL").locator("xpath=ancestor::*[.//button][1]").locator("button")
+    with contextlib.suppress(Exception):
+        if seconds:
+            notice.wait_for(timeout=1000 * seconds)
+        if notice.count():
+            notice.dispatch_event("click")
+            notice.wait_for(state="detached", timeout=30_000)
+
+
+def grey(image: np.ndarray) -> np.ndarray:
+    """Pixels of ghosts."""
+    return (np.ptp(image, axis=-1) < 25) & (image.mean(axis=-1) > 120) & (image.mean(axis=-1) < 205)
+
+
+def pale_orange(image: np.ndarray) -> np.ndarray:
+    """Pixels of the second person where the motion was given."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return (red > 190) & (red - blue > 22) & (red - blue < 110) & (green > blue)
+
+
+def upright(mask: np.ndarray) -> bool:
+    """Whether what is marked is taller than wide."""
+    rows, columns = np.nonzero(mask)
+    return bool(np.ptp(np.quantile(rows, [0.02, 0.98])) > 1.2 * np.ptp(np.quantile(columns, [0.02, 0.98])))
+
+
+# -- the viewer ----
+
+
+@contextlib.contextmanager
+def shown(stage: Any, page: Any) -> Iterator[Any]:
+    """A viewer that runs, and its page loaded."""
+    thread = stage.start()
+    try:
+        page.goto(f"http://127.0.0.1:{stage.port}")
+        page.get_by_role("button", name="Pause").wait_for()
+        wait(lambda: stage.server.get_clients())
+        undisturbed(page, 10.0)
+        yield page
+    finally:
+        stage.stop()
+        thread.join(timeout=10)
+
+
+def choose(page: Any, label: str, value: str) -> None:
+    """Pick from a drop-down list of the panel."""
+    field(page, label).first.click()
+    page.get_by_role("option", name=value, exact=True).click()
+
+
+def field(page: Any, label: str) -> Any:
+    """The inputs beside a label of the panel."""
+    return page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input")
+
+
+def enter(page: Any, label: str, value: object) -> None:
+    """Type a number into a field or beside a slider."""
+    number = field(page, label).last
+    number.fill(str(value))
+    number.press("Enter")
+
+
+def tick(page: Any, label: str) -> None:
+    """Click a checkbox."""
+    field(page, label).click()
+
+
+def press(page: Any, name: str) -> None:
+    """Press a button."""
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def downloaded(page: Any, kind: str, name: str, folder: Path) -> Path:
+    """Save the take as a format, from the open folder Save; the file that the browser gets."""
+    choose(page, "format", kind)
+    with page.expect_download() as download:
+        press(page, "Download")
+    assert download.value.suggested_filename == name
+    path = folder / name
+    download.value.save_as(path)
+    return path
+
+
+def drag_handle(page: Any, name: str, moved: Callable[[], bool]) -> None:
+    """Drag the green square between a handle's arrows some way over the floor, until it has `moved`."""
+
+    def dragged() -> bool:
+        image = shot(page, name)
+        red, green, blue = np.moveaxis(image, -1, 0)
+        rows, columns = np.nonzero((green > red + 60) & (green > blue + 40) & (np.arange(image.shape[1]) < 480))
+        if len(rows) <= 30:  # not drawn yet
+            page.wait_for_timeout(1000)
+            return False
+        # The square is the densest place; the ring is thin.
+        near = (np.abs(rows[:, None] - rows) < 8) & (np.abs(columns[:, None] - columns) < 8)
+        middle = near.sum(axis=1).argmax()
+        x, y = float(columns[middle]), float(rows[middle])
+        page.mouse.move(x, y)
+        page.mouse.down()
+        for step in range(1, 9):
+            page.mouse.move(x + 9 * step, y + 3 * step)
+            page.wait_for_timeout(150)
+        page.mouse.up()
+        page.wait_for_timeout(1500)
+        return moved()
+
+    wait(dragged)
+
+
+def seen(page: Any, name: str, right: Callable[[np.ndarray], Any]) -> np.ndarray:
+    """A screenshot of the stage beside the panel, taken again until it looks right: rendering without a GPU is slow."""
+
+    def stage() -> np.ndarray | None:
+        page.wait_for_timeout(2000)
+        image = shot(page, name)[:, :480]
+        return image if right(image) else None
+
+    end = time.monotonic() + 120
+    while (image := stage()) is None:
+        assert time.monotonic() < end, f"{name}.png does not look right"
+    return image
+
+
+def shipped() -> Any:
+    """The weights that come with the package, or an untrained model where there are none."""
+    from magnet.denoiser.module import Denoiser
+
+    try:
+        return Denoiser.load()
+    except ValueError:
+        return tiny_denoiser(max_agents=4, window=16)

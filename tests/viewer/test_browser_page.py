@@ -1,0 +1,77 @@
+"""The page of its own in a real headless Chromium; screenshots are kept in runs/viewer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.viewer.html import save_html
+from tests.viewer.browser import blue, orange, pale_orange, shot, upright
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+def test_the_page_plays_scrubs_and_changes_its_look_without_any_network(page, handshake, body, tmp_path) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    path = save_html(handshake, tmp_path / "a.html", body, context=32, truth=handshake.cut(0, 60), title="Two people")
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 2")
+    start = page.evaluate("player.time")
+    page.wait_for_function(f"player.time !== {start}")
+    assert page.title() == "Two people"
+    assert {url.split(":")[0] for url in asked} == {"file"}
+
+    page.evaluate("document.getElementById('truth').click()")
+    page.select_option("#from", "front")
+    page.locator("#time").fill("60")
+    assert page.evaluate("[player.frame, player.playing]") == [60, False]
+    page.wait_for_function("document.getElementById('state').textContent === 'generated'")
+    drawn = page.evaluate("player.drawn")
+    page.wait_for_function(f"player.drawn > {drawn + 1}")
+    meeting = shot(page, "page_body")
+    canvas = slice(40, 380)
+    assert blue(meeting)[canvas].sum() > 600
+    assert orange(meeting)[canvas].sum() > 600
+    assert upright(orange(meeting)[canvas])
+
+    for style in ("capsules", "skeleton"):
+        page.select_option("#style", style)
+        drawn = page.evaluate("player.drawn")
+        page.wait_for_function(f"player.drawn > {drawn + 1}")
+        assert orange(shot(page, f"page_{style}"))[canvas].sum() > 150
+    page.locator("#time").fill("3")
+    page.wait_for_function("document.getElementById('state').textContent === 'given'")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("player.frame") == 4
+    page.click("#play")
+    page.wait_for_function("player.frame > 4")
+
+
+def test_the_page_draws_what_the_body_says(page, handshake, body, tmp_path) -> None:
+    path = save_html(handshake, tmp_path / "a.html", body)
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 0")
+    places = page.evaluate("(player.motion.pose(1, 40), Array.from(player.motion.places))")
+    truth = body.joints(handshake)[0, 40, 1].numpy()
+    np.testing.assert_allclose(np.reshape(places, (22, 3)), truth, atol=1e-3)
+
+
+def test_the_page_marks_a_given_partner_and_keyframes(page, handshake, body, tmp_path) -> None:
+    given = torch.zeros(1, handshake.frames, 2, dtype=torch.bool)
+    given[:, :, 1] = True
+    given[:, 40:44, 0] = True
+    path = save_html(handshake.replace(given=given), tmp_path / "a.html", body, title="An answer")
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 2")
+    for frame, said in ((30, "given: person 2"), (41, "given")):
+        page.locator("#time").fill(str(frame))
+        page.wait_for_function(f"document.getElementById('state').textContent === '{said}'")
+    assert page.evaluate("document.getElementById('time').style.height") == "8px"
+    page.locator("#time").fill("30")
+    drawn = page.evaluate("player.drawn")
+    page.wait_for_function(f"player.drawn > {drawn + 1}")
+    image = shot(page, "page_given_partner")[40:380]
+    assert blue(image).sum() > 300 and pale_orange(image).sum() > 300
+    assert orange(image, least=130).sum() < pale_orange(image).sum() / 10
