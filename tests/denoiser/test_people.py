@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from magnet.denoiser.canvas import Canvas, Health
-from magnet.denoiser.generation import SamplerOptions, known_tokens, occupied, scrub
+from magnet.denoiser.generation import SamplerOptions, known_tokens, occupied, planning_grid, scrub
 from magnet.denoiser.seams import joined
 from magnet.motion.scene import Scene
+from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample
-from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.inbetweening import Inbetweening
@@ -44,7 +44,7 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     scene, task, health = people([[True, True]]), registry.get(name)(), Health()
     context = 0 if name == "generation" else 8
     made = run(model, scene, task, context, health)
-    schedule = task.schedule(Grid(10, 2, context // 4, 2, 8, 2))
+    schedule = task.schedule(planning_grid(10, 2, context // 4, 8, FAST))
     assert health.calls == schedule.evaluations
     views = {len(stage.hidden.unique(dim=0)) if stage.hidden is not None else 1 for stage in schedule.stages}
     assert health.evaluations <= schedule.evaluations * max(views)
@@ -55,8 +55,8 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     given = scrub(scene.pad_agents(4), padded.known)
     canvas = Canvas(model, given, padded, FAST, 1)
     start = known_tokens(model, given, padded.known)
-    generator = [torch.Generator().manual_seed(0)]
-    out = sample(model.denoise, padded, start, given.present, model.layout, generator, canvas.settle)
+    noise = NoiseStream((1, 4, model.layout.width), [torch.Generator().manual_seed(0)], eta=FAST.eta)
+    out = sample(model.denoise, padded, start, given.present, model.layout, settle=canvas.settle, noise=noise)
     with torch.no_grad():
         assert close(canvas.scene(out), made)
 

@@ -13,7 +13,11 @@ from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.partner import PartnerInpainting
 from magnet.testing import random_scene, tiny_denoiser
 
-FAST = {placement: SamplerOptions(steps=3, stride=2, placement=placement) for placement in ("integrate", "fuse")}
+# What an untrained model says of pairs contradicts what it says of steps: it is trusted as little as steps allow.
+FAST = {
+    placement: SamplerOptions(steps=3, stride=2, placement=placement, trust=0.003)
+    for placement in ("integrate", "fuse")
+}
 
 
 @pytest.fixture(params=FAST)

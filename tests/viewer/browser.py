@@ -93,8 +93,17 @@ def shown(stage: Any, page: Any) -> Iterator[Any]:
 
 def choose(page: Any, label: str, value: str) -> None:
     """Pick from a drop-down list of the panel."""
-    field(page, label).first.click()
-    page.get_by_role("option", name=value, exact=True).click()
+    option = page.get_by_role("option", name=value, exact=True)
+
+    def picked() -> bool:
+        """A list may close again while the panel is still being laid out."""
+        field(page, label).first.click()
+        with contextlib.suppress(Exception):
+            option.click(timeout=10_000)
+            return True
+        return False
+
+    wait(picked)
 
 
 def field(page: Any, label: str) -> Any:
