@@ -351,6 +351,6 @@ class MagnetCLI(LightningCLI):
         words = [str(first[0]), "--context", str(self.datamodule.context_frames)]
         print(f"watch it: magnet view {' '.join(words)}")
         if self._option("view"):
-            from magnet.cli_view import main as view
+            from magnet.cli_view import show_at_the_end
 
-            view(words)
+            show_at_the_end(words)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import roma
 import torch
 from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar, turn
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, joined
 
 
 def smoothstep(ramp: Tensor) -> Tensor:
@@ -125,13 +123,3 @@ def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
         return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).cut(1)
     last, agents = last_known(there), torch.arange(there.shape[1], device=there.device)
     return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
-
-
-def joined(pieces: Sequence[Scene]) -> Scene:
-    """Consecutive pieces of the same scenes as one."""
-    if len(pieces) == 1:
-        return pieces[0]
-    return pieces[0].replace(
-        body_rot=torch.cat([piece.body_rot for piece in pieces], dim=1),
-        T_world_root=torch.cat([piece.T_world_root for piece in pieces], dim=1),
-    )

@@ -21,8 +21,7 @@ from magnet.denoiser.generation import (
     scrub,
     task_sight,
 )
-from magnet.denoiser.seams import joined
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, joined
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import begin, run_stages
@@ -134,7 +133,7 @@ class Stream:
         if scene.agents > layout.agents:
             raise ValueError(f"the scene has {scene.agents} agents, the model was built for {layout.agents}")
         self.model, self.options, self.piece = model, options or SamplerOptions(), piece
-        self.scene = scene.to(model.device).pad_agents(layout.agents)
+        self.scene = scene.replace(given=None).to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.health = samples, progress, health or Health()
         self.frames = None if frames is None else context + frames
         if self.frames is not None and scene.frames >= self.frames:
@@ -226,7 +225,8 @@ class Stream:
             self.canvas.release(surplus)
             self.tokens, self.veil = self.tokens[:, surplus:].clone(), self.veil[:, surplus:].clone()
             self.first += surplus
-        return made
+        given = self._known(start, stop).repeat_interleave(STRIDE, dim=0).to(made.device)
+        return made.replace(given=given[None] & made.present[:, None])
 
     def _bring_in(self, stop: int) -> None:
         """Bring in rows, whole pieces at a time, until those before `stop` are held."""
