@@ -12,11 +12,15 @@ from magnet.sampling.noise import LEVELS, shifted
 NoiseLevels = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
-MIXTURE = (0.35, 0.15, 0.05, 0.45)
+MIXTURE = (0.25, 0.1, 0.05, 0.6)
 """Shares of the four kinds in `mixture`."""
 
-FROM_NOTHING = 0.2
-"""Share of roll-outs without any past: chance alone would start one in N there, and every generation does."""
+FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.5
+"""Share of roll-outs without any past: chance alone would start one in N there, and every generation does. More of
+those with mixed roles: with a past, where a partner is need not be told from the other's motion, as inpainting must."""
+
+ROLES = (0.45, 0.15, 0.3, 0.1)
+"""Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
 
 def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
@@ -57,7 +61,7 @@ def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Gene
 def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Clean past, one block at a shared level, unknown future; agents may be given or hidden. -> (B, N, P) int
 
-    In half of the scenes every agent is generated. In the others each agent is, by chance, generated,
+    In half of the scenes every agent is generated. In the others each agent is, by chance (`ROLES`), generated,
     given as far as the block reaches, given to the end, or hidden from the block on: partner
     prediction, motion control and inpainting.
     """
@@ -70,15 +74,17 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: fl
 
     zero = torch.zeros(B, 1, 1, dtype=torch.long, device=device)
     past = integers(zero, zero + N - 1)
-    past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < FROM_NOTHING, 0, past)
+    mixed = torch.rand(B, 1, 1, generator=generator, device=device) < 0.5
+    nothing = torch.where(mixed, FROM_NOTHING_MIXED, FROM_NOTHING)
+    past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < nothing, 0, past)
     stop = integers(past + 1, zero + N)
     level = shifted(integers(zero + 1, zero + LEVELS), shift)
     time = torch.arange(N, device=device)[None, :, None]
     generated = torch.where(time < past, 0, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, 0, LEVELS).expand(B, N, P)
-    role = torch.randint(4, (B, 1, P), generator=generator, device=device)
-    mixed = torch.rand(B, 1, 1, generator=generator, device=device) < 0.5
+    shares = torch.tensor(ROLES, device=device)
+    role = torch.multinomial(shares, B * P, replacement=True, generator=generator).view(B, 1, P)
     role = torch.where(mixed, role, 0)
     levels = torch.where(role == 1, given, generated)
     levels = torch.where(role == 2, torch.zeros_like(levels), levels)

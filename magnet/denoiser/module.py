@@ -19,6 +19,7 @@ from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
+from magnet.denoiser.own_past import with_own_past
 from magnet.denoiser.statistics import Statistics
 from magnet.denoiser.stream import PIECE, Generators, generate, stream
 from magnet.denoiser.transformer import Rope, Transformer
@@ -59,6 +60,7 @@ class Denoiser(L.LightningModule):
         noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
             `mixture` (ours: these and the patterns that sampling asks about).
         level_shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
+        own_past: share of the scenes with a past whose past is shown as the model would have made it (ours).
         latent_weight: lambda_0 of paper Eq. 10.
         step_weight: lambda_1 of paper Eq. 10.
         relation_weight: lambda_2 of paper Eq. 10.
@@ -96,6 +98,7 @@ class Denoiser(L.LightningModule):
         relation_noise: Literal["noisier_end", "token"] = "noisier_end",
         noise_levels: NoiseLevels = "per_token",
         level_shift: float = 1.0,
+        own_past: float = 0.0,
         latent_weight: float = 1.0,
         step_weight: float = 1.0,
         relation_weight: float = 1.0,
@@ -330,7 +333,10 @@ class Denoiser(L.LightningModule):
             B, N, P, _ = truth.shape
             levels = draw_levels(h.noise_levels, B, N, P, generator, h.level_shift)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
-            noisy = add_noise(truth, noise, self.layout.spread(self.layout.group_levels(levels)))
+            shown = truth
+            if self.training and h.own_past:
+                shown = with_own_past(self, truth, levels, scene.pad_agents(P), h.own_past, generator)
+            noisy = add_noise(shown, noise, self.layout.spread(self.layout.group_levels(levels)))
         clean = self.denoise(noisy, levels, scene.pad_agents(P).present).float()
         losses = token_losses(clean, truth, self.layout, there)
         total = h.latent_weight * losses["latent"] + h.step_weight * losses["step"]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import FROM_NOTHING, draw_levels, rollout_levels
+from magnet.denoiser.levels import FROM_NOTHING, FROM_NOTHING_MIXED, ROLES, draw_levels, rollout_levels
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -34,9 +34,17 @@ def test_a_roll_out_is_a_clean_past_a_block_and_an_unknown_future(generator):
 
 def test_more_roll_outs_begin_from_nothing_than_chance_gives(generator):
     levels = rollout_levels(4000, 16, 1, generator)
-    nothing = FROM_NOTHING + (1 - FROM_NOTHING) / 16
-    given = 0.25  # half of those in scenes of mixed roles
-    assert (levels[:, 0] > 0).double().mean() == pytest.approx((1 - given) * nothing, abs=0.02)
+    alone, mixed = (share + (1 - share) / 16 for share in (FROM_NOTHING, FROM_NOTHING_MIXED))
+    given = ROLES[1] + ROLES[2]
+    expected = 0.5 * alone + 0.5 * (1 - given) * mixed
+    assert (levels[:, 0] > 0).double().mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_a_partner_from_nothing_is_trained_as_often_as_inpainting_needs(generator):
+    """One in twelve roll-outs of two people gives one of them wholly and nothing of the other."""
+    levels = rollout_levels(8000, 16, 2, generator)
+    given, lacking = (levels == 0).all(dim=1), (levels > 0).all(dim=1)
+    assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 13
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,73 @@
+"""The past as the model would have made it."""
+
+import pytest
+import torch
+
+from magnet.denoiser.own_past import with_own_past
+from magnet.motion.frames import from_9d, propagated
+from magnet.motion.tokens import by_frame, relations_by_frame
+from magnet.testing import random_scene, tiny_denoiser
+
+PAST = 4
+N = 8
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_denoiser(max_agents=3, window=N)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return random_scene(4, 4 * N, 3, torch.Generator().manual_seed(0))
+
+
+def shown(model, scene, levels, share=1.0, seed=1):
+    truth = model.statistics.normalise(model.tokenize(scene)[0])
+    generator = torch.Generator().manual_seed(seed)
+    return truth, with_own_past(model, truth, levels, scene, share, generator)
+
+
+def rolled_out() -> torch.Tensor:
+    """Agents 0 and 1 have a past and are generated, agent 2 is given to the end."""
+    levels = torch.full((4, N, 3), 700)
+    levels[:, :PAST] = 0
+    levels[:, :, 2] = 0
+    return levels
+
+
+def test_only_the_past_of_those_who_are_generated_is_made_anew(model, scene):
+    truth, made = shown(model, scene, rolled_out())
+    own = slice(0, model.layout.latent + 36)
+    assert torch.equal(made[:, PAST:], truth[:, PAST:])
+    assert torch.equal(made[:, :, 2, own], truth[:, :, 2, own])
+    assert (made[:, :PAST, :2, : model.layout.latent] != truth[:, :PAST, :2, : model.layout.latent]).any()
+
+
+def test_steps_and_pairwise_transforms_of_a_made_past_agree(model, scene):
+    """As those of finished tokens do: each frame's relation follows from the frame before and the steps (Eq. 11)."""
+    _, made = shown(model, scene, rolled_out())
+    _, steps, relations = model.layout.unpack(model.statistics.restore(made[:, :PAST]))
+    T_self_partner, T_prev_can = from_9d(relations_by_frame(relations)), from_9d(by_frame(steps))
+    torch.testing.assert_close(propagated(T_self_partner, T_prev_can), T_self_partner[:, 1:], atol=1e-4, rtol=0)
+
+
+def test_latents_of_a_made_past_are_codes(model, scene):
+    _, made = shown(model, scene, rolled_out())
+    latent = model.layout.unpack(model.statistics.restore(made))[0][:, :PAST, :2]
+    torch.testing.assert_close(model.tokenizer.requantise(latent), latent, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("level", [0, 700])
+def test_scenes_without_a_past_stay_as_they_are(model, scene, level):
+    truth, made = shown(model, scene, torch.full((4, N, 3), level))
+    assert torch.equal(made, truth)
+
+
+def test_the_share_counts_scenes_and_the_seed_decides_which(model, scene):
+    many, levels = scene.repeat(25), rolled_out().repeat(25, 1, 1)
+    truth, made = shown(model, many, levels, share=0.3)
+    changed = (made != truth).flatten(1).any(dim=1)
+    assert 0.15 < changed.double().mean() < 0.45
+    assert torch.equal(made, shown(model, many, levels, share=0.3)[1])
+    assert torch.equal(shown(model, many, levels, share=0.0)[1], truth)
