@@ -19,7 +19,6 @@ from magnet.denoiser.module import Denoiser
 from magnet.export import formats
 from magnet.motion.scene import FPS, Scene, absent, require_rate
 from magnet.motion.tokens import STRIDE
-from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 
 if TYPE_CHECKING:
@@ -265,18 +264,8 @@ class Model:
         generator.manual_seed(seed) if seed is not None else generator.seed()
         plain = scene.plain() if isinstance(scene, Motion) else scene
         sampled = self.denoiser.generate(plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
-        grid = Grid(
-            -(-(context + frames) // STRIDE),
-            self.most_people,
-            context // STRIDE,
-            self.sampler.steps,
-            self.denoiser.window,
-            self.sampler.stride,
-        )
-        known = chosen.schedule(grid).known.repeat_interleave(STRIDE, dim=0)[: context + frames, :slots]
-        sampled = sampled.order(torch.arange(slots))
-        given = known[None] & sampled.present[:, None]
-        return Motion.of(sampled.replace(given=given), scene.model if isinstance(scene, Motion) else None)
+        shown = sampled.order(torch.arange(slots))
+        return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
 
     def _with_room(self, scene: Scene, slots: int) -> Scene:
         if slots > self.most_people:

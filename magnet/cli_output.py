@@ -11,12 +11,10 @@ from typing import Any
 from lightning.pytorch import Trainer
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from magnet import cli_record
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
 from magnet.report import machine, print_table
 
 PANELS = 4
@@ -83,9 +81,8 @@ def write_scenes(
             name = f"{rank}{number:04d}{_safe(scene)}"
             scene.save(folder / "scenes" / f"{name}.npz")
             if picture != "none" and number < pictures and model.global_rank == 0:
-                known = _known(evaluation, model, data, scene)
                 shown = [(f"sample {i + 1}", scene.pick([i])) for i in range(min(PANELS, scene.scenes))]
-                look = {"context_frames": data.context_frames, "known": known, "body": data.body.to("cpu")}
+                look = {"context_frames": data.context_frames, "body": data.body.to("cpu")}
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
@@ -98,9 +95,3 @@ def write_scenes(
 def _safe(scene: Scene) -> str:
     name = re.sub(r"[^A-Za-z0-9]+", "_", scene.names[0] if scene.names else "").strip("_")
     return f"_{name}" if name else ""
-
-
-def _known(evaluation: Evaluation, model: Any, data: Any, scene: Scene) -> Tensor:
-    """Which frames of whom the task gives. (T, P) bool"""
-    schedule = evaluation.schedule(model, data.context_frames, scene.frames - data.context_frames)
-    return schedule.known.repeat_interleave(STRIDE, dim=0)[: scene.frames, : scene.agents]

@@ -4,7 +4,6 @@ from nothing, a partner filled in, agents that take turns, and a minute of motio
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,6 @@ from typing import Any
 import lightning as L
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from magnet import cli_output, cli_record, weights
 from magnet.body import Body
@@ -26,9 +24,7 @@ from magnet.evaluation import Evaluation, aligned
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.schedule import Grid
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.base import Task
 from magnet.tasks.joint import Generation, JointFuture
@@ -159,12 +155,11 @@ def perform(
     began = time.perf_counter()
     sampled = model.generate(truth, show.task, show.context, frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
-    known = given(show, model, sampled)
     sampled.save(out / f"{show.name}.npz")
     rows = {show.words: sampled}
-    if known.any() and sampled.frames <= truth.frames:
-        rows = {"recorded": truth.cut(0, sampled.frames), show.words: sampled}
-    written = picture(show, rows, known, data.body.to("cpu"), out)
+    if sampled.given is not None and sampled.given.any() and sampled.frames <= truth.frames:
+        rows = {"recorded": truth.cut(0, sampled.frames).replace(given=sampled.given)} | rows
+    written = picture(show, rows, data.body.to("cpu"), out)
     pace = sampled.frames / seconds
     return [
         f"{show.words}: {sampled.frames} frames in {seconds:.1f} s, {pace:.0f} frames a second",
@@ -172,20 +167,11 @@ def perform(
     ]
 
 
-def given(show: Show, model: Denoiser, sampled: Scene) -> Tensor:
-    """What of a scene the task gave. -> (T, P) bool"""
-    tokens = math.ceil(sampled.frames / STRIDE)
-    schedule = show.task.schedule(Grid(tokens, model.layout.agents, show.context // STRIDE, window=model.window))
-    return schedule.known.repeat_interleave(STRIDE, dim=0)[: sampled.frames]
-
-
-def picture(show: Show, rows: dict[str, Scene], known: Tensor, body: Body, out: Path) -> list[Path]:
+def picture(show: Show, rows: dict[str, Scene], body: Body, out: Path) -> list[Path]:
     """A strip of the whole scene, and a moving picture of it, or of its end if it is long."""
     frames = next(iter(rows.values())).frames
     moments = [round(i * (frames - 1) / (COLUMNS - 1)) for i in range(COLUMNS)]
-    sheet = contact_sheet(
-        rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, known=known, body=body
-    )
+    sheet = contact_sheet(rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, body=body)
     first = max(0, frames - round(30 * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
     end = {words: scene.cut(first) for words, scene in rows.items()}
     paint: Callable[..., Path] = render_video
@@ -195,7 +181,6 @@ def picture(show: Show, rows: dict[str, Scene], known: Tensor, body: Body, out: 
         size=(320, 240),
         fps=10,
         context_frames=max(0, show.context - first),
-        known=known[first:],
         body=body,
         progress=True,
     )

@@ -142,8 +142,7 @@ def record(
     slots = torch.arange(scene.agents)
     longest = max(window.frames for window in stream.windows)
     windows = [window.order(slots).held(longest).cut(longest, 2 * longest) for window in stream.windows]
-    known = stream.known.repeat_interleave(STRIDE, dim=0)[: done.frames].cpu()
-    finished = done.replace(given=known[None] & done.present[:, None]).order(slots)
+    finished = done.order(slots)
     estimates = finished.repeat(len(windows)).replace(
         body_rot=torch.cat([window.body_rot for window in windows]),
         T_world_root=torch.cat([window.T_world_root for window in windows]),
