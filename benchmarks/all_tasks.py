@@ -68,8 +68,8 @@ def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
         "joint_future, HG w = 0.2": guided(kind="history", weight=0.2),
         "joint_future, smoothing 0.01": guided(smooth=0.01),
         "joint_future, context level 30": guided(context_level=30),
-        "joint_future, rolling 4": replace(options, rolling=4),
-        "joint_future, sampled as in the paper": replace(options, eta=0.0, shift=1.0, placement="integrate"),
+        "joint_future, in strides": replace(options, rolling=0),
+        "joint_future, sampled as in the paper": replace(options, rolling=0, eta=0.0, shift=1.0, placement="integrate"),
     }
     return {name: (task, options) for name, task in plain.items()} | {
         name: (JointFuture(), changed) for name, changed in guidance.items()

@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1800)
     parser.add_argument("--scenes", type=int, default=6, help="starts, evenly spaced over the test takes")
     parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--rolling", type=int, default=0)
+    parser.add_argument("--rolling", type=int, default=None, help="0: in strides; default: as tasks do by themselves")
     parser.add_argument("--guidance", type=float, default=0.0, help="weight of history guidance")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
     given = parser.parse_args()

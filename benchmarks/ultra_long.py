@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[1800, 20_000], help="lengths to measure")
     parser.add_argument("--task", default="joint_future", help="name of a task, as `magnet tasks` lists them")
     parser.add_argument("--steps", type=int, help="denoising steps; the toy's default is 2, a model's 30")
-    parser.add_argument("--rolling", type=int, default=0, help="denoising steps between a token and the next")
+    parser.add_argument("--rolling", type=int, default=None, help="denoising steps between a token and the next")
     parser.add_argument("--coupling", default="circle", help="what the synthetic people in the context do")
     parser.add_argument("--people", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)

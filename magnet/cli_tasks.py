@@ -137,7 +137,8 @@ class Shown:
         steps: denoising steps of a token; the sampler's default is 30.
         window: token steps that the model sees at once.
         stride: token steps finished before the window moves on.
-        rolling: denoising steps between a token and the next; 0: the tokens of a stride go together.
+        rolling: denoising steps between a token and the next; 0: the tokens of a stride go together. By default
+            tasks that can roll do, as in sampling.
         moments: rows of the picture at most; denoising steps between them are left out.
     """
 
@@ -148,7 +149,7 @@ class Shown:
     steps: int = 6
     window: int = 16
     stride: int = 4
-    rolling: int = 0
+    rolling: int | None = None
     moments: int = 16
 
 

@@ -39,9 +39,6 @@ COLUMNS = 9
 LIVELY = Guidance("history", 0.3)
 """For the shows: without it the model that comes along moves people less than was recorded (docs/results.md)."""
 
-ROLLING: dict[str, Any] = {"rolling": 4}
-"""The better way to sample where everybody sees everybody: it costs the same and comes nearer (docs/results.md)."""
-
 CALM: dict[str, Any] = {"guidance": Guidance()}
 """For groups of three, which the model knows from synthetic scenes alone: livelier, it lifts people off the floor."""
 
@@ -80,11 +77,11 @@ SHOWS = (
         ("circle", 3),
         sampler=CALM,
     ),
-    Show("duet", "two people from nothing", Generation(), ("handshake", 2), context=0, sampler=ROLLING),
-    Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0, sampler=ROLLING),
+    Show("duet", "two people from nothing", Generation(), ("handshake", 2), context=0),
+    Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
     Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
     Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
-    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, sampler=ROLLING),
+    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG),
 )
 
 
@@ -107,7 +104,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         test_clips=options.scenes, test_limit=options.scenes, train_clips=60, test_batch_size=options.scenes
     )
     sampler = SamplerOptions(steps=options.steps)
-    evaluation = measure(model, data, replace(sampler, **ROLLING), options.samples)
+    evaluation = measure(model, data, sampler, options.samples)
     facts = {"checkpoint": options.ckpt_path or "shipped"}
     cli_output.show_results(evaluation, out, facts)
     for show in SHOWS:

@@ -91,6 +91,7 @@ TASK_GRIDS = (
     Grid(12, 2, 0, steps=3, window=8, stride=2),
     Grid(9, 3, 0, steps=1),
     Grid(20, 2, 4, steps=6, window=8, rolling=2),
+    Grid(20, 2, 4, steps=6, window=8, rolling=None),
 )
 """Long and short scenes of one to four agents, with a past and without, in strides and rolling."""
 

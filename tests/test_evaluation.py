@@ -137,13 +137,13 @@ def test_no_two_samples_share_their_noise():
 
 
 def test_prediction_counts_what_it_costs():
-    """Two denoising steps for each of the windows of a scene, whose first is filled and then moves by two of five."""
+    """Two denoising steps for the first token after the past, and one for each token that follows on the slope."""
     scenes, evaluation = predicted(data())
     health = evaluation.health
     tokens = scenes.frames // 4
-    windows = 1 + -(-(tokens - 8) // FAST.stride)
+    past = evaluation.context // 4
     assert (evaluation.scenes, scenes.scenes, health.runs) == (9, 27, 3)
-    assert health.means()["calls"] == health.evaluations == FAST.steps * windows
+    assert health.means()["calls"] == health.evaluations == FAST.steps + tokens - past - 1
     assert evaluation.facts(prepared()[0])["health"]["evaluations"] == health.evaluations
 
 

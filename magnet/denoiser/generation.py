@@ -29,7 +29,9 @@ class SamplerOptions:
         steps: denoising steps S, paper A.3.
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
         rolling: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
-            8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper.
+            8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
+            that can roll do, with half of the window half denoised; those whose agents take turns or that look
+            ahead to keyframes go in strides.
         placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         trust: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
@@ -46,7 +48,7 @@ class SamplerOptions:
 
     steps: int = 30
     stride: int = 4
-    rolling: int = 0
+    rolling: int | None = None
     placement: Placement = "fuse"
     trust: float = 0.02
     requantise: bool = True

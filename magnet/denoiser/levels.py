@@ -12,14 +12,17 @@ from magnet.sampling.noise import LEVELS, shifted
 NoiseLevels = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
-MIXTURE = (0.25, 0.1, 0.05, 0.6)
+MIXTURE = (0.2, 0.1, 0.05, 0.65)
 """Shares of the four kinds in `mixture`."""
 
-FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.5
+MIXED = 0.6
+"""Share of roll-outs in which agents have roles of their own; in the others everybody is generated."""
+
+FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.6
 """Share of roll-outs without any past: chance alone would start one in N there, and every generation does. More of
 those with mixed roles: with a past, where a partner is need not be told from the other's motion, as inpainting must."""
 
-ROLES = (0.45, 0.15, 0.3, 0.1)
+ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
 
@@ -61,7 +64,7 @@ def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Gene
 def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Clean past, one block at a shared level, unknown future; agents may be given or hidden. -> (B, N, P) int
 
-    In half of the scenes every agent is generated. In the others each agent is, by chance (`ROLES`), generated,
+    In some of the scenes every agent is generated. In the others each agent is, by chance (`ROLES`), generated,
     given as far as the block reaches, given to the end, or hidden from the block on: partner
     prediction, motion control and inpainting.
     """
@@ -74,7 +77,7 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: fl
 
     zero = torch.zeros(B, 1, 1, dtype=torch.long, device=device)
     past = integers(zero, zero + N - 1)
-    mixed = torch.rand(B, 1, 1, generator=generator, device=device) < 0.5
+    mixed = torch.rand(B, 1, 1, generator=generator, device=device) < MIXED
     nothing = torch.where(mixed, FROM_NOTHING_MIXED, FROM_NOTHING)
     past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < nothing, 0, past)
     stop = integers(past + 1, zero + N)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,14 +13,12 @@ from torch import Tensor
 
 from magnet import weights
 from magnet.body import Body, load_body
+from magnet.denoiser import stream as streaming
 from magnet.denoiser.body_losses import decoded_losses
-from magnet.denoiser.canvas import Health
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
 from magnet.denoiser.own_past import with_own_past
 from magnet.denoiser.statistics import Statistics
-from magnet.denoiser.stream import PIECE, Generators, generate, stream
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
@@ -29,7 +26,6 @@ from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.optim import adamw_cosine
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
-from magnet.tasks.base import Task
 from magnet.tokenizer.module import RawPose, Tokenizer
 
 
@@ -153,7 +149,7 @@ class Denoiser(L.LightningModule):
     def built(self) -> bool:
         return hasattr(self, "transformer")
 
-    def _require_tokenizer(self) -> None:
+    def require_tokenizer(self) -> None:
         if not self.built:
             raise ValueError(
                 f"the denoiser has no tokenizer: --model.tokenizer is {self.hparams['tokenizer']!r}, which is no file. "
@@ -239,38 +235,8 @@ class Denoiser(L.LightningModule):
             there = there & whole[:, :, None, None]
         return tokens, there
 
-    def generate(
-        self,
-        scene: Scene,
-        task: Task,
-        context: int,
-        frames: int,
-        samples: int = 1,
-        options: SamplerOptions | None = None,
-        generator: Generators = None,
-        progress: Callable[[int], None] | None = None,
-        health: Health | None = None,
-    ) -> Scene:
-        """Sample a task: see `magnet.denoiser.stream.generate`."""
-        self._require_tokenizer()
-        return generate(self, scene, task, context, frames, samples, options, generator, progress, health)
-
-    def stream(
-        self,
-        scene: Scene,
-        task: Task,
-        context: int,
-        frames: int | None,
-        samples: int = 1,
-        options: SamplerOptions | None = None,
-        generator: Generators = None,
-        progress: Callable[[int], None] | None = None,
-        health: Health | None = None,
-        piece: int = PIECE,
-    ) -> Iterator[Scene]:
-        """Sample a task of any length piece by piece: see `magnet.denoiser.stream.stream`."""
-        self._require_tokenizer()
-        return stream(self, scene, task, context, frames, samples, options, generator, progress, health, piece)
+    generate = streaming.generate
+    stream = streaming.stream
 
     # -- training ------------------------------------------------------------------------------
 
@@ -360,7 +326,7 @@ class Denoiser(L.LightningModule):
         return self._body[0]
 
     def configure_optimizers(self) -> Any:
-        self._require_tokenizer()
+        self.require_tokenizer()
         h: Any = self.hparams
         return adamw_cosine(self, self.transformer.parameters(), h.learning_rate, h.weight_decay, h.warmup_steps)
 
@@ -371,7 +337,7 @@ class Denoiser(L.LightningModule):
         self.evaluation = evaluation
 
     def _evaluation(self) -> Evaluation:
-        self._require_tokenizer()
+        self.require_tokenizer()
         if self.evaluation is None:
             self.evaluation = Evaluation()
         return self.evaluation

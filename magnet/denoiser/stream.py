@@ -125,6 +125,7 @@ class Stream:
         health: Health | None,
         piece: int,
     ) -> None:
+        model.require_tokenizer()
         layout = model.layout
         if context % STRIDE:
             raise ValueError(

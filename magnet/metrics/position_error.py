@@ -19,8 +19,8 @@ def joint_error(generated: Tensor, truth: Tensor) -> Tensor:
 class PositionError(ClipMeans):
     """`mpjpe` in metres: mean over samples, frames, agents and 21 joints; not best of S.
 
-    Also `mpjpe_best`, each scene's best sample as a whole, and `mpjpe@<t>s`, the mean over frames up
-    to t seconds, measured only on clips at least that long.
+    Also `mpjpe_best`, each scene's best sample, and `mpjpe@<t>s` and `mpjpe_best@<t>s`, the same over frames up to t
+    seconds, measured only on clips at least that long.
     """
 
     higher_is_better = False
@@ -33,20 +33,18 @@ class PositionError(ClipMeans):
         agents: Tensor | None = None,
         confidence: float | None = None,
     ) -> None:
-        super().__init__(["mpjpe", "mpjpe_best", *(f"mpjpe@{s:g}s" for s in seconds)], of, agents, confidence)
+        horizons = ["", *(f"@{s:g}s" for s in seconds)]
+        names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best")]
+        super().__init__(names, of, agents, confidence)
         self.until = tuple(round(s * fps) for s in seconds)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         error = joint_error(futures.generated, futures.truth)  # (S, B, T, P)
         by_frame = torch.where(futures.scored[:, None], error, 0.0).sum(dim=-1)  # (S, B, T)
-        people = futures.scored.sum(dim=-1)
-        samples, frames = futures.samples, futures.frames
-        shares = [
-            (by_frame.sum(dim=(0, 2)), people * frames * samples),
-            (by_frame.sum(dim=2).min(dim=0).values, people * frames),
-        ]
-        for until in self.until:
-            long_enough = 0 < until <= frames
-            count = people * until * samples if long_enough else torch.zeros_like(people)
-            shares.append((by_frame[:, :, : until if long_enough else 0].sum(dim=(0, 2)), count))
+        people, samples, shares = futures.scored.sum(dim=-1), futures.samples, []
+        for until in (futures.frames, *self.until):
+            long_enough = 0 < until <= futures.frames
+            by_sample = by_frame[:, :, : until if long_enough else 0].sum(dim=-1)  # (S, B)
+            count = people * until if long_enough else torch.zeros_like(people)
+            shares += [(by_sample.sum(dim=0), count * samples), (by_sample.min(dim=0).values, count)]
         return shares

@@ -21,7 +21,7 @@ class Grid:
     steps: int = 30  # denoising steps S, paper A.3
     window: int = 16  # token steps W that the model sees at once
     stride: int = 4  # token steps finished before the window moves on
-    rolling: int = 0  # denoising steps between a token and the next; 0: the tokens of a stride go together
+    rolling: int | None = 0  # steps between a token and the next; 0: a stride's go together; None: see `slope`
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
 
     def __post_init__(self) -> None:
@@ -31,8 +31,8 @@ class Grid:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
         if not self.shift > 0:
             raise ValueError(f"shift: got {self.shift:g}, expected a number over 0; 1 leaves the levels even")
-        if self.rolling < 0:
-            raise ValueError(f"rolling: got {self.rolling}, expected 0 or a number of denoising steps")
+        if self.rolling is not None and self.rolling < 0:
+            raise ValueError(f"rolling: got {self.rolling}, expected 0, a number of denoising steps, or null")
         if self.rolling and self.rolled >= self.window:
             raise ValueError(
                 f"rolling={self.rolling} with {self.steps} denoising steps keeps {self.rolled} tokens half denoised, "
@@ -40,9 +40,19 @@ class Grid:
             )
 
     @property
+    def slope(self) -> int:
+        """Denoising steps between a token and the next in plans that can roll; 0: they go in strides.
+
+        By default (`rolling` None) what keeps half of the window in the making, and half in sight behind it.
+        """
+        if self.rolling is not None:
+            return self.rolling
+        return -(-self.steps // (self.window // 2)) if self.window > 1 else 0
+
+    @property
     def rolled(self) -> int:
         """Token steps that are half denoised at a time when rolling."""
-        return -(-self.steps // self.rolling)
+        return -(-self.steps // self.slope)
 
     def mask(self) -> Tensor:
         """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""
@@ -183,7 +193,7 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
-            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. With `grid.rolling`
+            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. With a `grid.slope`
                 it moves on token by token.
             positions: other places for the window, as `window_positions` gives them; these cannot roll.
 
@@ -191,8 +201,8 @@ class MaskSchedule:
             ValueError: rolling was asked for where the window's places are given.
         """
         if grid.rolling and positions is not None:
-            raise ValueError("rolling goes forward in time, and this task looks ahead to keyframes: leave it at 0")
-        if grid.rolling:
+            raise ValueError("rolling goes forward in time, and this task looks ahead to keyframes: leave it out")
+        if grid.slope and positions is None:
             return MaskSchedule.roll(known, target, grid)
         stages = []
         level = initial_levels(known)
@@ -211,7 +221,7 @@ class MaskSchedule:
 
     @staticmethod
     def roll(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
-        """Denoise along a slope: each token `grid.rolling` denoising steps behind the one before it in time.
+        """Denoise along a slope: each token `grid.slope` denoising steps behind the one before it in time.
 
         A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
         finishes one more token step.
@@ -219,7 +229,7 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated.
-            grid: sizes; `grid.rolling` is the slope.
+            grid: sizes; `grid.slope` is over 0.
         """
         plan = ddim_levels(grid.steps, grid.shift)
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
@@ -227,10 +237,10 @@ class MaskSchedule:
         level, stages = initial_levels(known), []
         ended = 0
         for token in wanted:
-            begins, ended = ended, grid.steps + (token - first) * grid.rolling
+            begins, ended = ended, grid.steps + (token - first) * grid.slope
             start = max(0, min(token + grid.rolled, grid.tokens) - grid.window)
             stop = min(start + grid.window, grid.tokens)
-            behind = grid.rolling * (torch.arange(start, stop) - first)
+            behind = grid.slope * (torch.arange(start, stop) - first)
             turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
             rows = torch.where(target[start:stop], plan[turn.clamp(0, grid.steps)][..., None], level[start:stop])
             changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
@@ -261,12 +271,12 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is longer than the window, or `grid.rolling` is asked for.
+            ValueError: the block is longer than the window, or `grid.rolling` is a number.
         """
         if grid.rolling:
             raise ValueError(
                 "rolling: here agents act on what they have seen of each other, and a token begun ahead of time would "
-                "be half made up by then; leave rolling at 0"
+                "be half made up by then; leave rolling out"
             )
         if not 1 <= block <= grid.window:
             raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import FROM_NOTHING, FROM_NOTHING_MIXED, ROLES, draw_levels, rollout_levels
+from magnet.denoiser.levels import FROM_NOTHING, FROM_NOTHING_MIXED, MIXED, ROLES, draw_levels, rollout_levels
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -36,15 +36,15 @@ def test_more_roll_outs_begin_from_nothing_than_chance_gives(generator):
     levels = rollout_levels(4000, 16, 1, generator)
     alone, mixed = (share + (1 - share) / 16 for share in (FROM_NOTHING, FROM_NOTHING_MIXED))
     given = ROLES[1] + ROLES[2]
-    expected = 0.5 * alone + 0.5 * (1 - given) * mixed
+    expected = (1 - MIXED) * alone + MIXED * (1 - given) * mixed
     assert (levels[:, 0] > 0).double().mean() == pytest.approx(expected, abs=0.02)
 
 
 def test_a_partner_from_nothing_is_trained_as_often_as_inpainting_needs(generator):
-    """One in twelve roll-outs of two people gives one of them wholly and nothing of the other."""
+    """One in eight roll-outs of two people gives one of them wholly and nothing of the other."""
     levels = rollout_levels(8000, 16, 2, generator)
     given, lacking = (levels == 0).all(dim=1), (levels > 0).all(dim=1)
-    assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 13
+    assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 9
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -180,7 +180,8 @@ def test_the_first_piece_comes_long_before_the_last(model, recording):
     done = []
     pieces = model.stream(recording, JointFuture(), 8, 160, 1, FAST, progress=done.append, piece=4)
     next(pieces)
-    assert 0 < len(done) < 0.4 * JointFuture().schedule(Grid(42, 3, 2, 2, 8, 2)).evaluations
+    whole = JointFuture().schedule(planning_grid(42, 3, 2, 8, FAST))
+    assert 0 < len(done) < 0.4 * whole.evaluations
 
 
 def test_nothing_that_the_stream_sets_is_left_set_between_pieces(model, recording):
@@ -304,7 +305,7 @@ def test_as_many_generators_as_scenes_are_needed(model, recording):
 def test_calls_and_evaluations_are_counted(model, recording, name, guidance, views, branches):
     health = Health()
     options = SamplerOptions(steps=3, stride=2, guidance=guidance)
-    schedule = registry.get(name)().schedule(Grid(7, 3, 4, 3, 8, 2))
+    schedule = registry.get(name)().schedule(planning_grid(7, 3, 4, 8, options))
     for _ in range(2):
         model.generate(recording, registry.get(name)(), 16, 12, 2, options, health=health)
     assert health.calls == 2 * schedule.evaluations

@@ -151,3 +151,16 @@ def test_padded_plans_know_and_generate_nothing_in_free_slots_and_add_no_view():
 def test_a_slope_that_does_not_fit_the_window_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         rolled(**options)
+
+
+@pytest.mark.parametrize("window", [2, 3, 8, 16])
+@pytest.mark.parametrize("steps", [1, 4, 20, 30, 50])
+def test_by_default_half_of_the_window_is_in_the_making(steps, window):
+    grid = Grid(24, 2, 4, steps, window, stride=1, rolling=None)
+    assert grid.rolled <= window // 2
+    assert grid.slope == 1 or -(-steps // (grid.slope - 1)) > window // 2  # no gentler slope would do
+
+
+def test_by_default_a_window_of_one_token_does_not_roll():
+    grid = Grid(6, 2, 2, steps=3, window=1, stride=1, rolling=None)
+    assert MaskSchedule.together(grid.past(), ~grid.past(), grid).evaluations == 4 * 3

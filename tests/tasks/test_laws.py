@@ -37,6 +37,17 @@ def test_a_task_that_cannot_roll_says_why(name: str):
         registry.get(name)().schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
 
 
+@pytest.mark.parametrize("name", registry.names())
+def test_tasks_that_can_roll_do_so_unless_told_otherwise(name: str):
+    def plan(rolling: int | None) -> list[Tensor]:
+        grid = Grid(20, 2, 0 if name == "generation" else 4, steps=8, window=8, rolling=rolling)
+        return list(registry.get(name)().schedule(grid).rows())
+
+    left_to_itself, told = plan(None), plan(0 if name in CANNOT_ROLL else 2)
+    assert len(left_to_itself) == len(told)
+    assert all(map(torch.equal, left_to_itself, told))
+
+
 def test_joint_future_needs_a_past():
     with pytest.raises(ValueError, match="use the task generation"):
         registry.get("joint_future")().schedule(Grid(20, 2, 0))
