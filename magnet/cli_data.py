@@ -97,6 +97,7 @@ def add_work(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)"
     )
+    one.add_argument("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
     one.add_argument("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
     one.add_argument("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
     one.add_argument("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
@@ -114,13 +115,12 @@ def add_prepare(one: argparse.ArgumentParser) -> None:
     one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
     one.add_argument("--root", help="folder of the download")
     one.add_argument("--out", help="folder of the store; run again to go on or to bring it up to date")
-    one.add_argument("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
     add_work(one)
     one.add_argument("--reader.OPTION", metavar="VALUE", help="an option of the data set: prepare NAME --help")
 
 
 def add_fake(one: argparse.ArgumentParser) -> None:
-    one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
+    one.add_argument("name", nargs="?", help="of the data set, see magnet data list; cmu as well")
     one.add_argument("out", nargs="?", help="folder to write to; new or empty")
     one.add_argument("--takes", type=int, default=4, help="(default: %(default)s)")
     one.add_argument("--frames", type=int, default=300, help="of each take, at its own rate (default: %(default)s)")
@@ -169,6 +169,7 @@ def run_list(given: argparse.Namespace) -> int:
 def run_info(given: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from magnet.datamodules.prepare import absent_note
     from magnet.datamodules.store import Folder
 
     (path,) = needed(given, "path")
@@ -202,6 +203,8 @@ def run_info(given: argparse.Namespace) -> int:
     for entry in m["notes"]:
         out.print(f"note: {entry['note']} ({len(entry['takes'])} takes)", soft_wrap=True, markup=False)
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    if m.get("listed but not there"):
+        out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
         out.print(f"{len(m['left out'])} takes are in no split")
     return 0
@@ -210,6 +213,7 @@ def run_info(given: argparse.Namespace) -> int:
 def run_check(given: argparse.Namespace) -> int:
     from magnet.body import load_body
     from magnet.datamodules import check
+    from magnet.datamodules.prepare import read_splits
     from magnet.datamodules.store import MANIFEST, STATE, Folder
 
     path = Path(needed(given, "path")[0]).expanduser()
@@ -225,8 +229,9 @@ def run_check(given: argparse.Namespace) -> int:
         name = given.name or check.recognise(path)
         order = order_of(given, name, str(path))
         body = order.body()
+        splits = read_splits(given.splits) if given.splits else None
         with bar() as tell:
-            found = check.check_download(order, given.workers, given.limit, tell)
+            found = check.check_download(order, given.workers, splits, given.limit, tell)
     show_splits(list(check.lines(found)), title=found.title)
     for note in found.notes:
         print(f"note: {note}")
@@ -241,7 +246,7 @@ def run_check(given: argparse.Namespace) -> int:
 
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
-    from magnet.datamodules.prepare import prepare, read_splits
+    from magnet.datamodules.prepare import absent_note, prepare, read_splits
 
     name, root, out = needed(given, "name", "root", "out")
     order = order_of(given, name, root)
@@ -249,6 +254,8 @@ def run_prepare(given: argparse.Namespace) -> int:
     with bar() as tell:
         report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
     m = report.folder.manifest
+    if m["listed but not there"]:
+        print(absent_note(m["listed but not there"]))
     print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     takes = sum(split["takes"] for split in m["splits"].values())
@@ -263,13 +270,19 @@ def run_fake(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
 
     name, out = needed(given, "name", "out")
-    write, folder = catalogue.find(name).load_fake(), Path(out).expanduser()
+    folder = Path(out).expanduser()
+    if name == "cmu":
+        from magnet.datamodules.fakes.cmu import write
+
+        then = f"train on it:\n  magnet fit --data CMU --data.root {folder}"
+    else:
+        write = catalogue.find(name).load_fake()
+        then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
     write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
-    print(f"{len(files)} files of a made-up {name} are in {folder}. To prepare it:")
-    print(f"  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}")
+    print(f"{len(files)} files of a made-up {name} are in {folder}. To {then}")
     return 0
 
 

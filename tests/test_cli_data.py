@@ -78,6 +78,19 @@ def test_a_check_finds_another_body(copy, capsys):
     assert cli.main(["data", "check", "store", "--picture", "none", "--body", "dl/body.npz"]) == 0
 
 
+def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
+    takes = [take.name for take in catalogue.find("dd100").load_reader()("dl").found()]
+    (copy / "mine.txt").write_text("".join(f"{name} train\n" for name in (*takes, *(f"gone{k}" for k in range(7)))))
+    words = ["--body", "dl/body.npz", "--workers", "1", "--splits", "mine.txt", "--limit", "1"]
+    assert cli.main(["data", "check", "dl", "--picture", "none", *words]) == 0
+    assert cli.main(["data", "prepare", "dd100", "--root", "dl", "--out", "other", *words]) == 0
+    assert cli.main(["data", "info", "other"]) == 0
+    assert cli.main(["data", "check", "other", "--picture", "none"]) == 0
+    said = capsys.readouterr().out
+    wanted = "7 names of the lists are not in the download: gone0, gone1, gone2, gone3, gone4 and 2 more"
+    assert said.count(wanted) == 4
+
+
 def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(copy, capsys):
     files = sorted((copy / "dl").rglob("*_00.npy"))
     files[0].write_bytes(files[0].read_bytes()[:100])
@@ -106,6 +119,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("check nowhere", "is not a folder"),
         ("check empty", "neither a prepared store nor a download"),
         ("fake dd100 dl", "is not empty"),
+        ("prepare cmu --root dl --out o", "cmu trains without being prepared"),
         ("fake dd100", "out is missing"),
         ("download dd100", "given out by its authors alone"),
         ("download cmu", "out is missing"),

@@ -49,19 +49,19 @@ class AIOZReader(Reader):
                 f"{self.root}: no folder motions_smpl; it holds {listing(self.root)}; give the folder that has it"
             )
 
-    def takes(self) -> list[Take]:
-        names = sorted(path.stem for path in (self.root / "motions_smpl").glob("*.pkl"))
-        official = any(path.is_file() for path in self._lists().values())
-        splits = listed_splits(self._lists(), _listed) if official else self._hashed(names)
-        return [
-            Take(
-                name=name,
-                files=(self.root / "motions_smpl" / f"{name}.pkl",),
-                split=splits.get(name),
-                group=name if official else _video(name),
-            )
-            for name in names
-        ]
+    def found(self) -> list[Take]:
+        paths = sorted((self.root / "motions_smpl").glob("*.pkl"), key=lambda path: path.stem)
+        return [Take(path.stem, (path,), None, path.stem) for path in paths]
+
+    def official(self) -> dict[str, Split]:
+        """By the lists, or else by a hash of the video."""
+        lists = {split: self.root / f"{split}_{LIST}" for split in LISTS}
+        if any(path.is_file() for path in lists.values()):
+            return listed_splits(lists, _listed)
+        names = {take.name for take in self.found()}
+        if (self.root / LIST).is_file():
+            names &= set(map(_listed, open_names(self.root / LIST)))
+        return {name: hashed_split(_video(name)) for name in names}
 
     def read(self, take: Take) -> Recording:
         """All dancers at 30 fps, y up, of the mean shape."""
@@ -95,15 +95,6 @@ class AIOZReader(Reader):
                 f"beside smpl_orients; {AGAIN}"
             )
         return poses[..., :66].reshape(*poses.shape[:2], 22, 3)
-
-    def _lists(self) -> dict[Split, Path]:
-        return {split: self.root / f"{split}_{LIST}" for split in LISTS}
-
-    def _hashed(self, names: list[str]) -> dict[str, Split]:
-        if (self.root / LIST).is_file():
-            listed = set(map(_listed, open_names(self.root / LIST)))
-            names = [name for name in names if name in listed]
-        return {name: hashed_split(_video(name)) for name in names}
 
 
 def _listed(line: str) -> str:

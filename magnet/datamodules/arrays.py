@@ -178,6 +178,9 @@ def one_shape(where: object, betas: Doubles) -> tuple[Doubles, tuple[str, ...]]:
 
 # -- splits ------------------------------------------------------------------------------------
 
+OR_YOURS = ", or give your own with --splits FILE"
+"""The other way out where official lists are missing."""
+
 
 def listed_splits(files: Mapping[Split, Path], clean: Callable[[str], str] = str) -> dict[str, Split]:
     """The split of every name in one list a split.

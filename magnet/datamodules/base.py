@@ -8,14 +8,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningDataModule
+from lightning.pytorch import LightningDataModule, Trainer
 from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.datamodules.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
 from magnet.datamodules.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store_mapped import MappedStore, Piece
-from magnet.datamodules.windows import Clip, Draw, Split, Store
+from magnet.datamodules.windows import Clip, Draw, Split, Store, at_least
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 
@@ -91,26 +91,10 @@ class MotionDataModule(LightningDataModule):
         read_ahead: int = 2,
     ) -> None:
         super().__init__()
-        at_least_one = {
-            "window_frames": window_frames,
-            "batch_size": batch_size,
-            "max_agents": max_agents,
-            "horizon_frames": horizon_frames,
-            "test_batch_size": test_batch_size,
-            "val_batch_size": val_batch_size,
-            "epoch_size": epoch_size,
-            "test_stride": test_stride,
-            "test_limit": test_limit,
-        }
-        for name, number in at_least_one.items():
-            if number is not None and number < 1:
-                raise ValueError(f"{name}: got {number}, expected at least 1")
-        for name, number in {"context_frames": context_frames, "read_ahead": read_ahead}.items():
-            if number < 0:
-                raise ValueError(f"{name}: got {number}, expected 0 (none) or more")
-        for name, share in {"drop_agent": drop_agent, "compose": compose}.items():
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
+        at_least(1, window_frames=window_frames, batch_size=batch_size, max_agents=max_agents, epoch_size=epoch_size)
+        at_least(1, horizon_frames=horizon_frames, test_stride=test_stride, test_limit=test_limit)
+        at_least(1, test_batch_size=test_batch_size, val_batch_size=val_batch_size)
+        at_least(0, context_frames=context_frames, composed_test=composed_test, read_ahead=read_ahead)
         self.window_frames = window_frames
         self.batch_size = batch_size
         self.max_agents = max_agents
@@ -137,6 +121,7 @@ class MotionDataModule(LightningDataModule):
         self.read_ahead = read_ahead
         self._stores: dict[tuple[str, torch.device], Store] = {}
         self._train_loader: TrainLoader | None = None
+        self._trained_by: Trainer | None = None
         self._resume: dict[str, int] | None = None
 
     # -- what a data set implements ------------------------------------------------------------
@@ -200,7 +185,14 @@ class MotionDataModule(LightningDataModule):
     # -- loaders -------------------------------------------------------------------------------
 
     def train_dataloader(self) -> TrainLoader:
-        """Random windows (batch_size, window_frames, max_agents); resumes where a loaded state stood."""
+        """Random windows (batch_size, window_frames, max_agents).
+
+        They go on where a loaded state stood, or where the same trainer's last ones ended; another's begin anew.
+        """
+        if self.trainer is not None and self.trainer is self._trained_by:
+            self._resume = self.state_dict()
+        self._trained_by = self.trainer
+        self._close()
         store = self.store("train")
         place = self._shard()
         draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
@@ -220,9 +212,9 @@ class MotionDataModule(LightningDataModule):
         else:
             gather = partial(self._gather, "train", frames)
             self._train_loader = TrainLoader(draws, gather, self.batch_size, size, *place, shared=draws.shared)
-        if self._resume is not None:
+        if self._resume:
             self._train_loader.load_state_dict(self._resume)
-            self._resume = None
+        self._resume = None
         return self._train_loader
 
     def statistics_batches(self, batches: int = 8) -> Iterator[Scene]:
@@ -291,6 +283,14 @@ class MotionDataModule(LightningDataModule):
         if isinstance(batch, Scene | Tensor):
             return batch.to(device)
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
+
+    def teardown(self, stage: str) -> None:
+        """End the threads that read ahead; they begin again when a batch is asked for."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._train_loader is not None:
+            self._train_loader.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Place in the training stream. Lightning restores a loader's own state only within an epoch."""

@@ -61,6 +61,8 @@ def find(name: str) -> Entry:
     if name not in NAMES:
         close = difflib.get_close_matches(name.lower(), NAMES, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(NAMES)}"
+        if name.lower() in ("cmu", "synthetic"):
+            hint = f"{name} trains without being prepared, see docs/data.md"
         raise ValueError(f"no data set {name!r}; {hint}")
     return NAMES[name]
 

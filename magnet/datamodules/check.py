@@ -12,7 +12,7 @@ import torch
 
 from magnet.body import Body, load_body
 from magnet.datamodules import catalogue
-from magnet.datamodules.prepare import chosen
+from magnet.datamodules.prepare import absent_note, chosen
 from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all
 from magnet.datamodules.recording import Reader
 from magnet.datamodules.store import SCALE, SPLITS, Folder, StoreError, body_hash, decode, file_hash
@@ -79,6 +79,8 @@ def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = No
         found.problems.append(f"the store is of body {theirs!r}, and {body.id!r} has other joints at rest")
     found.skipped = [(entry["take"], entry["why"]) for entry in manifest["skipped"]]
     found.notes = [f"{entry['note']} ({len(entry['takes'])} takes)" for entry in manifest["notes"]]
+    if absent := manifest.get("listed but not there"):
+        found.notes.append(absent_note(absent))
     if found.problems:
         return found
     try:
@@ -163,7 +165,7 @@ def recognise(root: Path) -> str:
     found, said = [], []
     for name, entry in catalogue.NAMES.items():
         try:
-            if entry.load_reader()(root).takes():
+            if entry.load_reader()(root).found():
                 found.append(name)
         except (ValueError, OSError) as error:
             said.append(f"\n  {name}: {str(error)[:200]}")
@@ -174,18 +176,36 @@ def recognise(root: Path) -> str:
     raise ValueError(f"{root} is neither a prepared store nor a download that is known:{''.join(said)}")
 
 
-def check_download(order: Order, workers: int = 1, limit: int | None = None, tell: Tell | None = None) -> Checked:
+def check_download(
+    order: Order,
+    workers: int = 1,
+    splits: dict[str, Split] | None = None,
+    limit: int | None = None,
+    tell: Tell | None = None,
+) -> Checked:
     """Every take of a download read and put through the common steps; nothing is written.
+
+    Args:
+        order: which data set, where, and how.
+        workers: processes.
+        splits: as for `prepare`.
+        limit: as for `prepare`.
+        tell: is told of progress.
 
     Raises:
         DataError: there are no takes at all.
+        ValueError: a list of splits that does not fit.
     """
     reader: Reader = order.reader()
     body = order.body()
     found = Checked(reader.title)
-    takes, left_out = chosen(reader, None, limit)
-    if left_out:
-        found.notes.append(f"{len(left_out)} takes are in no split by the data set's rule")
+    use = chosen(reader, splits, limit)
+    takes = use.takes
+    if use.left_out:
+        whose = "the data set's rule" if splits is None else "the list given"
+        found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")
+    if use.absent:
+        found.notes.append(absent_note(use.absent))
     notes: Counter[str] = Counter()
     parts: dict[str, Part] = {}
     for take, part in convert_all(order, takes, lambda take: None, workers, tell):

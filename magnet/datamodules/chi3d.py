@@ -52,7 +52,7 @@ class CHI3DReader(Reader):
                 f"{self.folder}: no train/sXX/smplx; it holds {listing(self.folder)}; give the download's folder chi3d"
             )
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         takes = []
         for folder in FOLDERS:
             for path in sorted(self.folder.glob(f"{folder}/*/smplx/*.json")):

@@ -7,14 +7,12 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -22,6 +20,7 @@ from magnet.body import Body
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
+from magnet.datamodules.prepare_takes import one_thread
 from magnet.datamodules.speeds import at_speed
 from magnet.motion.scene import Scene
 
@@ -223,7 +222,8 @@ class CMU(MotionDataModule):
         rank_zero_info(f"CMU: fitting {len(takes)} takes to body {self.body.id} once, into {self._cache()}")
         size = {take.name: sum(path.stat().st_size for path in take.amc if path.is_file()) for take in takes}
         bar = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
-        with _one_thread(), Progress(*bar, TimeRemainingColumn()) as progress:
+        # The fit's tensors are so small that threads cost more than they give, many times more on a busy machine.
+        with one_thread(), Progress(*bar, TimeRemainingColumn()) as progress:
             task, before = progress.add_task("fitting", total=max(sum(size.values()), 1)), 0
             for take in takes:
                 progress.update(task, description=f"fitting {take.name}")
@@ -247,17 +247,6 @@ class CMU(MotionDataModule):
             _write(self._file(take), lambda path: scene.save(path))
         text = json.dumps(report, indent=1)
         _write(self._file(take).with_suffix(".json"), lambda path: path.write_text(text))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """The fit's tensors are so small that threads cost more than they give, many times more on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _write(target: Path, write: Callable[[Path], object]) -> None:

@@ -72,7 +72,7 @@ class DD100Reader(Reader):
             )
         self.folder, self.validation, self.orient = folder, validation, orient
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         """One take a pair of files; a partner whose file is missing is found out by `read`."""
         found: dict[str, re.Match[str]] = {}
         for path in sorted(self.folder.iterdir()):

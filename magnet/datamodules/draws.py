@@ -24,6 +24,11 @@ class Augmentation:
     compose: float = 0.0
     apart: tuple[float, float] = (1.6, 3.5)
 
+    def __post_init__(self) -> None:
+        for name, share in {"mirror": self.mirror, "drop_agent": self.drop, "compose": self.compose}.items():
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
+
 
 def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Floats:
     """Uniform numbers of samples `first` to `first + count` of an epoch, a row each. -> (count, columns) in [0, 1)

@@ -84,7 +84,7 @@ class DuoBoxReader(Reader):
             )
         self.folder = folder
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         """Every file's parts and phases."""
         files: dict[str, Path] = {}
         if self.form != "fit":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,14 +24,11 @@ from magnet.datamodules.arrays import (
 from magnet.datamodules.fields import Person, mapping, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
 
 WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
 FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")
 BETAS = 300
 FIRST = "the first 10 of 300 shape numbers are used: the same basis, slightly another mesh"
-SHARE = 0.1  # of the scenes, for test and again for val
-SOLVABLE = (0.05, 0.2)  # a split by cast is taken if test and val both come to such a share
 
 
 @dataclass(frozen=True)
@@ -52,10 +47,9 @@ class _Scene:
 class Embody3DReader(Reader):
     """Embody 3D's `datasets/<section>/<capture>/<subject>/<feature>/<capture>.npy`.
 
-    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by scene: people
-    who ever met are kept together where that leaves a tenth or so of the scenes for test and for val, else whole
-    sessions are. They are made over all scenes of the sections, so that models of 2, 3, 4 and 2 to 4 people share
-    their test scenes.
+    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by scene: a hash
+    of its session, date and time, gives a tenth of the sessions to test and a tenth to val. So a scene is in the same
+    split whichever sections and numbers of people are chosen or were downloaded, and those of one session are together.
 
     Args:
         root: the folder `datasets`, or the one above.
@@ -93,17 +87,16 @@ class Embody3DReader(Reader):
                 f"{', '.join(there) or 'none'}; give those as `sections`, or get dataset.json from the toolbox"
             )
 
-    def takes(self) -> list[Take]:
-        scenes = [scene for section in self.sections for scene in self._scenes(section)]
-        groups, splits = _split(scenes)
+    def found(self) -> list[Take]:
         return [
             Take(
                 name=scene.capture if len(scene.people) > 1 else f"{scene.capture}/{scene.people[0]}",
                 files=tuple(self._file(scene, person, feature) for person in scene.people for feature in FEATURES),
-                split=splits[groups[index]],
-                group=groups[index],
+                split=hashed_split(scene.session),
+                group=scene.capture,
             )
-            for index, scene in enumerate(scenes)
+            for section in self.sections
+            for scene in self._scenes(section)
             if len(scene.people) in self.people
         ]
 
@@ -183,42 +176,6 @@ def _held(path: Path, array: Doubles, valid: NDArray[np.bool_]) -> Doubles:
         raise DataError(f"{path}: NaN or infinity in {int((bad & valid).sum())} frames of good tracking; {AGAIN}")
     good = np.flatnonzero(~bad)
     return array[good[np.searchsorted(good[1:], np.arange(len(array)), side="right")]]
-
-
-def _split(scenes: Sequence[_Scene]) -> tuple[list[str], dict[str, Split]]:
-    """The group of every scene and the split of every group: casts if that works out, else sessions."""
-    casts = _casts(scenes)
-    sizes = Counter(casts)
-    names = sorted(sizes, key=lambda name: hashlib.sha256(name.encode(errors="replace")).hexdigest())
-    splits: dict[str, Split] = dict.fromkeys(names, "train")
-    held: tuple[Split, ...] = ("test", "val")
-    for split in held:
-        taken = 0.0
-        for name in names:
-            share = sizes[name] / len(casts)
-            if splits[name] == "train" and taken < SHARE and taken + share <= SOLVABLE[1]:
-                splits[name] = split
-                taken += share
-        if taken < SOLVABLE[0]:
-            sessions = [scene.session for scene in scenes]
-            return sessions, {session: hashed_split(session, SHARE, SHARE) for session in sessions}
-    return casts, splits
-
-
-def _casts(scenes: Sequence[_Scene]) -> list[str]:
-    """For each scene, the first of all people connected with its own by scenes."""
-    leader: dict[str, str] = {}
-
-    def find(person: str) -> str:
-        while leader.setdefault(person, person) != person:
-            person = leader[person]
-        return person
-
-    for scene in scenes:
-        heads = sorted(find(person) for person in scene.people)
-        for head in heads[1:]:
-            leader[head] = heads[0]
-    return [find(scene.people[0]) for scene in scenes]
 
 
 class Embody3D(Prepared):

@@ -54,13 +54,13 @@ class Hi4DReader(Reader):
                 f"{self.root}: no folder pairXX; it holds {listing(self.root)}; give the folder of all pairs"
             )
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         takes = []
         for number, pair in self._pairs():
             split: Split = "test" if number in self.test_pairs else "val" if number in self.val_pairs else "train"
             for action in sorted(path for path in pair.iterdir() if path.is_dir() and not path.name.startswith(".")):
                 frames = sorted((action / "smpl").glob("*.npz"))
-                takes.append(Take(f"{pair.name}_{action.name}", (action / "meta.npz", *frames), split, pair.name))
+                takes.append(Take(name := f"{pair.name}_{action.name}", (action / "meta.npz", *frames), split, name))
         return takes
 
     def read(self, take: Take) -> Recording:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, floats, listed_splits, open_names
+from magnet.datamodules.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
 from magnet.datamodules.fields import listing, mapping, natural, person, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
@@ -32,7 +32,7 @@ class InterHumanReader(Reader):
         fps: frame rate of the recordings, which files that name another one are refused for.
 
     Raises:
-        DataError: no motions or no lists; says what was found.
+        DataError: no motions; says what was found.
     """
 
     name: ClassVar[str] = "interhuman"
@@ -51,10 +51,22 @@ class InterHumanReader(Reader):
                 "(motions_processed lacks root rotations and shapes and is not read)"
             )
 
-    def takes(self) -> list[Take]:
-        splits = self._splits()
+    def found(self) -> list[Take]:
         paths = sorted((self.root / "motions").glob("*.pkl"), key=lambda path: natural(path.stem))
-        return [Take(path.stem, (path,), splits.get(path.stem), path.stem) for path in paths]
+        return [Take(path.stem, (path,), None, path.stem) for path in paths]
+
+    def official(self) -> dict[str, Split]:
+        """By the lists, less ignore_list.txt."""
+        folder = next((at for at in (self.root / "split", self.root) if (at / "train.txt").is_file()), None)
+        if folder is None:
+            raise DataError(
+                f"{self.root / 'split'}: no train.txt; put the download's lists train, val and test there{OR_YOURS}"
+            )
+        splits = listed_splits({split: folder / f"{split}.txt" for split in LISTS})
+        ignored = folder / "ignore_list.txt"
+        for name in open_names(ignored) if ignored.is_file() else ():
+            splits.pop(name, None)
+        return splits
 
     def read(self, take: Take) -> Recording:
         """Both people at 59.94 fps, z up."""
@@ -73,16 +85,6 @@ class InterHumanReader(Reader):
         if isinstance(frames, int | np.integer) and frames != scene.frames:
             raise DataError(f"{path}: says {frames} frames, but people have {scene.frames}; {AGAIN}")
         return scene
-
-    def _splits(self) -> dict[str, Split]:
-        folder = next((at for at in (self.root / "split", self.root) if (at / "train.txt").is_file()), None)
-        if folder is None:
-            raise DataError(f"{self.root / 'split'}: no train.txt; put the download's lists train, val and test there")
-        splits = listed_splits({split: folder / f"{split}.txt" for split in LISTS})
-        ignored = folder / "ignore_list.txt"
-        for name in open_names(ignored) if ignored.is_file() else ():
-            splits.pop(name, None)
-        return splits
 
     def _rate(self, path: Path, said: Mapping[str, Any]) -> list[str]:
         if "mocap_framerate" not in said:

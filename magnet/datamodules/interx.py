@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from magnet.datamodules.arrays import open_names, open_npz
+from magnet.datamodules.arrays import OR_YOURS, open_names, open_npz
 from magnet.datamodules.fields import Person, first_folder, listing, person, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
@@ -37,7 +37,7 @@ class InterXReader(Reader):
         lists: folder of the lists for "paper": {train,val,test}.txt, .csv or _data.csv, one clip a line.
 
     Raises:
-        DataError: no motions, the processed .h5 alone, no lists, or a clip in two of them.
+        DataError: no motions, or the processed .h5 alone.
     """
 
     name: ClassVar[str] = "interx"
@@ -48,9 +48,11 @@ class InterXReader(Reader):
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(
-        self, root: str | Path, split: Literal["official", "paper"] = "official", lists: str | None = None
+        self, root: str | Path, split: Literal["official", "paper"] = "official", lists: Path | None = None
     ) -> None:
         super().__init__(root)
+        if split not in ("official", "paper"):
+            raise DataError(f"split: got {split!r}, expected 'official' or 'paper'")
         folder = first_folder(self.root, PLACES, "G[0-9]*T[0-9]*A[0-9]*R[0-9]*")
         if folder is None:
             processed = any(self.root.rglob("*.h5"))
@@ -59,29 +61,11 @@ class InterXReader(Reader):
                 f"Inter-X: no clips such as motions/G001T000A000R000 in {self.root}, which holds {listing(self.root)}; "
                 f"{hint}"
             )
-        self.folder = folder
-        self.splits = self._splits(split, lists)
+        self.folder, self.paper, self.lists = folder, split == "paper", lists
 
-    def _splits(self, split: str, lists: str | None) -> dict[str, Split]:
-        """Split by a clip's number, from the lists."""
-        if split == "official":
-            where = next(
-                (self.folder / place for place in LISTS if (self.folder / place / "train.txt").is_file()), None
-            )
-            if where is None:
-                raise DataError(
-                    f"Inter-X: no splits/train.txt beside {self.folder}; unpack the data set's splits there, or take "
-                    "datasets/{train,val,test}.txt of its repository"
-                )
-        elif split == "paper":
-            if lists is None:
-                raise DataError(
-                    "split=paper needs lists=FOLDER with train, val and test lists (.txt or .csv); the paper's are "
-                    "data/data_split/interx_data_split of its authors' repository"
-                )
-            where = Path(lists)
-        else:
-            raise DataError(f"split: got {split!r}, expected 'official' or 'paper'")
+    def official(self) -> dict[str, Split]:
+        """By a clip's number, from the lists."""
+        where = self._listed_in()
         found: dict[str, Split] = {}
         for name in get_args(Split):
             for clip in self._listed(where, name):
@@ -90,6 +74,22 @@ class InterXReader(Reader):
         if not found:
             raise DataError(f"{where}: all lists are empty; copy them again")
         return found
+
+    def _listed_in(self) -> Path:
+        if self.paper and self.lists is not None:
+            return Path(self.lists)
+        if self.paper:
+            raise DataError(
+                "split=paper needs lists=FOLDER with train, val and test lists (.txt or .csv); the paper's are "
+                f"data/data_split/interx_data_split of its authors' repository{OR_YOURS}"
+            )
+        where = next((self.folder / place for place in LISTS if (self.folder / place / "train.txt").is_file()), None)
+        if where is None:
+            raise DataError(
+                f"Inter-X: no splits/train.txt beside {self.folder}; unpack the data set's splits there, take "
+                f"datasets/{{train,val,test}}.txt of its repository{OR_YOURS}"
+            )
+        return where
 
     def _listed(self, where: Path, name: Split) -> list[str]:
         files = [where / f"{name}{ending}" for ending in (".txt", ".csv", "_data.csv")]
@@ -104,7 +104,7 @@ class InterXReader(Reader):
             )
         return clips
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         """One take a folder; a file that is missing in it is found out by `read`."""
         found: dict[str, Path] = {}
         for folder in sorted(self.folder.iterdir()):
@@ -113,15 +113,17 @@ class InterXReader(Reader):
                     raise DataError(f"{folder}: the same clip as {found[match[1]]}; leave one out")
                 found[match[1]] = folder
         return [
-            Take(folder.name, tuple(folder / name for name in FILES), self.splits.get(clip), group=clip)
+            Take(folder.name, tuple(folder / name for name in FILES), None, clip, also=self._orders())
             for clip, folder in found.items()
         ]
+
+    def _orders(self) -> tuple[Path, ...]:
+        return tuple(self.folder / place / "interaction_order.pkl" for place in ("../annots", "annots"))
 
     @cached_property
     def _order(self) -> dict[str, Any] | DataError | None:
         """Who acts, by clip: 0 is P1, 1 is P2. Without the file, or with a damaged one, roles stay unknown."""
-        for place in ("../annots", "annots"):
-            path = self.folder / place / "interaction_order.pkl"
+        for path in self._orders():
             if path.is_file():
                 try:
                     held = load_pickle(path)

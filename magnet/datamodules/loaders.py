@@ -34,14 +34,12 @@ class Ahead:
     def __init__(self, make: Callable[[Place], Any], after: Callable[[Place], Place], depth: int) -> None:
         self.make, self.after, self.depth = make, after, depth
         self.begun: deque[tuple[Place, Future[Any]]] = deque()
-        self.threads = ThreadPoolExecutor(depth, thread_name_prefix="read-ahead")
+        self.threads: ThreadPoolExecutor | None = None
 
     def get(self, place: Place) -> Any:
         """The batch of a place. Whatever went wrong when it was made is raised here."""
         if self.begun and self.begun[0][0] != place:  # a state was loaded
-            for _, future in self.begun:
-                future.cancel()
-            self.begun.clear()
+            self._forget()
         self._begin(place, 1)
         _, future = self.begun.popleft()
         self._begin(self.after(place), self.depth)
@@ -51,8 +49,21 @@ class Ahead:
             self.begun.clear()
             raise
 
+    def close(self) -> None:
+        """End the threads, once they have done what they are at; the next batch that is asked for begins new ones."""
+        self._forget()
+        if self.threads is not None:
+            self.threads.shutdown()
+            self.threads = None
+
+    def _forget(self) -> None:
+        for _, future in self.begun:
+            future.cancel()
+        self.begun.clear()
+
     def _begin(self, place: Place, count: int) -> None:
         """Have so many batches under way."""
+        self.threads = self.threads or ThreadPoolExecutor(self.depth, thread_name_prefix="read-ahead")
         while len(self.begun) < count:
             place = self.after(self.begun[-1][0]) if self.begun else place
             self.begun.append((place, self.threads.submit(self.make, place)))
@@ -118,6 +129,11 @@ class TrainLoader:
     def _after(self, place: Place) -> Place:
         epoch, batch = place
         return (epoch, batch + 1) if batch + 1 < self.batches else (epoch + 1, 0)
+
+    def close(self) -> None:
+        """End the threads that read ahead."""
+        if self.ahead:
+            self.ahead.close()
 
     def state_dict(self) -> dict[str, int]:
         """Where the stream stands: what comes next is this sample of this epoch."""

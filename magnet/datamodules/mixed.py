@@ -14,12 +14,13 @@ class Mixed(MotionDataModule):
 
     Of each data set only the clips are used: window, batch and augmentation are set here. Where one of them is a
     prepared store read by memory map, all are: the frames of the others are held in memory as a store's rows, 188
-    bytes a frame and person. Every process draws from everything.
+    bytes a frame and person, and each process reads lengths of its own of every source of clips.
 
     Args:
         data: the data sets; all of one body.
         test_on: position in `data` of the one whose test split is used; None: all of them.
         val_on: the same for the val split.
+        spread: as for `Prepared`; has no effect where no data set is read by memory map.
         **kwargs: as for MotionDataModule; `weights` says how the sources of clips are mixed.
 
     Raises:
@@ -27,7 +28,12 @@ class Mixed(MotionDataModule):
     """
 
     def __init__(
-        self, data: list[MotionDataModule], test_on: int | None = None, val_on: int | None = None, **kwargs: Any
+        self,
+        data: list[MotionDataModule],
+        test_on: int | None = None,
+        val_on: int | None = None,
+        spread: bool = True,
+        **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
         if not data:
@@ -38,6 +44,7 @@ class Mixed(MotionDataModule):
         bodies = {part.body_model for part in data} | {self.body_model}
         if len(bodies) > 1:
             raise ValueError(f"body_model: data sets of one body can be mixed, got {sorted(bodies)}")
+        self.spread = spread
         self.data, self.chosen = list(data), {"train": None, "val": val_on, "test": test_on}
 
     @property
@@ -66,7 +73,7 @@ class Mixed(MotionDataModule):
     def open_store(self, split: Split) -> Store:
         """By memory map where a data set is; else all clips in memory."""
         if self.maps_files and (piece := self.piece(split)) is not None:
-            return MappedStore(piece, self.max_agents, spread=False)
+            return MappedStore(piece, self.max_agents, self.spread)
         return super().open_store(split)
 
     def _used(self, split: Split) -> list[MotionDataModule]:

@@ -16,7 +16,7 @@ from magnet.datamodules.prepare_pack import Source, pack
 from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all, take_key
 from magnet.datamodules.recording import DataError, Reader, Take
 from magnet.datamodules.store import MANIFEST, SPLITS, STATE, Folder, StoreError, as_json, file_hash, write_whole
-from magnet.datamodules.windows import Split
+from magnet.datamodules.windows import Split, at_least
 
 SHARD_ROWS = 2**18
 """Rows of a shard at most, 49 MB; small enough that ten million frames spread over some forty processes."""
@@ -58,12 +58,10 @@ def prepare(
         ValueError: a number out of range, a list of splits that does not fit, or `out` holds something else.
         OSError: another prepare works there, or the disk is full.
     """
-    numbers: dict[str, int | None] = {"workers": workers, "limit": limit, "shard_rows": shard_rows}
-    for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise ValueError(f"{name}: got {number}, expected at least 1")
+    at_least(1, workers=workers, limit=limit, shard_rows=shard_rows)
     reader, body = order.reader(), order.body()
-    takes, left_out = chosen(reader, splits, limit)
+    use = chosen(reader, splits, limit)
+    takes = use.takes
     out = Path(out).expanduser()
     old = opened(out, reader)
     state = out / STATE
@@ -85,7 +83,8 @@ def prepare(
             "body": {"id": body.id, "sha256": settings["body"], "genders": settings["bodies"]},
             "options": {key: settings[key] for key in ("options", "steps", "steps version", "reader version")},
             "splits by": "the data set's rule" if splits is None else "a list given by the user",
-            "left out": left_out,
+            "left out": use.left_out,
+            "listed but not there": use.absent,
         }
         if limit is not None:
             facts["limit"] = limit
@@ -100,25 +99,35 @@ def prepare(
     return Report(folder, len(todo), len(takes) - len(todo))
 
 
-def chosen(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> tuple[list[Take], list[str]]:
-    """The takes to prepare, each with its split, and the names of those left out by the rule or the list.
+@dataclass(frozen=True)
+class Chosen:
+    """What is to be prepared of a download, and what is not."""
+
+    takes: list[Take]  # each with its split
+    left_out: list[str]  # takes that the rule or the list leaves out
+    absent: list[str]  # what the lists name and the download lacks
+
+
+def chosen(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> Chosen:
+    """The takes to prepare; official lists are not looked at where `splits` are given.
 
     Raises:
         DataError: there are none, two of a name, or a group in two splits.
     """
-    takes = reader.takes()
+    takes = reader.takes() if splits is None else reader.found()
     if not takes:
         raise DataError(f"{reader.title}: no takes under {reader.root}; is it the folder of the download?")
+    listed = reader.official() if splits is None else splits
+    absent = sorted(set(listed or ()) - {take.group if splits is None else take.name for take in takes})
     names = {take.name for take in takes}
     if len(names) < len(takes):
         twice = sorted({take.name for take in takes if sum(t.name == take.name for t in takes) > 1})
         raise DataError(f"{reader.title}: takes are named twice: {', '.join(twice[:5])}")
     if splits is not None:
-        unknown = sorted(set(splits) - names)
-        if len(unknown) == len(splits):
+        if len(absent) == len(splits):
             raise ValueError(
-                f"the list of splits names no take of this download: it has {', '.join(unknown[:3])}, takes are called "
-                f"{', '.join(sorted(names)[:3])}"
+                f"the list of splits names no take of this download: it has {', '.join(absent[:3]) or 'no names'}, "
+                f"takes are called {', '.join(sorted(names)[:3])}"
             )
         takes = [replace(take, split=splits.get(take.name)) for take in takes]
     groups: dict[str, tuple[str, Split]] = {}
@@ -139,7 +148,13 @@ def chosen(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -
             count[take.split] += 1
     if not used:
         raise DataError(f"{reader.title}: none of {len(takes)} takes belongs to a split")
-    return used, left_out
+    return Chosen(used, left_out, absent)
+
+
+def absent_note(names: list[str], most: int = 5) -> str:
+    """What lists of splits name and a download lacks: was it unpacked whole?"""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{len(names)} names of the lists are not in the download: {', '.join(names[:most])}{more}"
 
 
 def read_splits(path: str | Path) -> dict[str, Split]:
@@ -147,20 +162,25 @@ def read_splits(path: str | Path) -> dict[str, Split]:
 
     Raises:
         ValueError: a line that is neither, a split that is none of train, val and test, or a name in two of them.
+        OSError: no such file.
     """
-    text = Path(path).read_text()
     pairs: list[tuple[str, str]] = []
-    if text.lstrip().startswith("{"):
-        for key, value in json.loads(text).items():
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+        held = json.loads(text) if text.lstrip().startswith("{") else None
+    except ValueError as error:
+        raise ValueError(f"{path}: neither lines NAME SPLIT nor JSON ({error})") from error
+    if held is not None:
+        for key, value in held.items():
             pairs += [(name, key) for name in value] if isinstance(value, list) else [(key, value)]
     else:
         for number, line in enumerate(text.splitlines(), 1):
             line = line.split("#")[0].strip()
             if line:
-                name, _, split = line.rpartition(" ")
-                if not name:
+                name, *rest = line.rsplit(maxsplit=1)
+                if not rest:
                     raise ValueError(f"{path}, line {number}: got {line!r}, expected NAME SPLIT")
-                pairs.append((name.strip(), split))
+                pairs.append((name, rest[0]))
     found: dict[str, Split] = {}
     for name, split in pairs:
         known = [one for one in SPLITS if one == split]

@@ -25,7 +25,7 @@ from magnet.datamodules import catalogue
 from magnet.datamodules.common import STEPS_VERSION, Steps, to_clips
 from magnet.datamodules.genders import load_bodies, one_body
 from magnet.datamodules.recording import Gender, Reader, Take
-from magnet.datamodules.store import FORMAT, body_hash, write_whole
+from magnet.datamodules.store import FORMAT, body_hash, file_hash, write_whole
 from magnet.datamodules.store_rows import ROW, encode
 
 PART_VERSION = 2
@@ -43,7 +43,7 @@ class Order:
     Args:
         name: of the data set in the catalogue.
         root: folder of the download.
-        options: of the reader's constructor.
+        options: of the reader's constructor; files and folders among them as `Path`.
         body_file: path of the body file, or "open".
         steps: what can be chosen about the common steps.
         body_files: folder or files of gendered bodies that shape numbers belong to; none: all belong to `body_file`.
@@ -92,17 +92,31 @@ class Order:
             "steps": self.steps.__dict__,
             "reader": self.name,
             "reader version": kind.version,
-            # A folder's name and not its place, so that a store's bytes do not depend on the machine.
-            "options": {key: Path(str(value)).name for key, value in self.options.items()},
+            "options": {key: content(value) for key, value in self.options.items()},
             "body": body_hash(body),
             "bodies": {gender: body_hash(one) for gender, one in self.bodies().items()},
         }
 
 
+def content(value: Any) -> str:
+    """An option's value as text: of a file or folder what it is called and holds, so that its place is no part of it.
+
+    Raises:
+        ValueError: no such file or folder.
+    """
+    if not isinstance(value, Path):
+        return str(value)
+    if not value.exists():
+        raise ValueError(f"{value}: no such file or folder")
+    inside = sorted(path for path in value.rglob("*") if path.is_file()) if value.is_dir() else [value]
+    listed = [[path.relative_to(value).as_posix(), file_hash(path)] for path in inside]
+    return f"{value.resolve().name} ({hashlib.sha256(json.dumps(listed).encode()).hexdigest()[:16]})"
+
+
 def take_key(take: Take, root: Path, settings: dict[str, Any]) -> str:
-    """Name of a take's part: another file size or time, or another setting, is another part."""
+    """Name of a take's part: another size or time of a file, one that came or went, another setting: another part."""
     files: list[list[str | int]] = []
-    for path in take.files:
+    for path in (*take.files, *take.also):
         try:
             stat = path.stat()
         except OSError:

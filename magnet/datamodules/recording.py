@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
@@ -28,15 +29,17 @@ class Take:
 
     Args:
         name: unique within the data set, such as "Jive_005_001".
-        files: what `read` will open; their sizes and times decide whether a prepared clip is still good.
+        files: what `read` will open; with `also`, their sizes and times decide whether a prepared clip is still good.
         split: by the data set's official rule; None: the rule leaves it out.
         group: takes of one group never stand in different splits.
+        also: what `read` opens besides where it is there, such as a table of all takes' roles.
     """
 
     name: str
     files: tuple[Path, ...]
     split: Split | None
     group: str = ""
+    also: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,9 @@ class Recording:
 class Reader(ABC):
     """How one data set lies on disk. A subclass also has a `fake` that writes a tiny one in the same layout.
 
+    Options that are files or folders are annotated as `Path`: what they hold, and not what they are called, decides
+    whether a prepared take is still good.
+
     Args:
         root: the folder of the download.
 
@@ -114,8 +120,21 @@ class Reader(ABC):
             raise DataError(f"{self.title}: {self.root} is not a folder; ask for the data at {self.source}")
 
     @abstractmethod
+    def found(self) -> list[Take]:
+        """All takes in a fixed order; opens no motion and no list of splits. Names alone may tell the split."""
+
+    def official(self) -> Mapping[str, Split] | None:
+        """The split of each group by the data set's lists or rule; None: `found` tells. Not asked where the user does.
+
+        Raises:
+            DataError: a list is missing or damaged.
+        """
+        return None
+
     def takes(self) -> list[Take]:
-        """All takes in a fixed order, from file names and split lists alone; opens no motion."""
+        """All takes with their official splits."""
+        found, splits = self.found(), self.official()
+        return found if splits is None else [replace(take, split=splits.get(take.group)) for take in found]
 
     @abstractmethod
     def read(self, take: Take) -> Recording:

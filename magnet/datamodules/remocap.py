@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, one_length, open_npz, require
+from magnet.datamodules.arrays import AGAIN, OR_YOURS, one_length, open_npz, require
 from magnet.datamodules.fields import first_folder, listing, mapping, person, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
@@ -42,7 +42,7 @@ class ReMoCapReader(Reader):
         scale: metres a unit of the csv files.
 
     Raises:
-        DataError: no sequences, or fits without a known split.
+        DataError: no sequences.
     """
 
     name: ClassVar[str] = "remocap"
@@ -55,7 +55,7 @@ class ReMoCapReader(Reader):
         self,
         root: str | Path,
         split: Literal["official", "paper"] = "official",
-        fits: str | None = None,
+        fits: Path | None = None,
         scale: float = 0.001,
     ) -> None:
         super().__init__(root)
@@ -68,30 +68,36 @@ class ReMoCapReader(Reader):
             self.fits = self.root
         if self.fits is not None and not _fit_files(self.fits):
             raise DataError(f"ReMoCap: no fits such as 16.npz in {self.fits}; give their folder")
-        if self.halves is None and (self.fits is None or not self.paper):
-            wanted = (
-                "sequences train/*/0 and test/*/0" if self.fits is None else "train/ and test/ to split the fits by"
-            )
-            hint = "" if self.fits is None else ", or take split=paper"
-            raise DataError(
-                f"ReMoCap: no {wanted} in {self.root}, which holds {listing(self.root)}; give the folder LindyHop{hint}"
-            )
+        if self.halves is None and self.fits is None:
+            raise self._no("sequences train/*/0 and test/*/0")
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         """One take a sequence; files that are missing in it are found out by `read`."""
-        folders = self._folders()
-        splits = PAPER if self.paper else self._official(folders)
         found: dict[int, tuple[Path, ...]] = {}
         if self.fits is None:
-            found = {number: _files(folder) for number, folder in folders.items()}
+            found = {number: _files(folder) for number, folder in self._folders().items()}
         else:
             for path in _fit_files(self.fits):
                 if (number := _number(path)) is not None:
                     found.setdefault(number, (path,))
-        return [
-            Take(f"lindyhop_{number:03}", found[number], splits.get(number), group=str(number))
-            for number in sorted(found)
-        ]
+        return [Take(f"lindyhop_{number:03}", found[number], None, group=str(number)) for number in sorted(found)]
+
+    def official(self) -> dict[str, Split]:
+        """By the paper's numbers; or by folder, the last training sequence kept back."""
+        splits = PAPER
+        if not self.paper:
+            if self.halves is None:
+                raise self._no("train/ and test/ to split the fits by", f", take split=paper{OR_YOURS}")
+            splits = {n: "test" if f.parent.name == "test" else "train" for n, f in self._folders().items()}
+            train = sorted(number for number, split in splits.items() if split == "train")
+            if len(train) > 1:
+                splits[train[-1]] = "val"
+        return {str(number): split for number, split in splits.items()}
+
+    def _no(self, wanted: str, hint: str = "") -> DataError:
+        return DataError(
+            f"ReMoCap: no {wanted} in {self.root}, which holds {listing(self.root)}; give the folder LindyHop{hint}"
+        )
 
     def _folders(self) -> dict[int, Path]:
         """Folder of each sequence, by number."""
@@ -106,13 +112,6 @@ class ReMoCapReader(Reader):
                     raise DataError(f"{folder}: has the number of {found[number]}; leave one of the two out")
                 found[number] = folder
         return found
-
-    def _official(self, folders: dict[int, Path]) -> dict[int, Split]:
-        splits: dict[int, Split] = {n: "test" if f.parent.name == "test" else "train" for n, f in folders.items()}
-        train = sorted(number for number, split in splits.items() if split == "train")
-        if len(train) > 1:
-            splits[train[-1]] = "val"
-        return splits
 
     def read(self, take: Take) -> Recording:
         """Positions, or the ready fits, of both people at 50 fps, y up."""

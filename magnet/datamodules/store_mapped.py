@@ -108,7 +108,7 @@ class MappedStore(Store):
     Args:
         piece: the clips; at least one.
         max_agents: slots P of every batch.
-        spread: let each process read a length of the store of its own, where there are enough clips.
+        spread: let each process read a length of every source of its own, where there are enough clips.
 
     Raises:
         ValueError: a clip has more people than slots.
@@ -131,7 +131,8 @@ class MappedStore(Store):
         self.shards: dict[int, NDArray[np.void]] = {}
         self.device = torch.device("cpu")
         self.spread = spread
-        for number in range(len(part.files)):  # missing files are found now, not in the middle of an epoch
+        # Missing files are found now, not in the middle of an epoch. A map takes addresses alone until it is read.
+        for number in range(len(part.files)):
             part.shard(number)
 
     def to(self, device: torch.device | str) -> MappedStore:
@@ -145,13 +146,16 @@ class MappedStore(Store):
         return self.bad[clip] if clip in self.bad else np.ones(int(self.length[clip]), dtype=bool)
 
     def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
-        """Which process reads each clip: the store cut into equally likely lengths, one a process. (C,)
+        """Which process reads each clip: every source cut into equally likely lengths, one a process. (C,)
 
-        A process maps the shards of its length alone, of which it shares the first and the last with its neighbours.
-        None where clips are too few for lengths within a tenth of each other: then all draw from all.
+        A process reads from the shards of its lengths alone, of which it shares the first and the last with its
+        neighbours. None where clips are too few for loads within a tenth of each other: then all draw from all.
         """
-        middle = np.cumsum(mass) - mass / 2
-        owner = np.minimum((middle * world).astype(np.int64), world - 1)
+        owner = np.zeros(len(mass), dtype=np.int64)
+        for source in set(self.sources):
+            mine = np.where(self.sources == source, mass, 0.0)
+            middle = (np.cumsum(mine) - mine / 2) / (mine.sum() or 1.0)
+            owner = np.where(self.sources == source, np.minimum((middle * world).astype(np.int64), world - 1), owner)
         load = np.bincount(owner, mass, world)
         return owner if self.spread and np.ptp(load) <= UNEVEN / world else None
 

@@ -88,6 +88,17 @@ class Draw:
         return Draw(*(np.concatenate([getattr(d, f) for d in draws]) for f in Draw.__dataclass_fields__))
 
 
+def at_least(least: int, **numbers: int | None) -> None:
+    """Every number that is given is so large.
+
+    Raises:
+        ValueError: names the one that is not.
+    """
+    for name, number in numbers.items():
+        if number is not None and number < least:
+            raise ValueError(f"{name}: got {number}, expected at least {least}")
+
+
 class Store:
     """All clips of a split as flat tensors on one device; rows are frames of one person.
 

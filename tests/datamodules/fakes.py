@@ -1,12 +1,16 @@
-"""A data set of random smooth clips in memory, and a trainer that says only where it runs."""
+"""A data set of random smooth clips in memory, a trainer that says only where it runs, and what is seen of them."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import torch
+from lightning.pytorch import LightningModule, Trainer
+from torch import Tensor, nn
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.motion.scene import Scene, concatenate
 from magnet.testing import random_scene
 
 
@@ -52,3 +56,50 @@ class FakeTrainer:
     global_rank: int = 0
     world_size: int = 1
     strategy: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(root_device=torch.device("cpu")))
+
+
+def same(a: Scene, b: Scene) -> bool:
+    """Bit for bit, names too."""
+    return a.names == b.names and all(torch.equal(value, b.tensors()[name]) for name, value in a.tensors().items())
+
+
+def one_epoch(data: FakeData) -> Scene:
+    return concatenate(list(data.train_dataloader()))
+
+
+class Recorder(LightningModule):
+    """A model that learns one number and remembers what it was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.seen: list[tuple[str, ...]] = []
+        self.checked: list[tuple[str, ...]] = []
+
+    def training_step(self, batch: Scene) -> Tensor:
+        assert isinstance(batch, Scene)
+        self.seen.append(batch.names)
+        return (self.weight - batch.T_world_root[..., 0, 3].mean()) ** 2
+
+    def validation_step(self, batch: Scene) -> None:
+        self.checked.append(batch.names)
+
+    def test_step(self, batch: Scene) -> None:
+        self.checked.append(batch.names)
+
+    def predict_step(self, batch: Scene) -> tuple[str, ...]:
+        return batch.names
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def quiet(path: Path, **options: Any) -> Trainer:
+    return Trainer(
+        accelerator="cpu",
+        default_root_dir=path,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **options,
+    )

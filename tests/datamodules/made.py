@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class MadeReader(Reader):
         super().__init__(root)
         self.fps = fps
 
-    def takes(self) -> list[Take]:
+    def found(self) -> list[Take]:
         files = sorted(self.root.glob("*.txt"))
         return [Take(file.stem, (file,), SPLITS[i % len(SPLITS)]) for i, file in enumerate(files)]
 
@@ -96,3 +96,10 @@ SPOILED: dict[str, tuple[Callable[[Recording], Recording], str]] = {
 def in_degrees(recording: Recording) -> Recording:
     assert recording.poses is not None
     return replace(recording, poses=np.rad2deg(recording.poses))
+
+
+def data(store: Path, **kwargs: Any) -> Made:
+    """A store of it, with the body beside its download."""
+    return Made(
+        str(store), body_model=str(store.parent / "dl/body.npz"), **{"batch_size": 8, "epoch_size": 32, **kwargs}
+    )

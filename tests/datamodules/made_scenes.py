@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules.common import Steps
 from magnet.datamodules.duobox import DuoBoxReader
+from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
+from magnet.datamodules.prepare_takes import Order
 from magnet.datamodules.recording import Reader, Recording
 
-from .reading import world_joints
+from .reading import fake_of, world_joints
+
+MILLIMETRE = 0.001
+FITTED = 0.04
+"""Metres: the bound of joints that are read, and of those that a body is fitted to, above which readers refuse."""
+FORMS: dict[str, tuple[str, dict[str, Any], float]] = {
+    **{name: (name, {}, FITTED if NAMES[name].load_reader().family == "positions" else MILLIMETRE) for name in NAMES},
+    "remocap, ready fits": ("remocap", {"fits": "fits"}, MILLIMETRE),
+    "duobox, bare skeleton": ("duobox", {"form": "skeleton", "phases": 1}, FITTED),
+}
+"""Data set, options of its reader, bound."""
 
 
 def wild(motion: FakeMotion, seed: int) -> FakeMotion:
@@ -90,3 +107,13 @@ def placed(joints: NDArray, like: NDArray) -> NDArray:
     """Moved as the common steps must: pelvises of the first frame about the origin, and one height for the floor."""
     joints = joints - joints[0, :, 0].mean(axis=0) * [1.0, 0.0, 1.0]
     return joints + np.array([0.0, np.median(like[..., 1] - joints[..., 1]), 0.0])
+
+
+def written(form: str, root: Path, scenes: Mapping[str, FakeMotion], steps: Steps) -> Order:
+    """The order to prepare scenes that now lie under `root` in a data set's layout."""
+    name, options, _ = FORMS[form]
+    fake_of(name).write_scenes(root, scenes)
+    if "fits" in options:
+        fake_remocap.write_fitted_scenes(root / "fits", scenes)
+        options = {"fits": root / "fits"}
+    return Order(name, str(root), options, str(root / "body.npz"), steps)

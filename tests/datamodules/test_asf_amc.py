@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.asf_amc import Recording, _fast, _slow, read_amc, read_asf, together
+from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.glitches import repaired, runs
-from tests.datamodules.fake_cmu import slow_ends, write_amc, write_asf
+from tests.datamodules.slow_cmu import slow_ends
 
 
 @pytest.fixture

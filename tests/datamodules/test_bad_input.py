@@ -219,7 +219,7 @@ def test_bad_takes_are_listed_with_why_and_the_others_are_there(
     options = {"phases": 1} if name == "duobox" else {}
     if form != name:
         fake_remocap.write_fitted_scenes(root / "fits", scenes)
-        options = {"fits": str(root / "fits")}
+        options = {"fits": root / "fits"}
     takes = {take.name: take for take in NAMES[name].load_reader()(root, **options).takes()}  # type: ignore[call-arg]
     scene = {take: take.rpartition("_")[0] if name == "duobox" else take for take in takes}  # of a file may be more
     bad = dict(zip(sorted(set(scene.values()))[:-1], damages, strict=True))

@@ -14,8 +14,7 @@ from magnet.datamodules import cmu
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.cmu_fit import check_rate
-
-from .fake_cmu import write_amc, write_asf
+from magnet.datamodules.fakes.cmu import write_amc, write_asf
 
 
 @pytest.fixture(scope="module")

@@ -106,13 +106,25 @@ def prepare_fit_and_test(name, body, options, capsys):
     assert "all assertions hold" in capsys.readouterr().out
     manifest = json.loads(Path("store/manifest.json").read_text())
     assert manifest["skipped"] == [] and all(manifest["splits"][split]["clips"] for split in ("train", "val", "test"))
-    data = ["--data", catalogue.find(name).data.replace(":", "."), "--data.path", "store", *flags("data", SMALL)]
-    data += ["--data.body_model", body[1]] if body else []
+    body_model = ("--data.body_model", body[1]) if body else ()
+    fit_and_test("--data", catalogue.find(name).data.replace(":", "."), "--data.path", "store", *body_model)
+    return manifest
+
+
+def fit_and_test(*data: str) -> None:
+    """Two steps of training, and a test."""
     limits = ("--trainer.max_steps", "2", "--trainer.limit_val_batches", "1")
-    magnet("fit", "--model", "Tokenizer", *flags("model", TINY), *data, "--out", "run", *limits, *CPU)
+    words = (*flags("model", TINY), *data, *flags("data", SMALL), "--out", "run", *limits)
+    magnet("fit", "--model", "Tokenizer", *words, *CPU)
     magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", "--out", "tested", *CPU)
     assert json.loads(Path("tested/results.json").read_text())
-    return manifest
+
+
+def test_a_fake_of_cmu_trains_without_being_prepared(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    magnet("data", "fake", "cmu", "dl", "--frames", "60", "--takes", "3")
+    assert "magnet fit --data CMU --data.root dl" in capsys.readouterr().out
+    fit_and_test("--data", "CMU", "--data.root", "dl", "--data.cache", "cache")
 
 
 @pytest.mark.parametrize("name", catalogue.NAMES)

@@ -14,8 +14,7 @@ import pytest
 from magnet.datamodules import download
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.download import DownloadError, Retries, download_cmu
-
-from .fake_cmu import write_amc, write_asf
+from magnet.datamodules.fakes.cmu import write_amc, write_asf
 
 QUICK = Retries(attempts=3, backoff=0.001, timeout=5.0, pause=0.0)
 

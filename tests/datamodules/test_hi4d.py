@@ -30,9 +30,9 @@ def test_the_basis_of_shapes_is_noted(root: Path) -> None:
 def test_whole_pairs_are_held_out(tmp_path: Path) -> None:
     write(tmp_path, 6, 2)
     takes = Hi4DReader(tmp_path).takes()
-    assert {take.group for take in takes if take.split == "test"} == {"pair28"}
+    assert {take.name.split("_")[0] for take in takes if take.split == "test"} == {"pair28"}
     mine = Hi4DReader(tmp_path, test_pairs=(0,), val_pairs=(1,)).takes()
-    assert {take.split for take in mine if take.group == "pair00"} == {"test"}
+    assert {take.split for take in mine if take.name.startswith("pair00_")} == {"test"}
     with pytest.raises(ValueError, match=r"pairs \[3\] are in both"):
         Hi4DReader(tmp_path, test_pairs=(3,), val_pairs=(3,))
 

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from magnet.datamodules.common import Steps
 from magnet.datamodules.fakes import interx as fake
 from magnet.datamodules.interx import InterXReader
+from magnet.datamodules.prepare import prepare
+from magnet.datamodules.prepare_takes import Order
 from magnet.datamodules.recording import DataError, Recording
 
 TAKES, FRAMES = 4, 4
@@ -66,7 +69,7 @@ def test_the_papers_split_is_that_of_the_users_lists(made: Path, tmp_path: Path,
     for split, numbers in (("train", (2,)), ("val", (3,)), ("test", (0, 1))):
         lines = ["scene_name"] * (ending != ".txt") + [f"{fake.name(number)}_Hug" for number in numbers]
         (tmp_path / f"{split}{ending}").write_text("\n".join(lines) + "\n")
-    reader = InterXReader(made, split="paper", lists=str(tmp_path))
+    reader = InterXReader(made, split="paper", lists=tmp_path)
     assert [take.split for take in reader.takes()] == ["test", "test", "train", "val"]
 
 
@@ -75,10 +78,20 @@ def test_lists_beside_the_repositorys_motions_are_found(copy: Path) -> None:
     assert InterXReader(copy).takes()[0].split == "train"
 
 
+def test_roles_that_come_after_a_store_was_made_are_read_into_it(copy: Path, tmp_path: Path) -> None:
+    (copy / "annots").rename(tmp_path / "annots")
+    order = Order("interx", str(copy), {}, str(copy / "body.npz"), Steps(min_frames=1))
+    assert prepare(order, tmp_path / "store", limit=1).folder.manifest["persons"][0]["persons"] == ["P1", "P2"]
+    (tmp_path / "annots").rename(copy / "annots")
+    report = prepare(order, tmp_path / "store", limit=1)
+    assert report.kept == 0
+    assert {word for entry in report.folder.manifest["persons"] for word in entry["persons"]} >= {"P1, actor"}
+
+
 def test_a_clip_in_two_lists_is_refused(copy: Path) -> None:
     shutil.copy(copy / "splits/train.txt", copy / "splits/test.txt")
     with pytest.raises(DataError, match="in both train and test"):
-        InterXReader(copy)
+        InterXReader(copy).takes()
 
 
 @pytest.mark.parametrize(
@@ -86,24 +99,24 @@ def test_a_clip_in_two_lists_is_refused(copy: Path) -> None:
     [
         ({"split": "paper"}, "lists=FOLDER"),
         ({"split": "mine"}, "expected 'official' or 'paper'"),
-        ({"split": "paper", "lists": "nowhere"}, "no train.txt, train.csv"),
+        ({"split": "paper", "lists": Path("nowhere")}, "no train.txt, train.csv"),
     ],
 )
 def test_a_split_without_lists_is_refused(made: Path, options: dict[str, Any], said: str) -> None:
     with pytest.raises(DataError, match=said):
-        InterXReader(made, **options)
+        InterXReader(made, **options).takes()
 
 
 def test_a_list_of_something_else_is_refused(copy: Path) -> None:
     (copy / "splits/train.txt").write_text("eggs\nmilk\nbread\n")
     with pytest.raises(DataError, match=r"train\.txt: 0 of 3 lines"):
-        InterXReader(copy)
+        InterXReader(copy).takes()
 
 
 def test_missing_lists_are_refused_with_where_they_are(copy: Path) -> None:
     shutil.rmtree(copy / "splits")
     with pytest.raises(DataError, match=r"no splits/train\.txt"):
-        InterXReader(copy)
+        InterXReader(copy).takes()
 
 
 def test_the_processed_file_is_refused_with_the_reason(tmp_path: Path) -> None:

@@ -20,12 +20,7 @@ from magnet.datamodules.recording import DataError
 from magnet.datamodules.store import STATE, Folder
 from tests.datamodules import made
 
-
-@pytest.fixture(autouse=True)
-def known():
-    catalogue.NAMES[made.NAME] = made.ENTRY
-    yield
-    del catalogue.NAMES[made.NAME]
+pytestmark = pytest.mark.usefixtures("known")
 
 
 @pytest.fixture
@@ -213,7 +208,7 @@ def test_a_manifest_tells_what_the_store_holds_and_nothing_of_the_machine(order,
 
 
 def test_a_users_list_of_splits_replaces_the_rule(order, tmp_path):
-    (tmp_path / "mine.txt").write_text("# mine\ntake0 test\ntake1 train\ntake2   val\n")
+    (tmp_path / "mine.txt").write_text("# mine\ntake0 test\ntake1\ttrain\ntake2   val\n")
     splits = read_splits(tmp_path / "mine.txt")
     folder = prepare(order, tmp_path / "store", splits=splits).folder
     assert [folder.split(split).name for split in ("train", "val", "test")] == [["take1"], ["take2"], ["take0"]]
@@ -224,19 +219,22 @@ def test_a_users_list_of_splits_replaces_the_rule(order, tmp_path):
         assert read_splits(tmp_path / "mine.json") == splits
     for text, message in (("take0 dev", "take0 is in 'dev', expected one of train, val, test"),
                           ("take0", "line 1: got 'take0', expected NAME SPLIT"),
+                          ('{"take0": "val"', "bad.txt: neither lines NAME SPLIT nor JSON"),
                           ("take0 val\ntake0 test", "in val and in test")):  # fmt: skip
         (tmp_path / "bad.txt").write_text(text)
         with pytest.raises(ValueError, match=message):
             read_splits(tmp_path / "bad.txt")
     with pytest.raises(ValueError, match="names no take of this download: it has other"):
         prepare(order, tmp_path / "store", splits={"other": "train"})
+    with pytest.raises(ValueError, match="names no take of this download: it has no names"):
+        prepare(order, tmp_path / "store", splits={})
 
 
 def test_near_copies_never_stand_in_two_splits(order, tmp_path, monkeypatch):
     from dataclasses import replace
 
-    takes = made.MadeReader.takes
-    monkeypatch.setattr(made.MadeReader, "takes", lambda self: [replace(t, group="all one") for t in takes(self)])
+    found = made.MadeReader.found
+    monkeypatch.setattr(made.MadeReader, "found", lambda self: [replace(t, group="all one") for t in found(self)])
     with pytest.raises(DataError, match="take3 is in val but take0 in train, and both belong to all one"):
         prepare(order, tmp_path / "store")
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,23 +20,14 @@ from magnet.datamodules.draws import whole_clips
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, turned
 from magnet.datamodules.prepare import chosen, prepare
-from magnet.datamodules.prepare_takes import Order, convert
+from magnet.datamodules.prepare_takes import convert
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError
 from magnet.datamodules.windows import Split
 
-from .made_scenes import joints_at_30_fps, placed, random_scene, scene_of
+from .made_scenes import FITTED, FORMS, MILLIMETRE, joints_at_30_fps, placed, random_scene, scene_of, written
 from .reading import fake_of, world_joints
 
-MILLIMETRE = 0.001
-FITTED = 0.04
-"""Metres: the bound of joints that are read, and of those that a body is fitted to, above which readers refuse."""
-FORMS: dict[str, tuple[str, dict[str, Any], float]] = {
-    **{name: (name, {}, FITTED if NAMES[name].load_reader().family == "positions" else MILLIMETRE) for name in NAMES},
-    "remocap, ready fits": ("remocap", {"fits": "fits"}, MILLIMETRE),
-    "duobox, bare skeleton": ("duobox", {"form": "skeleton", "phases": 1}, FITTED),
-}
-"""Data set, options of its reader, bound."""
 TAKES = {"duobox": 1, "remocap": 2}
 """Of a download, where one take has all splits or takes long to fit; else 3."""
 
@@ -47,16 +37,6 @@ GENDERS = {
     "hi4d": ("male", "female"),
 }  # fmt: skip
 """Of the fakes whose layout says them."""
-
-
-def written(form: str, root: Path, scenes: Mapping[str, FakeMotion], steps: Steps) -> Order:
-    """The order to prepare scenes that now lie under `root` in a data set's layout."""
-    name, options, _ = FORMS[form]
-    fake_of(name).write_scenes(root, scenes)
-    if "fits" in options:
-        fake_remocap.write_fitted_scenes(root / "fits", scenes)
-        options = {"fits": str(root / "fits")}
-    return Order(name, str(root), options, str(root / "body.npz"), steps)
 
 
 # -- joints ------------------------------------------------------------------------------------
@@ -247,11 +227,11 @@ def test_a_users_list_takes_the_place_of_the_rule_but_parts_no_group(download: t
     mine = {take.name: turn[groups.index(take.group) % 3] for take in reader.takes()}
     left = groups[-1]
     wanted = {take.name: mine[take.name] for take in reader.takes() if take.group != left}
-    used, left_out = chosen(reader, wanted, None)
-    assert {take.name: take.split for take in used} == wanted
-    assert set(left_out) == {take.name for take in reader.takes() if take.group == left}
+    use = chosen(reader, {**wanted, "lost": "val"}, None)
+    assert {take.name: take.split for take in use.takes} == wanted and use.absent == ["lost"]
+    assert set(use.left_out) == {take.name for take in reader.takes() if take.group == left}
     pairs = [(a, b) for a in reader.takes() for b in reader.takes() if a.group == b.group and a.name < b.name]
-    assert pairs or name in ("remocap", "interx", "aioz", "interhuman", "chi3d", "embody3d")
+    assert pairs or name not in ("duobox", "dd100")
     for a, b in pairs[:2]:
         with pytest.raises(DataError, match=f"both belong to {re.escape(a.group)}.*put them into one split"):
             chosen(reader, {**mine, a.name: "train", b.name: "test"}, None)

@@ -152,15 +152,51 @@ def test_damaged_files_are_read_or_refused(name: str, fakes: Callable[[str], Pat
         path.write_bytes(whole)
 
 
+Outcome = tuple[int, tuple[str, ...], bool] | str
+"""Frames of a take, notes, whether a body has to be fitted (and the note will say so); or why it is refused."""
+
+
+def outcomes(reader: type[Reader], root: Path) -> dict[str, Outcome]:
+    """Of every take; under "", why all are refused. Raises anything but `DataError`."""
+    found: dict[str, Outcome] = {}
+    try:
+        opened = reader(root)
+        takes = opened.takes()
+    except DataError as error:
+        return {"": str(error)}
+    for take in takes:
+        try:
+            recording = opened.read(take)
+            found[take.name] = recording.frames, recording.notes, recording.poses is None
+        except DataError as error:
+            found[take.name] = str(error)
+    return found
+
+
 @pytest.mark.parametrize("name", known())
-def test_missing_files_and_folders_are_read_or_refused(name: str, fakes: Callable[[str], Path], tmp_path: Path) -> None:
+def test_what_is_missing_is_named_and_takes_that_do_not_need_it_are_read(
+    name: str, fakes: Callable[[str], Path], tmp_path: Path
+) -> None:
     root, reader = fakes(name), NAMES[name].load_reader()
-    for path in sample(root):
-        for gone in (path, path.parent):
-            if gone != root:
-                gone.rename(tmp_path / "away")
-                read(reader, root, path)
-                (tmp_path / "away").rename(gone)
+    whole, takes = outcomes(reader, root), reader(root).takes()
+    assert whole and not any(isinstance(how, str) for how in whole.values())
+    for gone in sorted({place for path in sample(root) for place in (path, path.parent)} - {root}):
+        using = {take.name for take in takes if any(file.is_relative_to(gone) for file in take.files)}
+        gone.rename(tmp_path / "away")
+        try:
+            found = outcomes(reader, root)
+        finally:
+            (tmp_path / "away").rename(gone)
+        if "" in found:  # of what all takes need: a folder, an index, a list; never for want of one take's file
+            assert str(root) in str(found[""]) and (gone.is_dir() or using in (set(), set(whole))), gone
+            continue
+        assert all(found.get(take) == how for take, how in whole.items() if take not in using), gone
+        for take in using & set(found):
+            said = found[take]
+            if isinstance(said, str):
+                assert gone.name in said or str(gone.parent) in said, f"{gone}: {said}"
+            else:
+                assert said[1:] != whole[take][1:], f"{gone}: the take is read without it, and no note says so"
 
 
 @pytest.mark.parametrize("name", known())

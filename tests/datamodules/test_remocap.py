@@ -55,7 +55,7 @@ def test_the_fakes_csv_has_the_order_of_the_authors_code(made: Path) -> None:
 
 def test_ready_fits_alone_need_the_papers_split(fits: Path) -> None:
     with pytest.raises(DataError, match="split=paper"):
-        ReMoCapReader(fits)
+        ReMoCapReader(fits).takes()
     splits = {take.group: take.split for take in ReMoCapReader(fits, split="paper").takes()}
     assert splits == {"3": "train", "5": "train", "6": "test", "8": "val"}
 

@@ -1,13 +1,14 @@
-"""Writes tiny recordings in CMU's on-disk format, of a made-up person, and reads them in a slow second way."""
+"""A tiny CMU: made-up people who sway, in its ASF and AMC files, inches and degrees, 60 and 120 fps."""
 
 from __future__ import annotations
 
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+TEST, VAL = 5, 3
+"""Takes that `CMU` holds out."""
 # Axes of the left side's bones; {s} and {m} become the signs of the side and of the other.
 LEG, FOOT, ARM, HAND, THUMB = "0 0 {s}20", "-90 0 {s}20", "-180 {m}30 {m}90", "0 {s}90 {s}90", "-90 {s}45 0"
 SIDE = (
@@ -33,6 +34,25 @@ MIDDLE = (
     ("upperneck", "lowerneck", 1.6),
     ("head", "upperneck", 1.6),
 )
+
+
+def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+    """Takes of the couple 60 and 61, the first to test, the second to validate on, and one of somebody alone.
+
+    Args:
+        out: root of the fake.
+        takes: of the couple.
+        frames: of each, at 60 frames a second; 120 of the one alone.
+        seed: of the motion.
+    """
+    numbers = [TEST, VAL, *islice((n for n in count(1) if n not in (TEST, VAL) and n % 5), max(takes - 2, 0))][:takes]
+    for folder, subjects in (("salsa", {60: 0.0, 61: 0.8}), ("singles", {2: 0.0})):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+        for subject, x in subjects.items():
+            write_asf(out / folder / f"{subject:02}.asf")
+            for take in numbers if len(subjects) > 1 else [1]:
+                amc, rate = out / folder / f"{subject:02}_{take:02}.amc", 60.0 if len(subjects) > 1 else 120.0
+                write_amc(amc, frames, x, 1000 * seed + 10 * subject + take, rate=rate)
 
 
 def bones() -> list[tuple[str, str, tuple[float, float, float], float, str, str]]:
@@ -76,43 +96,3 @@ def write_amc(path: Path, frames: int, x: float = 0.0, seed: int = 0, swing: flo
             lines.append(" ".join([name, *(f"{value:.6g}" for value in values)]))
     path.write_text("\r\n".join([*lines, ""]))
     return path
-
-
-def slow_ends(asf: Path, amc: Path, frame: int) -> dict[str, NDArray[np.float64]]:
-    """Bone ends of one frame in metres, by matrices and scipy, from the files' text alone."""
-    skeleton = asf.read_text().replace("\r", "")
-    bone_text = {
-        block.split("name ")[1].split()[0]: block
-        for block in skeleton.split(":bonedata")[1].split(":hierarchy")[0].split("begin")[1:]
-    }
-    tree = {}
-    for line in skeleton.split(":hierarchy")[1].splitlines():
-        words = line.split()
-        tree.update({child: words[0] for child in words[1:]} if words and words[0] not in ("begin", "end") else {})
-    wanted = amc.read_text().replace("\r", "").split(f"\n{frame + 1}\n")[1].splitlines()
-    angles = {}
-    for line in wanted:
-        if line.strip().isdigit():
-            break
-        if line.strip():
-            angles[line.split()[0]] = list(map(float, line.split()[1:]))
-    scale = 0.0254 / 0.45
-    T = {"root": np.eye(4)}
-    T["root"][:3, :3] = Rotation.from_euler("xyz", angles["root"][3:], degrees=True).as_matrix()
-    T["root"][:3, 3] = np.multiply(angles["root"][:3], scale)
-
-    def transform(name: str) -> NDArray[np.float64]:
-        """World frame of a bone, at its end."""
-        if name not in T:
-            text = bone_text[name].splitlines()
-            field = {line.split()[0]: line.split()[1:] for line in text if line.split()}
-            C = Rotation.from_euler("xyz", [float(v) for v in field["axis"][:3]], degrees=True)
-            turn = dict(zip(field.get("dof", []), angles.get(name, []), strict=True))
-            E = Rotation.from_euler("xyz", [turn.get(k, 0.0) for k in ("rx", "ry", "rz")], degrees=True)
-            local, along = np.eye(4), np.eye(4)
-            local[:3, :3] = (C * E * C.inv()).as_matrix()
-            along[:3, 3] = np.array([float(v) for v in field["direction"]]) * float(field["length"][0]) * scale
-            T[name] = transform(tree[name]) @ local @ along
-        return T[name]
-
-    return {name: transform(name)[:3, 3] for name in tree}
