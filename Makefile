@@ -85,6 +85,6 @@ clean:  ## remove caches and builds
 	@rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find magnet tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean  ## clean, and the virtual environment
-	@echo "distclean: $(VENV)"
-	@rm -rf $(VENV)
+distclean: clean  ## clean, and the virtual environments
+	@echo "distclean: $(VENV) .venv-bpy"
+	@rm -rf $(VENV) .venv-bpy

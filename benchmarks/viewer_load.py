@@ -79,7 +79,7 @@ class Listener(threading.Thread):
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
-        self.port, self.total, self.ended = port, 0, False
+        self.port, self.total, self.packets, self.ended = port, 0, 0, False
 
     def run(self) -> None:
         asyncio.run(self._listen())
@@ -94,6 +94,7 @@ class Listener(threading.Thread):
             while not self.ended:
                 with contextlib.suppress(TimeoutError):
                     self.total += len(await asyncio.wait_for(socket.recv(), 0.2))
+                    self.packets += 1
 
     def quiet(self) -> int:
         """Bytes so far, as soon as nothing has come for a second."""
@@ -105,7 +106,8 @@ class Listener(threading.Thread):
 
 
 HEAD = (
-    f"{'view':10} {'server MB':>9} {'server ms':>9} {'kB/frame':>8} {'sent/s':>6} | {'drawn/s':>7} {'k triangles':>11} "
+    f"{'view':10} {'server MB':>9} {'server ms':>9} {'kB/frame':>8} {'packets':>7} {'sent/s':>6} | "
+    f"{'drawn/s':>7} {'k triangles':>11} "
     f"{'calls':>5} {'script ms':>9} {'draw ms':>7} {'script MB':>9} {'page MB':>7}"
 )
 
@@ -119,14 +121,14 @@ def main() -> None:
     options.add_argument("--views", nargs="+", choices=VIEWS, default=VIEWS)
     options.add_argument("--shadows", action="store_true", help="true shadows instead of discs")
     options.add_argument("--marks", action="store_true", help="trails, contacts and collisions too")
-    options.add_argument("--full-resolution", action="store_true", help="viser may not lower it where frames are slow")
+    options.add_argument("--dpr", type=float, help="viser's ?fixedDpr: 0.5 draws a quarter of the pixels")
     options.add_argument("--no-browser", action="store_true")
     asked = options.parse_args()
     torch.set_num_threads(1)
     body = load_body("open")
     empty = memory()
     scene = crowd(asked.people, asked.frames)
-    print(f"{asked.people} people x {asked.frames} frames; the scene takes {memory() - empty:.0f} MB")
+    print(f"{asked.people} people x {asked.frames} frames; the scene takes {memory() - empty:.0f} of {memory():.0f} MB")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; window {asked.size}")
     print(HEAD)
     for style in asked.views:
@@ -142,20 +144,21 @@ def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Style) ->
     viewer.dress(dataclasses.replace(look, style=style))
     listener = Listener(viewer.port)
     listener.start()
-    begun, cpu = listener.quiet(), time.process_time()
+    begun, packets, cpu = listener.quiet(), listener.packets, time.process_time()
     for frame in range(100, 100 + STEPS):
         viewer.clock.seek(frame)
         viewer.draw()
         time.sleep(0.05)
     cost = (time.process_time() - cpu) / STEPS
     kilobytes = (listener.quiet() - begun) / STEPS / 1e3
+    sent_packets = (listener.packets - packets) / STEPS
     listener.ended = True
     listener.join()
     thread = viewer.start()
     sent = viewer.sent
     time.sleep(asked.seconds)
     rate = (viewer.sent - sent) / asked.seconds
-    line = f"{style:10} {memory() - before:9.0f} {1e3 * cost:9.1f} {kilobytes:8.1f} {rate:6.1f}"
+    line = f"{style:10} {memory() - before:9.0f} {1e3 * cost:9.1f} {kilobytes:8.1f} {sent_packets:7.1f} {rate:6.1f}"
     print(line if asked.no_browser else f"{line} | {in_browser(viewer.port, asked)}", flush=True)
     viewer.stop()
     thread.join(timeout=10)
@@ -171,7 +174,7 @@ def in_browser(port: int, asked: argparse.Namespace) -> str:
         browser = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS.split())
         page = browser.new_page(viewport={"width": width, "height": height})
         page.add_init_script(COUNT)
-        page.goto(f"http://127.0.0.1:{port}/{'?fixedDpr=1' if asked.full_resolution else ''}")
+        page.goto(f"http://127.0.0.1:{port}/{f'?fixedDpr={asked.dpr}' if asked.dpr else ''}")
         page.get_by_role("button", name="Pause").wait_for(timeout=120_000)
         page.wait_for_function(f"window.drawn.frames > {WARM}", timeout=300_000)
         tools = page.context.new_cdp_session(page)

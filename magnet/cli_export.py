@@ -49,7 +49,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="FRAMES",
         help="first frames that a model was given, in files that do not say",
     )
-    pictures.add_argument("--style", choices=("body", "capsules", "skeleton"), default="body", help="how people look")
+    pictures.add_argument(
+        "--style",
+        choices=("body", "light", "capsules", "skeleton"),
+        default="body",
+        help="how people look; light, a body of few vertices, is for .html",
+    )
     pictures.add_argument("--title", help="written above")
     bvh = options.add_argument_group("reading .bvh of other programs")
     bvh.add_argument("--in-unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")

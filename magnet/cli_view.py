@@ -147,8 +147,6 @@ def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
 def _write_page(options: argparse.Namespace) -> int:
     from magnet.viewer.html import save_html
 
-    if options.style == "light":
-        raise ValueError("--style light is for the viewer; a page draws body, capsules or skeleton")
     takes, body = _read(options)
     truth = _truth(options, body, takes[0].scene.fps)
     styles = (options.style,) if options.style else None

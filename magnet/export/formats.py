@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -155,7 +155,7 @@ def write(
     smplx: bool = False,
     context_frames: int = 0,
     known: Tensor | None = None,
-    style: Style = "body",
+    style: Style | Literal["light"] = "body",
     title: str | None = None,
     progress: bool | Report = False,
 ) -> list[Path]:
@@ -171,7 +171,7 @@ def write(
         smplx: npz with SMPL-X's conventional keys.
         context_frames: how many first frames were given to a model, where the scene does not say; pictures mark them.
         known: (T, P) bool instead, whatever the scene says.
-        style: how pictures show people: `body`, `capsules` or `skeleton`.
+        style: how pictures show people: `body`, `capsules` or `skeleton`; of pages also `light`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function told (done, all).
 
@@ -217,7 +217,7 @@ class _Given:
 
     context: int
     known: Tensor | None
-    style: Style
+    style: Style | Literal["light"]
     title: str | None
 
     def resampled(self, scene: Scene, fps: float) -> _Given:

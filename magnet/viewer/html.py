@@ -16,7 +16,7 @@ from torch import Tensor
 from magnet.body.base import PARENTS, Body
 from magnet.motion.scene import Scene
 from magnet.viewer.palette import GHOST, agent_colours, pale
-from magnet.viewer.rig import STYLES, Rig, Style, bone_poses, rigs
+from magnet.viewer.rig import STYLES, VIEWS, Rig, Style, bone_poses, rigs
 from magnet.viewer.takes import Take, same_length, take
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
@@ -42,8 +42,9 @@ def save_html(
         context: first frames, shown paler as given to the model, where the scene does not say which were.
         known: (T, P) bool, the frames of whom to show paler, whatever the scene says.
         truth: a scene (B = 1) shown as ghosts; held or cut to the scene's length.
-        styles: looks to choose from, the first one first. By default all, but no skin of a body that is not the
-            open one: the file would carry a model that its owner may not pass on. Name "body" to have it all the same.
+        styles: looks to choose from, the first one first. By default body, capsules and skeleton, but no skin of a
+            body that is not the open one: the file would carry a model that its owner may not pass on. Name "body" or
+            "light" to have it all the same.
 
     Returns:
         The path written.
@@ -73,9 +74,9 @@ def page(
         raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to a page of its own")
     if styles is None:
         styles = STYLES if body.id.startswith("open") else tuple(s for s in STYLES if s != "body")
-    unknown = [style for style in styles if style not in STYLES]
+    unknown = [style for style in styles if style not in VIEWS]
     if unknown or not styles:
-        raise ValueError(f"styles {styles}: choose from {', '.join(STYLES)}")
+        raise ValueError(f"styles {styles}: choose from {', '.join(VIEWS)}")
     title = title or (scene.names[0] if scene.names else "") or "magnet"
     shown = take(title, scene, min(context, scene.frames), known=known)
     ghosts = None if truth is None else same_length(take("ground truth", truth), shown)

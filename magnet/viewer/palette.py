@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.stage import AGENTS, BACKGROUND, PALE, TILES
+from magnet.export.stage import AGENTS, TILES
 
 PALENESS = 0.58
 """How far the colour of given motion lies towards white."""
@@ -17,8 +17,6 @@ TOUCHES = (250, 200, 40)
 COLLIDES = (225, 30, 45)
 FLOOR = TILES[0]
 LINES = TILES[1]
-PAPER = BACKGROUND
-QUIET = PALE
 
 Colours = NDArray[np.uint8]
 

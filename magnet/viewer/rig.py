@@ -24,9 +24,9 @@ Array = NDArray[np.floating]
 Index = NDArray[np.integer]
 Style = Literal["body", "light", "capsules", "skeleton"]
 STYLES: tuple[Style, ...] = ("body", "capsules", "skeleton")
-"""What a page of its own can hold."""
+"""What a page of its own holds unless others are asked for."""
 VIEWS: tuple[Style, ...] = ("body", "light", "capsules", "skeleton")
-"""What the viewer can show; `light` is the body with a twentieth of its vertices."""
+"""All there are; `light` is the body with a twentieth of its vertices."""
 
 INFLUENCES = 4
 """Bones that a vertex can follow in a browser."""

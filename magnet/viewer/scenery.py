@@ -11,8 +11,8 @@ from magnet.viewer import marks
 from magnet.viewer.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.viewer.rig import Array, Index, capsule
 
-HIDDEN = -50.0
-"""Height in metres at which marks that are not needed wait under the floor."""
+AWAY, NO_SIZE = -50.0, 1e-6
+"""Height in metres and size of marks that are not needed: mostly out of sight, so not drawn, and nothing to see."""
 
 
 class Floor:
@@ -72,13 +72,12 @@ class Spots:
     def __init__(self, server: Any, name: str, mesh: tuple[Array, Index], most: int, opacity: float | None) -> None:
         self.most, self.shown = most, 0
         upright = np.tile(np.float32([1, 0, 0, 0]), (most, 1))  # type: ignore[arg-type]
-        away = np.tile(np.float32([0, HIDDEN, 0]), (most, 1))  # type: ignore[arg-type]
         self.batch = server.scene.add_batched_meshes_simple(
             name,
             *mesh,
             upright,
-            away,
-            batched_scales=np.ones(most, dtype=np.float32),
+            self._away(),
+            batched_scales=np.full(most, NO_SIZE, dtype=np.float32),
             batched_colors=np.zeros((most, 3), dtype=np.uint8),
             opacity=opacity,
             lod="off",
@@ -91,11 +90,11 @@ class Spots:
         M = min(len(places), self.most)
         if M == self.shown == 0:
             return
-        at = np.tile(np.float32([0, HIDDEN, 0]), (self.most, 1))  # type: ignore[arg-type]
+        at = self._away()
         at[:M] = places[:M]
         tint = np.zeros((self.most, 3), dtype=np.uint8)
         tint[:M] = np.broadcast_to(colours, (len(places), 3))[:M]
-        scale = np.ones(self.most, dtype=np.float32)
+        scale = np.full(self.most, NO_SIZE, dtype=np.float32)
         scale[:M] = np.broadcast_to(sizes, (len(places),))[:M]
         self.batch.batched_positions, self.batch.batched_colors, self.batch.batched_scales = (
             at,
@@ -103,6 +102,9 @@ class Spots:
             scale,
         )
         self.shown = M
+
+    def _away(self) -> Array:
+        return np.tile(np.array([0, AWAY, 0], dtype=np.float32), (self.most, 1))
 
     def remove(self) -> None:
         self.batch.remove()

@@ -47,7 +47,10 @@ def free_port(host: str, port: int) -> int:
 
     Raises:
         OSError: it is taken, or the host is not this machine.
+        ValueError: no port has this number.
     """
+    if not 0 <= port < 2**16:
+        raise ValueError(f"--port {port}: expected 0 to {2**16 - 1}; 0 takes any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -55,7 +58,7 @@ def free_port(host: str, port: int) -> int:
             probe.bind((host, port))
         except socket.gaierror as error:
             raise OSError(f"--host {host}: no such address; use 127.0.0.1, or 0.0.0.0 for all") from error
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise OSError(taken(host, port)) from error
         return int(probe.getsockname()[1])
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from magnet.body.base import Body
 from magnet.viewer.clock import SPEEDS, Clock
-from magnet.viewer.palette import PAPER
 from magnet.viewer.rig import VIEWS, Array
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scenery import Floor
@@ -20,6 +19,8 @@ from magnet.viewer.troupe import Look, Troupe
 
 RATE = 30.0
 """Frames a second that are sent at most."""
+SETTLES = 0.3
+"""Seconds after which a slider that was moved is taken to be let go."""
 CAMERAS = {"three quarters": (0.65, 0.30), "front": (0.0, 0.12), "side": (1.571, 0.12), "above": (0.0, 1.45)}
 """Presets: azimuth about the vertical from +z and elevation, radians."""
 AIM = 0.85
@@ -47,11 +48,11 @@ class Stage:
         self.follow, self.centre = True, np.zeros(3)
         self.shown = -1
         self.sent = 0
+        self.unsettled: float | None = None  # when a person moved the slider
         self._stop = threading.Event()
         scene = self.server.scene
         scene.set_up_direction("+y")
         scene.configure_default_lights(True, cast_shadow=look.shadows)
-        scene.set_background_image(np.full((4, 4, 3), PAPER, dtype=np.uint8))
         self.root = scene.add_frame("/stage", show_axes=False)
         self.floor = Floor(self.server, "/stage")
         self.server.gui.main_panel.dock_right()
@@ -77,6 +78,7 @@ class Stage:
                 with self.lock:
                     self.clock.playing = False
                     self.clock.seek(int(self.slider.value))
+                    self.unsettled = time.perf_counter()
                 self._update_play()
 
         def press(_: Any) -> None:
@@ -244,6 +246,16 @@ class Stage:
             lines.append(f"{label}{state.removeprefix(' · ')}")
         return "  \n".join(lines)
 
+    def settle(self, now: float) -> None:
+        """Say once more where a slider stands that a person has let go: frames still on their way may have moved it."""
+        if self.unsettled is None or now < self.unsettled + SETTLES:
+            return
+        self.unsettled = None
+        with self.lock, self.server.atomic():
+            frame = self.clock.frame
+            self.slider.value = frame - 1 if frame else 1  # viser does not send what it takes to be there
+            self.slider.value = frame
+
     def before_draw(self) -> None:
         """What happens between two frames."""
 
@@ -260,6 +272,7 @@ class Stage:
             last = now
             self.before_draw()
             self.draw()
+            self.settle(now)
             self._stop.wait(max(0.001, 1 / RATE - (time.perf_counter() - now)))
 
     def start(self) -> threading.Thread:

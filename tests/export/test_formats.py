@@ -35,6 +35,13 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
+def test_a_page_can_be_light_and_a_film_says_that_it_cannot(duet: Scene, body: Body, tmp_path: Path):
+    (page,) = formats.write(duet, tmp_path / "a.html", body, style="light")
+    assert '"styles":["light"]' in page.read_text()
+    with pytest.raises(ValueError, match="style 'light': expected one of"):
+        formats.write(duet, tmp_path / "a.gif", body, style="light")
+
+
 def test_mp4_is_written_where_its_package_is(duet: Scene, body: Body, tmp_path: Path):
     pytest.importorskip("av", reason="PyAV is not installed")
     (path,) = formats.write(duet.cut(0, 3), tmp_path / "a.mp4", body, style="skeleton")

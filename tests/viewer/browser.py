@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from magnet.body import Body
 from magnet.testing import tiny_denoiser
+from magnet.viewer.live import Live
+from magnet.viewer.takes import Take
 
 SHOTS = Path(__file__).parents[2] / "runs" / "viewer"
 
@@ -25,13 +29,13 @@ def wait(done: Callable[[], Any], seconds: float = 300.0) -> Any:
     return result
 
 
-def shot(page: Any, name: str) -> np.ndarray:
-    """A screenshot, kept. -> (H, W, 3) 0 to 255"""
+def shot(page: Any, name: str, part: Any = None) -> np.ndarray:
+    """A screenshot of a page or a part of it, kept. -> (H, W, 3) 0 to 255"""
     from PIL import Image
 
     undisturbed(page)
     SHOTS.mkdir(parents=True, exist_ok=True)
-    raw = page.screenshot(path=SHOTS / f"{name}.png")
+    raw = (part or page).screenshot(path=SHOTS / f"{name}.png")
     return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)
 
 
@@ -89,6 +93,31 @@ def shown(stage: Any, page: Any) -> Iterator[Any]:
     finally:
         stage.stop()
         thread.join(timeout=10)
+
+
+@contextlib.contextmanager
+def watched(page: Any, takes: list[Take], body: Body, truth: Take | None = None, style: Any = None) -> Iterator[Any]:
+    """A viewer of takes, without true shadows, and its page loaded."""
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer, first_look
+
+    viewer = Viewer(takes, body, truth, port=0, look=first_look(takes, style, shadows=False))
+    with shown(viewer, page):
+        yield viewer
+
+
+@contextlib.contextmanager
+def played(page: Any, live: Live, body: Body) -> Iterator[Any]:
+    """A model that plays live and has gone on from its first frames, without true shadows, and its page loaded."""
+    pytest.importorskip("viser")
+    from magnet.viewer.live import FIRST
+    from magnet.viewer.play import Playground
+    from magnet.viewer.troupe import Look
+
+    playground = Playground(live, body, port=0, look=Look(shadows=False))
+    with shown(playground, page):
+        wait(lambda: live.scene.frames > FIRST)
+        yield playground
 
 
 def choose(page: Any, label: str, value: str) -> None:

@@ -13,6 +13,7 @@ from magnet.body import Body, load_body
 from magnet.motion.scene import Scene
 from magnet.synthesis.generate import synthesize
 from magnet.testing import random_scene
+from magnet.viewer.server import start
 
 SIZE = {"width": 800, "height": 500}
 FLAGS = (
@@ -37,6 +38,15 @@ def body() -> Body:
 def duet(generator: torch.Generator) -> Scene:
     """One scene of two people, 24 frames."""
     return random_scene(1, 24, 2, generator)
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    """viser's, on any port."""
+    pytest.importorskip("viser")
+    server = start("127.0.0.1", 0, "test")
+    yield server
+    server.stop()
 
 
 @pytest.fixture(scope="module")

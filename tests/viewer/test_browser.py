@@ -11,6 +11,7 @@ import torch
 from magnet.denoiser.generation import SamplerOptions
 from magnet.motion.scene import Scene
 from magnet.tasks.joint import JointFuture
+from magnet.viewer import stage
 from magnet.viewer.recording import record
 from magnet.viewer.saving import FORMATS
 from magnet.viewer.takes import take
@@ -27,23 +28,19 @@ from tests.viewer.browser import (
     seen,
     shipped,
     shot,
-    shown,
     tick,
     upright,
     wait,
+    watched,
 )
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 def test_files_play_pause_step_and_scrub(page, handshake, body) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
-
     takes = [take("handshake", handshake, 32)]
     truth = take("truth", handshake.cut(4))
-    viewer = Viewer(takes, body, truth, port=0, look=first_look(takes, shadows=False))
-    with shown(viewer, page):
+    with watched(page, takes, body, truth) as viewer:
         first = viewer.shown
         wait(lambda: viewer.shown != first)
         press(page, "Pause")
@@ -54,6 +51,7 @@ def test_files_play_pause_step_and_scrub(page, handshake, body) -> None:
         wait(lambda: viewer.shown == 61)
         enter(page, "frame", 66)
         wait(lambda: viewer.shown == 66)
+        wait(lambda: field(page, "frame").last.input_value() == "66")  # also where older frames come late
         image = seen(page, "watch_body", lambda image: blue(image).sum() > 500 and upright(orange(image)))
         assert page.get_by_text("standing feet").is_visible()
         tick(page, "ground truth")
@@ -65,12 +63,8 @@ def test_files_play_pause_step_and_scrub(page, handshake, body) -> None:
 
 
 def test_the_look_changes_and_the_scene_is_saved(page, handshake, body, tmp_path) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
-
     takes = [take("one", handshake, 32), take("two", handshake)]
-    viewer = Viewer(takes, body, port=0, look=first_look(takes, shadows=False))
-    with shown(viewer, page):
+    with watched(page, takes, body) as viewer:
         viewer.clock.playing = False
         viewer.clock.seek(64)
         choose(page, "people", "capsules")
@@ -79,20 +73,20 @@ def test_the_look_changes_and_the_scene_is_saved(page, handshake, body, tmp_path
         choose(page, "people", "skeleton")
         wait(lambda: viewer.look.style == "skeleton")
         seen(page, "watch_skeleton", lambda image: 60 < blue(image).sum() < 0.8 * full)
+        (client,) = viewer.server.get_clients().values()
+        page.get_by_text("above", exact=True).click()
+        wait(lambda: client.camera.position[1] > 0.9 * np.linalg.norm(client.camera.position))
+        seen(page, "watch_above", lambda image: blue(image).any() and not upright(blue(image) | orange(image)))
         page.get_by_text("Save", exact=True).click()
         path = downloaded(page, "npz", "one.npz", tmp_path)
         assert torch.equal(Scene.load(path).T_world_root, handshake.T_world_root)
 
 
 def test_without_a_truth_there_are_no_ghosts_and_the_panel_says_so(page, handshake, body) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
-
     given = torch.zeros(1, handshake.frames, 2, dtype=torch.bool)
     given[:, :, 1] = True
     takes = [take("answer", handshake.replace(given=given))]
-    viewer = Viewer(takes, body, port=0, look=first_look(takes, shadows=False))
-    with shown(viewer, page):
+    with watched(page, takes, body) as viewer:
         viewer.clock.playing = False
         viewer.clock.seek(60)
         assert field(page, "ground truth: none given").is_disabled()
@@ -101,15 +95,11 @@ def test_without_a_truth_there_are_no_ghosts_and_the_panel_says_so(page, handsha
 
 
 def test_every_format_is_downloaded(page, handshake, body, tmp_path) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
-
     takes = [take("dance", handshake.cut(40, 64), 8)]
-    viewer = Viewer(takes, body, port=0, look=first_look(takes, "skeleton", shadows=False))
     begins = {"npz": b"PK", "bvh": b"PK", "glb": b"glTF", "csv": b"scene,frame", "gif": b"GIF8", "png": b"\x89PNG"}
     begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00"}
     files = {}
-    with shown(viewer, page):
+    with watched(page, takes, body, style="skeleton") as viewer:
         viewer.clock.playing = False
         page.get_by_text("Save", exact=True).click()
         for kind in FORMATS:
@@ -122,21 +112,23 @@ def test_every_format_is_downloaded(page, handshake, body, tmp_path) -> None:
     shot(page, "page_downloaded")
 
 
-def test_what_cannot_be_saved_is_said(page, handshake, body, monkeypatch) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer import stage
-    from magnet.viewer.watch import Viewer, first_look
-
+def test_what_cannot_be_saved_is_said_and_nothing_is_downloaded(page, handshake, body, monkeypatch) -> None:
     def refuses(*_: object) -> tuple[str, bytes]:
         raise ImportError('films need av: pip install "magnet-motion[video]"')
 
     monkeypatch.setattr(stage, "saved", refuses)
-    takes = [take("dance", handshake.cut(40, 64))]
-    viewer = Viewer(takes, body, port=0, look=first_look(takes, "skeleton", shadows=False))
-    with shown(viewer, page):
+    files = []
+    page.on("download", lambda download: files.append(download))
+    with watched(page, [take("dance", handshake.cut(40, 64))], body, style="skeleton"):
         page.get_by_text("Save", exact=True).click()
         press(page, "Download")
-        page.get_by_text("magnet-motion[video]").wait_for()
+        notice = page.get_by_role("alert").filter(has_text="magnet-motion[video]")
+        notice.wait_for()
+        assert "Not saved" in notice.inner_text()
+        red = shot(page, "watch_not_saved", notice)
+        assert (red[..., 0] > red[..., 1] + 80).any()
+        wait(lambda: page.get_by_role("button", name="Download", exact=True).is_enabled())
+    assert not files
 
 
 def differs(image: np.ndarray, before: np.ndarray | None) -> bool:
@@ -145,24 +137,22 @@ def differs(image: np.ndarray, before: np.ndarray | None) -> bool:
 
 
 def test_the_slider_goes_through_the_steps_of_denoising(page, handshake, body) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
-
     generator = torch.Generator().manual_seed(1)
     recording = record(shipped(), handshake, JointFuture(), 32, 32, SamplerOptions(steps=6), generator)
-    takes = [take("steps", recording.scene, recording=recording)]
-    viewer = Viewer(takes, body, port=0, look=first_look(takes, shadows=False))
-    with shown(viewer, page):
+    noise, images = [], []
+    with watched(page, [take("steps", recording.scene, recording=recording)], body) as viewer:
         press(page, "Pause")
         wait(lambda: not viewer.clock.playing)
         viewer.clock.seek(60)
-        page.get_by_text("levels: time, people").wait_for()
-        images = []
-        for step in (0, recording.steps):
+        levels = page.get_by_text("levels: time, people").locator("xpath=following::img[1]")
+        for step, name in ((0, "first"), (recording.steps, "last")):
             enter(page, "denoising step", step)
             said = f"expected after step 1 of {recording.steps}" if step == 0 else "finished"
             page.get_by_text(said, exact=True).wait_for()
-            wait(lambda step=step: (viewer.troupes[0].estimate is None) == (step > 0))
             before = images[-1] if images else None
-            name = f"denoising_{'first' if step == 0 else 'last'}"
-            images.append(seen(page, name, lambda image, before=before: blue(image).any() and differs(image, before)))
+            shows = f"denoising_{name}"
+            images.append(seen(page, shows, lambda image, before=before: blue(image).any() and differs(image, before)))
+            noise.append((shot(page, f"levels_{name}", levels).min(axis=-1) > 235).mean())
+    assert (
+        0.2 < noise[0] < 0.6 and noise[1] < 0.05
+    )  # the window's new half is white at first, and full of colour at last

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from magnet.motion.scene import Scene
+from magnet.viewer.live import FIRST, REACH, Live
 from tests.viewer.browser import (
     blue,
     choose,
@@ -13,10 +14,10 @@ from tests.viewer.browser import (
     drag_handle,
     enter,
     orange,
+    played,
     press,
     seen,
     shipped,
-    shown,
     tick,
     wait,
 )
@@ -25,16 +26,9 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, body, tmp_path) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.live import FIRST, Live
-    from magnet.viewer.play import Playground
-    from magnet.viewer.troupe import Look
-
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
     live.settings.steps = 10
-    playground = Playground(live, body, port=0, look=Look(shadows=False))
-    with shown(playground, page):
-        wait(lambda: live.scene.frames > FIRST)
+    with played(page, live, body) as playground:
         choose(page, "task", "motion_control")
         wait(lambda: live.settings.task == "motion_control")
         choose(page, "whom", "person 2")
@@ -75,15 +69,8 @@ def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, bo
 
 
 def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(page, body) -> None:
-    pytest.importorskip("viser")
-    from magnet.viewer.live import FIRST, REACH, Live
-    from magnet.viewer.play import Playground
-    from magnet.viewer.troupe import Look
-
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
-    playground = Playground(live, body, port=0, look=Look(shadows=False))
-    with shown(playground, page):
-        wait(lambda: live.scene.frames > FIRST)
+    with played(page, live, body) as playground:
         tick(page, "loop")
         wait(lambda: playground.worker.paused and playground.clock.loop)
         press(page, "Pause")

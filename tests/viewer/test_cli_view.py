@@ -10,6 +10,7 @@ from magnet import cli_view
 from magnet.cli import main
 from magnet.motion.scene import Scene
 from magnet.viewer import server
+from magnet.viewer.rig import VIEWS
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -29,6 +30,12 @@ def test_a_port_in_use_names_another(tmp_path: Path, duet: Scene, capsys) -> Non
         port = holder.getsockname()[1]
         assert f"port {port} of 127.0.0.1 is in use" in (line := said(capsys, str(path), "--port", str(port)))
         assert "--port" in line
+
+
+def test_a_port_that_no_machine_has_is_named(tmp_path: Path, duet: Scene, capsys) -> None:
+    pytest.importorskip("viser")
+    path = duet.save(tmp_path / "a.npz")
+    assert "--port 99999: expected 0 to 65535" in said(capsys, str(path), "--port", "99999")
 
 
 @pytest.mark.parametrize("words", [["--live"], ["a.npz"]])
@@ -98,9 +105,12 @@ def test_without_a_display_no_browser_is_started(monkeypatch) -> None:
     assert not server.open_browser("http://localhost:1")
 
 
-def test_a_page_is_written_without_viser_or_a_server(tmp_path: Path, duet: Scene, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize("style", VIEWS)
+def test_a_page_of_any_style_is_written_without_viser_or_a_server(
+    tmp_path: Path, duet: Scene, monkeypatch, capsys, style
+) -> None:
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     path = duet.save(tmp_path / "a.npz")
-    assert main(["view", str(path), "--html", str(tmp_path / "a.html"), "--style", "skeleton", "--context", "4"]) == 0
-    assert (tmp_path / "a.html").stat().st_size > 10_000
+    assert main(["view", str(path), "--html", str(tmp_path / "a.html"), "--style", style, "--context", "4"]) == 0
+    assert f'"styles":["{style}"]' in (tmp_path / "a.html").read_text()
     assert "written:" in capsys.readouterr().out

@@ -109,5 +109,5 @@ FIELDS = ("J_template", "J_shapedirs", "v_template", "shapedirs", "weights", "fa
 def test_several_scenes_and_unknown_styles_are_refused(scene: Scene, duet: Scene, body: Body) -> None:
     with pytest.raises(ValueError, match="got 2 scenes, expected one"):
         page(scene, body)
-    with pytest.raises(ValueError, match="choose from body, capsules, skeleton"):
+    with pytest.raises(ValueError, match="choose from body, light, capsules, skeleton"):
         page(duet, body, styles=("cartoon",))  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ from magnet.metrics.penetration import penetration_depth
 from magnet.metrics.skating import toe_steps
 from magnet.motion.scene import Scene
 from magnet.viewer import marks
+from magnet.viewer.scenery import Spots, ball
 
 
 def test_standing_and_sliding_are_those_of_the_metric(duet: Scene, body: Body) -> None:
@@ -49,3 +50,11 @@ def test_one_person_alone_collides_with_nobody(duet: Scene, body: Body) -> None:
     joints = body.joints(duet)[0, 0, :1].numpy()
     assert len(marks.penetrations(joints)[2]) == 0
     assert len(marks.touching(joints)) == 0
+
+
+def test_marks_that_are_not_needed_are_too_small_to_be_seen(server) -> None:
+    spots = Spots(server, "/spots", ball(1.0), 5, None)
+    assert spots.batch.batched_scales.max() < 1e-5
+    for shown in (3, 1, 0):
+        spots.show(np.ones((shown, 3)), np.zeros(3), 0.5)
+        assert (spots.batch.batched_scales[:shown] == 0.5).all() and spots.batch.batched_scales[shown:].max() < 1e-5

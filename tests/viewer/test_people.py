@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,6 @@ from magnet.motion.scene import Scene
 from magnet.viewer.palette import agent_colours
 from magnet.viewer.people import Skinned, add_people, poser, quick_poser
 from magnet.viewer.rig import bone_poses
-from magnet.viewer.server import start
-
-
-@pytest.fixture
-def server() -> Iterator[Any]:
-    pytest.importorskip("viser")
-    server = start("127.0.0.1", 0, "test")
-    yield server
-    server.stop()
 
 
 def told(mesh: Any, pose: Any, turns: Any, places: Any, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
