@@ -19,6 +19,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.export import formats
 from magnet.motion.scene import FPS, Scene, absent, require_rate
 from magnet.motion.tokens import STRIDE
+from magnet.partner import Partner
 from magnet.tasks import registry
 
 if TYPE_CHECKING:
@@ -230,6 +231,20 @@ class Model:
         """An agent's answer, from its first `context` frames on, to what the others do up to each moment."""
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=(agent,))
 
+    def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> Partner:
+        """Agents who answer live: `partner(past).answer(frames)` with the others' newest frames, 4 or more at a time.
+
+        Args:
+            past: how it began, of everybody; a second is enough.
+            agents: slots of those who answer.
+
+        Raises:
+            ValueError: as `magnet.partner.Partner`.
+        """
+        plain = past.plain() if isinstance(past, Motion) else past
+        targets = (agents,) if isinstance(agents, int) else tuple(agents)
+        return Partner(self.denoiser, plain, targets, self.sampler, self._generator(seed))
+
     def predict(
         self,
         scene: Scene,
@@ -260,12 +275,16 @@ class Model:
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
         chosen: Task = kind(**fields)
-        generator = torch.Generator(self.denoiser.device)
-        generator.manual_seed(seed) if seed is not None else generator.seed()
+        generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
         sampled = self.denoiser.generate(plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
         shown = sampled.order(torch.arange(slots))
         return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
+
+    def _generator(self, seed: int | None) -> torch.Generator:
+        generator = torch.Generator(self.denoiser.device)
+        generator.manual_seed(seed) if seed is not None else generator.seed()
+        return generator
 
     def _with_room(self, scene: Scene, slots: int) -> Scene:
         if slots > self.most_people:

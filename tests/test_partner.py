@@ -1,0 +1,101 @@
+"""A partner who answers live."""
+
+import pytest
+import torch
+
+import magnet
+from magnet.api import Model
+from magnet.datamodules.synthetic import Synthetic
+from magnet.denoiser.generation import SamplerOptions
+from magnet.motion.scene import Scene, joined
+from magnet.partner import Partner
+from magnet.testing import random_scene, tiny_denoiser
+
+FAST = SamplerOptions(steps=2)
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    return tiny_denoiser(max_agents=3, window=8)
+
+
+@pytest.fixture(scope="module")
+def duet() -> Scene:
+    return random_scene(1, 60, 2, torch.Generator().manual_seed(5))
+
+
+def answered(denoiser, scene: Scene, piece: int = 4, past: int = 16, agents=(0,)) -> Scene:
+    partner = Partner(denoiser, scene.cut(0, past), agents, FAST, torch.Generator().manual_seed(0))
+    fed = [scene.cut(first, first + piece) for first in range(past, scene.frames, piece)]
+    return joined([partner.answer(frames) for frames in fed])
+
+
+@pytest.mark.parametrize("piece", [4, 8])
+def test_what_is_fed_comes_back_and_the_answer_is_the_models(denoiser, duet, piece):
+    scene = duet.cut(0, 56)
+    out, fed = answered(denoiser, scene, piece), scene.cut(16)
+    assert out.frames == 40
+    assert torch.equal(out.T_world_root[:, :, 1], fed.T_world_root[:, :, 1])
+    assert torch.equal(out.body_rot[:, :, 1], fed.body_rot[:, :, 1])
+    assert out.given[0, :, 1].all() and not out.given[0, :, 0].any()
+    assert out.T_world_root.isfinite().all()
+    assert not torch.equal(out.T_world_root[:, :, 0], fed.T_world_root[:, :, 0])
+
+
+def test_nothing_of_those_who_answer_is_read_from_what_is_fed(denoiser, duet):
+    other = random_scene(1, 60, 2, torch.Generator().manual_seed(6))
+    T_world_root, body_rot = duet.T_world_root.clone(), duet.body_rot.clone()
+    T_world_root[:, 16:, 0], body_rot[:, 16:, 0] = other.T_world_root[:, 16:, 0], other.body_rot[:, 16:, 0]
+    replaced = duet.replace(T_world_root=T_world_root, body_rot=body_rot)
+    ours, theirs = answered(denoiser, duet), answered(denoiser, replaced)
+    assert torch.equal(ours.T_world_root, theirs.T_world_root) and torch.equal(ours.body_rot, theirs.body_rot)
+
+
+def test_an_answer_is_there_before_what_comes_next(denoiser, duet):
+    """What is fed later changes nothing that was answered; what was fed before does."""
+    later = duet.T_world_root.clone()
+    later[:, 40:, 1, :3, 3] += 1.0
+    moved = duet.replace(T_world_root=later)
+    ours, theirs = answered(denoiser, duet), answered(denoiser, moved)
+    assert torch.equal(ours.T_world_root[:, :24], theirs.T_world_root[:, :24])
+    assert not torch.equal(ours.T_world_root[:, 24:, 0], theirs.T_world_root[:, 24:, 0])
+
+
+def test_answers_of_the_model_that_ships_go_on_from_one_another():
+    """Fed token by token, the answer moves at the borders as it moves inside, and as when all is known at once."""
+    model = magnet.load("duet", steps=6)
+    scene = Synthetic(test_clips=1).scene("test", 0).scene.cut(0, 72)
+    partner = model.partner(scene.cut(0, 32), agents=1, seed=0)
+    answers = [partner.answer(scene.cut(first, first + 4)) for first in range(32, 72, 4)]
+    live = joined([each.replace(given=None) for each in (scene.cut(0, 32), *answers)])
+    whole = model.react(scene, agent=1, seed=0)
+    root, of_whole = (each.T_world_root[0, 31:, 1, :3, 3].diff(dim=0).norm(dim=-1) for each in (live, whole))
+    assert root[::4].max() < 1.5 * of_whole.max()
+    assert (live.T_world_root[0, -1, 1, :3, 3] - scene.T_world_root[0, -1, 1, :3, 3]).norm() < 0.5
+
+
+def test_memory_of_the_past_does_not_grow(denoiser, duet):
+    partner = Partner(denoiser, duet.cut(0, 16), (0,), FAST, torch.Generator().manual_seed(0))
+    for _ in range(12):
+        partner.answer(duet.cut(16, 20))
+    assert partner.past.frames == 16
+
+
+def test_what_cannot_be_answered_is_named(denoiser, duet):
+    partner = Partner(denoiser, duet.cut(0, 16), (0,), FAST)
+    with pytest.raises(ValueError, match="multiple of 4"):
+        partner.answer(duet.cut(16, 18))
+    with pytest.raises(ValueError, match="same slots"):
+        partner.answer(random_scene(1, 4, 3, torch.Generator().manual_seed(0)))
+    with pytest.raises(ValueError, match="expected at least 4"):
+        Partner(denoiser, duet.cut(0, 2))
+    with pytest.raises(ValueError, match="not none and not all"):
+        Partner(denoiser, duet.cut(0, 16), (0, 1), FAST).answer(duet.cut(16, 20))
+
+
+def test_a_loaded_model_gives_a_partner(denoiser, duet):
+    partner = Model(denoiser, FAST).partner(duet.cut(0, 32), agents=1, seed=3)
+    again = Model(denoiser, FAST).partner(duet.cut(0, 32), agents=1, seed=3)
+    one, two = (each.answer(duet.cut(32, 40)) for each in (partner, again))
+    assert torch.equal(one.T_world_root, two.T_world_root)
+    assert torch.equal(one.T_world_root[:, :, 0], duet.T_world_root[:, 32:40, 0])
