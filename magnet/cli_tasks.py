@@ -147,7 +147,7 @@ class Shown:
     tokens: int = 14
     context: int = 4
     steps: int = 6
-    window: int = 16
+    window: int = 8
     stride: int = 4
     rolling: int | None = None
     moments: int = 16

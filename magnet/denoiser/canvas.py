@@ -22,6 +22,7 @@ from magnet.motion.frames import (
     place,
     posed,
     project_se2,
+    shift_onto,
     to_9d,
 )
 from magnet.motion.scene import Scene
@@ -267,9 +268,9 @@ class Canvas:
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`, such that the first step leads to the right place.
 
-        Whoever was there before goes on from there. A newcomer's first frame hangs by the pairwise transform
-        off somebody known at that frame, or off somebody who was there before, or off the first newcomer, who then
-        starts at the origin; in each scene off somebody who is present.
+        Whoever was there before goes on from there. A newcomer's whole way hangs by the pairwise transforms, as
+        nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
+        newcomer, who then starts at the origin; in each scene off somebody who is present.
         """
         starts = self.T_world_can[:, max(first * STRIDE - 1, 0)].clone()
         there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
@@ -283,14 +284,16 @@ class Canvas:
         onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
         T_world_anchor = torch.where(now[anchor, None, None], self.T_world_can[scene, first * STRIDE, anchor], onward)
         for agent in (~there).nonzero()[:, 0].tolist():
-            T_world_first = T_world_anchor
-            if bool(now[agent]):
-                T_world_first = self.T_world_can[:, first * STRIDE, agent]
-            elif T_self_partner is not None:
-                slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
-                hung = T_world_anchor @ project_se2(T_self_partner[scene, 0, anchor, slot])
-                T_world_first = torch.where((anchor == agent)[:, None, None], T_world_anchor, hung)
+            T_world_first = self.T_world_can[:, first * STRIDE, agent] if bool(now[agent]) else T_world_anchor
             starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
+        if T_self_partner is None:
+            return starts
+        ways = place(T_prev_can, None, starts)
+        for agent in (~there & ~now).nonzero()[:, 0].tolist():
+            slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
+            hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
+            shift = shift_onto(ways[:, :, agent], hung)
+            starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
         return starts
 
     def _arrive(self, row: int, new: Tensor) -> Tensor:

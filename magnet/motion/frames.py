@@ -148,6 +148,17 @@ def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
     )
 
 
+def shift_onto(path: Tensor, target: Tensor) -> Tensor:
+    """The turn and move over the ground that best lay a path onto another: headings first, then positions.
+
+    (..., T, 4, 4), (..., T, 4, 4) -> (..., 4, 4), such that shift @ path is about target.
+    """
+    (yaw, ground), (yaw_target, ground_target) = to_planar(path), to_planar(target)
+    off = yaw_target - yaw
+    turned = torch.atan2(off.sin().mean(dim=-1), off.cos().mean(dim=-1))
+    return from_planar(turned, (ground_target - turn(turned[..., None], ground)).mean(dim=-2))
+
+
 # -- from predicted tokens back into the world -------------------------------------------------
 
 

@@ -224,7 +224,8 @@ class MaskSchedule:
         """Denoise along a slope: each token `grid.slope` denoising steps behind the one before it in time.
 
         A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
-        finishes one more token step.
+        finishes one more token step. As long as less than half of a window lies behind, there is too little to go on
+        from: the first window is then filled whole.
 
         Args:
             known: (N, P) bool, given clean.
@@ -232,9 +233,16 @@ class MaskSchedule:
             grid: sizes; `grid.slope` is over 0.
         """
         plan = ddim_levels(grid.steps, grid.shift)
+        level, stages, done = initial_levels(known), [], 0
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
+        if wanted and wanted[0] < grid.window // 2:
+            done = min(grid.window, grid.tokens)
+            rows = torch.where(target[:done], plan[:, None, None], level[:done])
+            stages.append(Stage(0, rows.short()))
+            level[:done] = rows[-1]
+        rolling = target & (torch.arange(grid.tokens) >= done)[:, None]
+        wanted = [token for token in wanted if token >= done]
         first = wanted[0] if wanted else 0
-        level, stages = initial_levels(known), []
         ended = 0
         for token in wanted:
             begins, ended = ended, grid.steps + (token - first) * grid.slope
@@ -242,7 +250,7 @@ class MaskSchedule:
             stop = min(start + grid.window, grid.tokens)
             behind = grid.slope * (torch.arange(start, stop) - first)
             turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
-            rows = torch.where(target[start:stop], plan[turn.clamp(0, grid.steps)][..., None], level[start:stop])
+            rows = torch.where(rolling[start:stop], plan[turn.clamp(0, grid.steps)][..., None], level[start:stop])
             changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
             rows = torch.cat([rows[:1], rows[1:][changes]])
             stages.append(Stage(start, rows.short()))

@@ -16,6 +16,7 @@ from magnet.motion.frames import (
     posed,
     propagated,
     rigid,
+    shift_onto,
     to_9d,
     to_planar,
 )
@@ -213,3 +214,16 @@ def test_bowing_past_the_horizontal_does_not_turn_a_person_round():
 
 def test_9d_round_trip(scene: Scene):
     assert torch.allclose(from_9d(to_9d(scene.T_world_root)), scene.T_world_root, atol=1e-6)
+
+
+def test_a_path_is_laid_onto_where_it_was_moved_from(generator):
+    """Exactly where it differs by one turn and move; else heading and middle are those of the target."""
+    scene = random_scene(3, 20, 2, generator)
+    path = canonical_frame(scene.T_world_root)[:, :, 0]
+    moved = from_planar(torch.tensor([0.3, -2.0, 3.0]), torch.randn(3, 2, generator=generator))
+    torch.testing.assert_close(shift_onto(path, moved[:, None] @ path), moved, atol=1e-5, rtol=0)
+    other = canonical_frame(scene.T_world_root)[:, :, 1]
+    laid = shift_onto(path, other)[:, None] @ path
+    torch.testing.assert_close(to_planar(laid)[1].mean(dim=1), to_planar(other)[1].mean(dim=1), atol=1e-5, rtol=0)
+    off = to_planar(inverse(laid) @ other)[0]
+    torch.testing.assert_close(off.sin().sum(dim=1), torch.zeros(3), atol=1e-4, rtol=0)
