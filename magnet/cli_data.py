@@ -7,9 +7,14 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
 from magnet.cli_data_shown import bar, file_bars, show_persons, show_skipped, show_splits
+
+if TYPE_CHECKING:
+    from magnet.body import Body
+    from magnet.datamodules.check import Checked
 
 DESCRIPTION = """\
 Prepare, check, describe, fake and download data sets.
@@ -32,43 +37,47 @@ def main(arguments: Sequence[str]) -> int:
         ValueError: a data set, option or folder that does not fit; says what does.
         OSError: a folder or disk that cannot be used.
     """
-    given = list(arguments)
-    name = given[1] if len(given) > 1 and given[0] in ("prepare", "check") else None
-    known, rest = parser().parse_known_args(given)
-    if "run" not in known:
+    command, *words = arguments or [""]
+    if command not in COMMANDS:
+        parser().parse_known_args(arguments)
         parser().print_help()
         return 0
-    if rest and not (known.takes_reader_options and all_reader_options(rest)):
-        raise ValueError(f"magnet data {given[0]}: no option {rest[0]}; see magnet data {given[0]} --help")
+    # Intermixed, so that OUT may come after options: argparse would take it as left out once another came before them.
+    known, rest = command_parser(command).parse_known_intermixed_args(words)
+    if rest and not (command in ("prepare", "check") and all_reader_options(rest)):
+        raise ValueError(f"magnet data {command}: no option {rest[0]}; see magnet data {command} --help")
     known.reader_options = rest
-    if known.help:
-        return show_help(given[0], name)
-    return int(known.run(known))
+    return show_help(known) if known.help else int(known.run(known))
 
 
 def parser() -> argparse.ArgumentParser:
-    """The commands and their options."""
+    """The commands."""
     whole = argparse.ArgumentParser(
         prog="magnet data", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = whole.add_subparsers(metavar="COMMAND")
-    for name, (add, run, what) in COMMANDS.items():
-        one = commands.add_parser(name, help=what, description=what, add_help=False, allow_abbrev=False)
-        one.add_argument("-h", "--help", action="store_true", help="show this")
-        add(one)
-        one.set_defaults(run=run, parser=one, takes_reader_options=name in ("prepare", "check"))
+    for name, (_, _, what) in COMMANDS.items():
+        commands.add_parser(name, help=what)
     return whole
 
 
-def show_help(command: str, name: str | None) -> int:
+def command_parser(command: str) -> argparse.ArgumentParser:
+    """A command's options."""
+    add, run, what = COMMANDS[command]
+    one = argparse.ArgumentParser(f"magnet data {command}", description=what, add_help=False, allow_abbrev=False)
+    one.add_argument("-h", "--help", action="store_true", help="show this")
+    add(one)
+    one.set_defaults(run=run, parser=one)
+    return one
+
+
+def show_help(given: argparse.Namespace) -> int:
     """Help of a command, with a data set's own options where one is named."""
     from magnet.datamodules import catalogue
 
-    for one in parser()._subparsers._group_actions[0].choices.items():  # type: ignore[union-attr]
-        if one[0] == command:
-            one[1].print_help()
-    if name in catalogue.NAMES:
-        kind = catalogue.find(name).load_reader()
+    given.parser.print_help()
+    if given.run in (run_prepare, run_check) and given.name in catalogue.NAMES:
+        kind = catalogue.find(given.name).load_reader()
         print(f"\noptions of {kind.title}:\n")
         reader_parser(kind).print_help()
     return 0
@@ -123,7 +132,7 @@ def add_fake(one: argparse.ArgumentParser) -> None:
     one.add_argument("name", nargs="?", help="of the data set, see magnet data list; cmu as well")
     one.add_argument("out", nargs="?", help="folder to write to; new or empty")
     one.add_argument("--takes", type=int, default=4, help="(default: %(default)s)")
-    one.add_argument("--frames", type=int, default=300, help="of each take, at its own rate (default: %(default)s)")
+    one.add_argument("--frames", type=int, default=300, help="of a take at 30 fps, DuoBox: its test part (%(default)s)")
     one.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
 
 
@@ -211,37 +220,74 @@ def run_info(given: argparse.Namespace) -> int:
 
 
 def run_check(given: argparse.Namespace) -> int:
-    from magnet.body import load_body
     from magnet.datamodules import check
-    from magnet.datamodules.prepare import read_splits
-    from magnet.datamodules.store import MANIFEST, STATE, Folder
+    from magnet.datamodules.store import MANIFEST, STATE
 
     path = Path(needed(given, "path")[0]).expanduser()
-    body = load_body(given.body) if given.body != "open" else None
     if (path / MANIFEST).exists() or (path / STATE).is_dir():
-        folder = Folder(path)
-        name = folder.manifest["name"]
-        with bar() as tell:
-            found = check.check_store(folder, body, tell)
+        found, body = checked_store(given, path)
+    elif not path.is_dir():
+        raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
+    elif (name := given.name or check.recognise(path)) == "cmu":
+        found, body = checked_cmu(given, path)
     else:
-        if not path.is_dir():
-            raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
-        name = given.name or check.recognise(path)
-        order = order_of(given, name, str(path))
-        body = order.body()
-        splits = read_splits(given.splits) if given.splits else None
-        with bar() as tell:
-            found = check.check_download(order, given.workers, splits, given.limit, tell)
+        found, body = checked_download(given, name, path)
     show_splits(list(check.lines(found)), title=found.title)
     for note in found.notes:
         print(f"note: {note}")
     show_skipped(found.skipped)
-    if given.picture != "none" and (picture := check.draw(found, Path(given.picture or f"{name}_check.png"), body)):
+    picture = Path(given.picture or f"{found.name}_check.png")
+    if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
     for problem in found.problems:
         print(f"PROBLEM: {problem}", file=sys.stderr)
     print(f"{len(found.problems)} problems" if found.problems else "all assertions hold")
     return FAILED if found.problems else 0
+
+
+def checked_store(given: argparse.Namespace, path: Path) -> tuple[Checked, Body | None]:
+    """What was found, and the body to draw."""
+    from magnet.body import load_body
+    from magnet.datamodules import check
+    from magnet.datamodules.store import Folder
+
+    refuse_unused(given, "a store, which is checked whole, as it was prepared,")
+    body = load_body(given.body) if given.body != "open" else None
+    with bar() as tell:
+        return check.check_store(Folder(path), body, tell), body
+
+
+def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
+    """What was found, and the body to draw."""
+    from magnet.datamodules import check
+    from magnet.datamodules.cmu import CMU
+
+    refuse_unused(given, "CMU's recordings, all of which are fitted once and kept,", "name")
+    data = CMU(str(path), body_model=given.body)
+    return check.check_cmu(data), data.body
+
+
+def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[Checked, Body]:
+    """What was found, and the body to draw."""
+    from magnet.datamodules import check
+    from magnet.datamodules.prepare import read_splits
+
+    order = order_of(given, name, str(path))
+    body, splits = order.body(), read_splits(given.splits) if given.splits else None
+    with bar() as tell:
+        return check.check_download(order, given.workers, splits, given.limit, tell), body
+
+
+def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
+    """Options that would change nothing.
+
+    Raises:
+        ValueError: one was given.
+    """
+    used = ("path", "picture", "body", "workers", "reader_options", *used)
+    set_ones = {name for name, value in vars(given).items() if value != given.parser.get_default(name)}
+    if words := [*(f"--{name}" for name in sorted(set_ones.difference(used))), *given.reader_options]:
+        raise ValueError(f"{given.parser.prog}: {what} has no use for {words[0]}; leave it out")
 
 
 def run_prepare(given: argparse.Namespace) -> int:
@@ -268,6 +314,7 @@ def run_prepare(given: argparse.Namespace) -> int:
 
 def run_fake(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
+    from magnet.datamodules.windows import at_least
 
     name, out = needed(given, "name", "out")
     folder = Path(out).expanduser()
@@ -280,6 +327,7 @@ def run_fake(given: argparse.Namespace) -> int:
         then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
+    at_least(1, takes=given.takes, frames=given.frames)
     write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
     print(f"{len(files)} files of a made-up {name} are in {folder}. To {then}")

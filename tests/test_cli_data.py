@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from magnet import cli, cli_data_options
+from magnet import cli, cli_data, cli_data_options
 from magnet.datamodules import catalogue
 
 
@@ -68,6 +69,22 @@ def test_a_check_finds_one_changed_byte(copy, capsys, which):
     assert f"{file.name} is damaged: its checksum" in said.err and "1 problems" in said.out
 
 
+def check_options() -> list[list[str]]:
+    """Every option of a check but those that go for stores, with some value."""
+    one = argparse.ArgumentParser()
+    cli_data.add_check(one)
+    given = [action for action in one._actions if action.option_strings]
+    words = [[action.option_strings[-1], *(["1"] if action.nargs != 0 else [])] for action in given]
+    return [w for w in words if w[0] not in ("--help", "--body", "--picture", "--workers")] + [["--reader.people", "1"]]
+
+
+@pytest.mark.parametrize("words", check_options(), ids=lambda words: words[0])
+def test_a_check_of_a_store_refuses_options_that_would_change_nothing(made, capsys, words):
+    words = [word.replace("1", "+z") if words[0] == "--up" else word for word in words]
+    assert cli.main(["data", "check", str(made / "store"), "--picture", "none", *words]) == 2
+    assert f"has no use for {words[0]}; leave it out" in capsys.readouterr().err
+
+
 def test_a_check_finds_another_body(copy, capsys):
     from magnet.datamodules.fakes.body import arrays
 
@@ -121,6 +138,10 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("fake dd100 dl", "is not empty"),
         ("prepare cmu --root dl --out o", "cmu trains without being prepared"),
         ("fake dd100", "out is missing"),
+        ("fake dd100 new --takes 0", "takes: got 0"),
+        ("fake cmu new --frames 0", "frames: got 0"),
+        ("check dl --body dl/body.npz --limit 0", "limit: got 0"),
+        ("check dl --body dl/body.npz --workers 0", "workers: got 0"),
         ("download dd100", "given out by its authors alone"),
         ("download cmu", "out is missing"),
     ],
@@ -130,6 +151,22 @@ def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message)
     assert cli.main(["data", *words.split()]) == 2
     said = capsys.readouterr().err
     assert message in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize("command", cli_data.COMMANDS)
+def test_names_and_folders_may_stand_before_between_and_after_options(command, monkeypatch):
+    add, _, what = cli_data.COMMANDS[command]
+    seen = []
+    monkeypatch.setitem(cli_data.COMMANDS, command, (add, lambda given: seen.append(given) or 0, what))
+    one = argparse.ArgumentParser()
+    add(one)
+    places = [f"place{k}" for k, action in enumerate(a for a in one._actions if not a.option_strings)]
+    option = next((a.option_strings[0] for a in one._actions if a.option_strings and a.nargs is None), None)
+    for k in range(len(places) + 1):
+        words = [*places[:k], *([option, "1"] if option else []), *places[k:]]
+        assert cli.main(["data", command, *words]) == 0
+    assert all({**vars(given), "parser": None} == {**vars(seen[0]), "parser": None} for given in seen)
+    assert set(places) <= set(map(str, vars(seen[0]).values()))
 
 
 def test_help_shows_a_data_sets_own_options(capsys):

@@ -50,20 +50,26 @@ NAMES: dict[str, Entry] = {
     "hi4d": _entry("hi4d", "Hi4D"),
     "chi3d": _entry("chi3d", "CHI3D"),
 }
+UNPREPARED = {
+    "cmu": (
+        "cmu trains without being prepared: the first magnet fit --data CMU --data.root FOLDER fits bodies to its "
+        "recordings and keeps each in a cache; magnet data check FOLDER does so ahead"
+    ),
+    "synthetic": "synthetic has no files: magnet fit --data Synthetic makes its scenes on the spot",
+}
+"""Data sets without a reader, and what to do instead."""
 
 
 def find(name: str) -> Entry:
     """The entry of a name.
 
     Raises:
-        ValueError: no such data set; names the closest one.
+        ValueError: no such data set, with the closest one; or one that needs no preparing, with what to do instead.
     """
     if name not in NAMES:
         close = difflib.get_close_matches(name.lower(), NAMES, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(NAMES)}"
-        if name.lower() in ("cmu", "synthetic"):
-            hint = f"{name} trains without being prepared, see docs/data.md"
-        raise ValueError(f"no data set {name!r}; {hint}")
+        raise ValueError(UNPREPARED.get(name.lower()) or f"no data set {name!r}; {hint}")
     return NAMES[name]
 
 

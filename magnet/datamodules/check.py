@@ -6,18 +6,20 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 import torch
 
 from magnet.body import Body, load_body
 from magnet.datamodules import catalogue
+from magnet.datamodules.cmu import CMU
 from magnet.datamodules.prepare import absent_note, chosen
 from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all
 from magnet.datamodules.recording import Reader
 from magnet.datamodules.store import SCALE, SPLITS, Folder, StoreError, body_hash, decode, file_hash
 from magnet.datamodules.store import Part as Stored
-from magnet.datamodules.windows import Split
+from magnet.datamodules.windows import Split, at_least
 from magnet.export.picture import contact_sheet
 from magnet.motion.scene import Scene
 
@@ -33,12 +35,20 @@ SHOWN, SHOWN_FRAMES = 4, 120
 class Checked:
     """What a check found."""
 
+    name: str  # of the data set
     title: str
     problems: list[str] = field(default_factory=list)
     counts: dict[Split, Counter[str]] = field(default_factory=dict)  # takes, clips, frames, person frames, N people
     skipped: list[tuple[str, str]] = field(default_factory=list)  # take, why
     notes: list[str] = field(default_factory=list)
-    scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture, all of one length
+    scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
+
+    def count_skipped(self, takes: int) -> None:
+        """Skipped ones of so many takes are a problem."""
+        if not self.counts:
+            self.problems.append(f"none of {takes} takes can be used")
+        elif self.skipped:
+            self.problems.append(f"{len(self.skipped)} of {takes} takes broke an assertion; they are listed above")
 
 
 def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], people: list[int]) -> None:
@@ -64,7 +74,7 @@ def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = No
         tell: is told of progress, by file.
     """
     manifest = folder.manifest
-    found = Checked(manifest["title"])
+    found = Checked(manifest["name"], manifest["title"])
     files = folder.files()
     for number, (name, digest) in enumerate(sorted(files.items())):
         if tell is not None:
@@ -169,6 +179,10 @@ def recognise(root: Path) -> str:
                 found.append(name)
         except (ValueError, OSError) as error:
             said.append(f"\n  {name}: {str(error)[:200]}")
+    try:
+        found += ["cmu"] if CMU(str(root)).takes() else []
+    except OSError as error:
+        said.append(f"\n  cmu: {str(error)[:200]}")
     if len(found) == 1:
         return found[0]
     if found:
@@ -194,11 +208,12 @@ def check_download(
 
     Raises:
         DataError: there are no takes at all.
-        ValueError: a list of splits that does not fit.
+        ValueError: a list of splits that does not fit, or a number out of range.
     """
+    at_least(1, workers=workers, limit=limit)
     reader: Reader = order.reader()
     body = order.body()
-    found = Checked(reader.title)
+    found = Checked(reader.name, reader.title)
     use = chosen(reader, splits, limit)
     takes = use.takes
     if use.left_out:
@@ -221,10 +236,32 @@ def check_download(
         notes.update(part.notes)
         tally(found.counts, take.split or "train", list(part.frames), list(part.people))
     found.notes += [f"{note} ({count} takes)" for note, count in notes.items()]
-    if not found.counts:
-        found.problems.append(f"none of {len(takes)} takes can be used")
-    elif found.skipped:
-        found.problems.append(f"{len(found.skipped)} of {len(takes)} takes broke an assertion; they are listed above")
+    found.count_skipped(len(takes))
+    return found
+
+
+def check_cmu(data: CMU) -> Checked:
+    """Every recording of CMU fitted as for training, into its cache; a second check only reads that.
+
+    Raises:
+        FileNotFoundError: the folder holds no recordings.
+    """
+    found = Checked("cmu", "CMU Graphics Lab Motion Capture Database")
+    found.skipped = list(data.fit_takes().items())
+    for split in SPLITS:
+        clips = data.clips(split)
+        for clip in clips:
+            tally(found.counts, split, [clip.frames], [clip.agents])
+        seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
+        found.scenes += [(clip.name, clip.scene.cut(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
+    found.scenes = found.scenes[:SHOWN]
+    takes = data.takes()
+    reports = [report for take in takes if "frames" in (report := data.report(take))]
+    if limbs := [report["limb error cm"] for report in reports if report["limb error cm"] is not None]:
+        found.notes.append(f"body {data.body.id} fitted: limbs {mean(limbs):.1f} cm off, {max(limbs):.1f} at worst")
+    masked, frames = (sum(report[key] for report in reports) for key in ("frames masked", "frames"))
+    found.notes.append(f"{masked} of {frames} frames are masked; each take's report lies in {data.cache_folder}")
+    found.count_skipped(len(takes))
     return found
 
 

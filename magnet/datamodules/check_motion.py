@@ -39,6 +39,7 @@ STROLL, SLOWLY = 0.9, 0.7
 """m/s of a foot on its way, and of a pelvis, that somebody with long steps stays below if time runs too slowly."""
 
 KEEP = "(--trust_fps keeps such takes)"
+CONVERT = "convert the file, or take it as it was published"
 
 
 def usable(recording: Recording) -> Bools:
@@ -92,8 +93,7 @@ def check_angles(poses: Array, valid: Bools) -> None:
         what = "degrees" if np.percentile(size, 99) < 400 else "neither radians nor degrees"
         raise DataError(
             f"{100 * share:.0f} % of the rotation vectors are longer than a full turn (the longest is "
-            f"{size.max():.1f}), expected radians up to 3.15: they look like {what}; convert the file, or tell the "
-            f"reader its unit"
+            f"{size.max():.1f}), expected radians up to 3.15: they look like {what}; {CONVERT}"
         )
 
 
@@ -157,7 +157,7 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
         if length > most:
             raise DataError(
                 f"{what} {length:.0f} m, expected less than {most:.0f} m: translations look like "
-                f"{_unit(max(got / limit for got, limit, _ in measures))}, expected metres"
+                f"{_unit(max(got / limit for got, limit, _ in measures))}, expected metres; {CONVERT}"
             )
 
 
@@ -171,7 +171,7 @@ def check_apart(transl: Array, valid: Bools) -> None:
     if apart is not None and apart < INSIDE:
         raise DataError(
             f"translations of different people are {1000 * apart:.1f} mm apart: they look too small, perhaps they were "
-            f"divided by 1000 twice; expected metres"
+            f"divided by 1000 twice; expected metres; {CONVERT}"
         )
 
 
@@ -191,7 +191,7 @@ def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
         what = _unit(length / 0.05) if length > TRUNK[1] else "too small a unit, or are of something else"
         raise DataError(
             f"trunks are {length:.4g} m long, expected {TRUNK[0]} to {TRUNK[1]} m: positions look like {what}, "
-            f"expected metres"
+            f"expected metres; {CONVERT}"
         )
 
 
@@ -229,7 +229,7 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
     move = np.diff(joints, axis=0) * fps
     fine = together[1:] & together[:-1]
     if np.linalg.norm(move[fine], axis=-1).max() < 1e-3:
-        raise DataError(f"nothing moves in {len(joints)} frames: the file repeats one frame")
+        raise DataError(f"nothing moves in {len(joints)} frames: the file repeats one frame; {CONVERT}")
     pelvis = move[:, :, 0]
     pull = np.diff(pelvis, axis=0) * fps
     push = np.linalg.norm(pull, axis=-1)

@@ -20,9 +20,9 @@ from magnet.body import Body
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
-from magnet.datamodules.prepare_takes import one_thread
 from magnet.datamodules.speeds import at_speed
 from magnet.motion.scene import Scene
+from magnet.threads import one_thread
 
 FIT_VERSION = 3
 """Raise it whenever the same recordings would be fitted otherwise: caches are then made anew."""
@@ -107,27 +107,30 @@ class CMU(MotionDataModule):
     # -- Lightning -----------------------------------------------------------------------------
 
     def prepare_data(self) -> None:
-        """Fit what the cache lacks; seconds a take.
+        """Fit what the cache lacks.
 
         Raises:
             FileNotFoundError: no folder was given or it holds no recordings; says where to get them.
             ValueError: no take at all could be used; says why for each.
         """
-        takes = self.takes()
-        todo = [take for take in takes if not (self._file(take).exists() or self._failed(take))]
-        if todo:
-            self._convert(todo)
-        failed = {take.name: reason for take in takes if (reason := self._failed(take))}
+        takes, failed = self.takes(), self.fit_takes()
         if failed:
             listed = "".join(f"\n  {name}: {reason}" for name, reason in failed.items())
             if len(failed) == len(takes):
                 raise ValueError(f"{self._folder()}: no take could be used:{listed}")
             rank_zero_warn(f"CMU: {len(failed)} of {len(takes)} takes are left out:{listed}")
 
+    def fit_takes(self) -> dict[str, str]:
+        """Fit what the cache lacks; seconds a take. Returns why takes cannot be used, by name."""
+        takes = self.takes()
+        if todo := self._lacking(takes):
+            self._convert(todo)
+        return {take.name: str(report["error"]) for take in takes if "error" in (report := self.report(take))}
+
     def clips(self, split: Split) -> list[Clip]:
         """Fitted takes of a split; makes the cache if `prepare_data` has not."""
         takes = self.takes()
-        if any(not (self._file(take).exists() or self._failed(take)) for take in takes):
+        if self._lacking(takes):
             self.prepare_data()
         clips = []
         for take in takes:
@@ -188,7 +191,9 @@ class CMU(MotionDataModule):
             raise FileNotFoundError(f"{folder}: no such folder. {WHERE}")
         return folder
 
-    def _cache(self) -> Path:
+    @property
+    def cache_folder(self) -> Path:
+        """Where fitted takes lie."""
         if self.cache:
             return Path(self.cache).expanduser()
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet" / "cmu"
@@ -208,18 +213,21 @@ class CMU(MotionDataModule):
             for path in (*take.asf, *take.amc):
                 key.update(path.read_bytes() if path.is_file() else b"missing")
             self._keys[take.name] = key.hexdigest()[:16]
-        return self._cache() / f"{take.name}.{self._keys[take.name]}.npz"
+        return self.cache_folder / f"{take.name}.{self._keys[take.name]}.npz"
 
-    def _failed(self, take: Take) -> str | None:
-        """Why these very files could not be used, if that has been found out."""
+    def report(self, take: Take) -> dict[str, Any]:
+        """What became of these very files: `report_of`, or an "error"; empty while that is not known."""
         report = self._file(take).with_suffix(".json")
-        return json.loads(report.read_text()).get("error") if report.exists() else None
+        return json.loads(report.read_text()) if report.exists() else {}
+
+    def _lacking(self, takes: list[Take]) -> list[Take]:
+        return [take for take in takes if not (self._file(take).exists() or "error" in self.report(take))]
 
     # -- fitting -------------------------------------------------------------------------------
 
     def _convert(self, takes: list[Take]) -> None:
-        self._cache().mkdir(parents=True, exist_ok=True)
-        rank_zero_info(f"CMU: fitting {len(takes)} takes to body {self.body.id} once, into {self._cache()}")
+        self.cache_folder.mkdir(parents=True, exist_ok=True)
+        rank_zero_info(f"CMU: fitting {len(takes)} takes to body {self.body.id} once, into {self.cache_folder}")
         size = {take.name: sum(path.stat().st_size for path in take.amc if path.is_file()) for take in takes}
         bar = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
         # The fit's tensors are so small that threads cost more than they give, many times more on a busy machine.

@@ -111,7 +111,7 @@ class DD100Reader(Reader):
             if apart > SAME and self.orient == "same":
                 raise DataError(
                     f"{path}: global_orient and poses[:, :3] differ by up to {apart:.3g} radians, expected the same; "
-                    "look which stands upright and give orient=global_orient or orient=poses"
+                    "look which stands upright and give --reader.orient global_orient or poses"
                 )
             poses = np.concatenate([first, poses[:, 3:]], axis=1)
         frames = one_length(path, lengths)

@@ -84,7 +84,7 @@ class Embody3DReader(Reader):
         if lacking := [section for section in self.sections if section not in there]:
             raise DataError(
                 f"{self.folder}: no {', '.join(f'{section}/dataset.json' for section in lacking)}; sections with one: "
-                f"{', '.join(there) or 'none'}; give those as `sections`, or get dataset.json from the toolbox"
+                f"{', '.join(there) or 'none'}; give those as --reader.sections, or get dataset.json from the toolbox"
             )
 
     def found(self) -> list[Take]:
@@ -163,8 +163,8 @@ class Embody3DReader(Reader):
         if valid.mean() < 0.5:
             raise DataError(
                 f"{path}: only {valid.mean():.0%} of {len(valid)} frames hold {self.good}, which means good tracking; "
-                f"if nearly all scenes say so, the meaning is the other way round: give good={1 - self.good}; if only "
-                f"this one does, leave it out"
+                f"if nearly all scenes say so, the meaning is the other way round: give --reader.good {1 - self.good}; "
+                f"if only this one does, leave it out"
             )
         return valid
 

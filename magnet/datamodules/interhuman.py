@@ -93,7 +93,7 @@ class InterHumanReader(Reader):
         if abs(rate - self.fps) > 0.01 * self.fps:
             raise DataError(
                 f"{path}: mocap_framerate is {rate:g}, expected {self.fps:g}; if the recordings really are of "
-                f"{rate:g} frames a second, give fps={rate:g}"
+                f"{rate:g} frames a second, give --reader.fps {rate:g}"
             )
         return []
 

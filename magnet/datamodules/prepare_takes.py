@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from pathlib import Path
@@ -27,6 +26,7 @@ from magnet.datamodules.genders import load_bodies, one_body
 from magnet.datamodules.recording import Gender, Reader, Take
 from magnet.datamodules.store import FORMAT, body_hash, file_hash, write_whole
 from magnet.datamodules.store_rows import ROW, encode
+from magnet.threads import one_thread
 
 PART_VERSION = 2
 """Raise it whenever a part holds something else: takes prepared before are then made anew."""
@@ -268,7 +268,7 @@ def _converted(
     if workers == 1 or len(takes) < 2:
         reader, body, bodies = order.reader(), order.body(), order.bodies()
         for take in takes:
-            with one_thread():
+            with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
                 part, path = convert(reader, take, body, order.steps, bodies), file(take)
                 part = part if path is None else part.saved(path)
             yield take, part
@@ -288,14 +288,3 @@ def _converted(
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """In this process, too, sums must come out the same whatever the number of cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

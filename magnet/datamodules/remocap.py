@@ -50,6 +50,7 @@ class ReMoCapReader(Reader):
     source: ClassVar[str] = "https://github.com/anindita127/ReMoS"
     licence: ClassVar[str] = "research only, no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "positions"
+    version: ClassVar[int] = 2  # notes in whole millimetres
 
     def __init__(
         self,

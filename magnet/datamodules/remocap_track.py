@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -166,7 +167,8 @@ def _proof(folder: Path, header: BvhHeader, table: _Table, scale: float) -> str:
             f"{folder}: no Euler order leads from {source} and {paths[0].name} to {table.path.name}: "
             f"{100 * scale * error:.3g} cm apart at best, expected less than 1 cm; {advice}"
         )
-    return f"rotations, Euler order {order}, lead to the positions within {1000 * scale * error:.2g} mm"
+    mm = max(1, math.ceil(1000 * scale * error))  # so that takes alike share a note
+    return f"rotations and {source}, Euler order {order}, lead to the positions within {mm} mm"
 
 
 def _order(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +13,7 @@ from magnet.synthesis.couplings import COUPLINGS
 from magnet.synthesis.people import FPS, RestBody, gather, uniform
 from magnet.synthesis.planning import PAD, Truth
 from magnet.synthesis.pose import embody
+from magnet.threads import one_thread
 
 FEWEST_FRAMES = 120
 """Shorter scenes have no room for an approach, a handshake and a parting."""
@@ -27,17 +26,6 @@ class CoupledScene:
     scene: Scene
     coupling: str
     truth: Truth
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Thousands of tiny operations: waking a second thread for each is many times slower on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def synthesize(coupling: str, people: int, frames: int, generator: torch.Generator, body: RestBody) -> CoupledScene:
@@ -60,7 +48,7 @@ def synthesize(coupling: str, people: int, frames: int, generator: torch.Generat
         raise ValueError(f"coupling {coupling!r}: got {people} people, expected {kind.fewest} to {kind.most}")
     if frames < FEWEST_FRAMES:
         raise ValueError(f"got {frames} frames, expected at least {FEWEST_FRAMES}; make more and cut the scene")
-    with _one_thread():
+    with one_thread():
         group = gather(people, generator, body)
         plan, truth = kind.plan(group, frames, generator)
         body_rot, T_world_root = embody(plan, group, generator)

@@ -85,8 +85,8 @@ def scaled(recording: Recording, by: float) -> Recording:
 SPOILED: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "up axis": (lambda r: spoil_up(r, "+z" if r.up != "+z" else "-x"), "declared up axis is .*stand along "),
     "up axis reversed": (lambda r: spoil_up(r, ("-" if r.up[0] == "+" else "+") + r.up[1]), "stand along "),  # type: ignore[arg-type]
-    "mm for m": (lambda r: scaled(r, 1000.0), "millimetres.*expected metres"),
-    "m for mm": (lambda r: scaled(r, 0.001), "too small"),
+    "mm for m": (lambda r: scaled(r, 1000.0), "millimetres.*expected metres; convert"),
+    "m for mm": (lambda r: scaled(r, 0.001), "too small.*; convert"),
     "120 for 30 fps": (lambda r: replace(r, fps=r.fps / 4), "120 frames a second are called 30"),
     "30 for 120 fps": (lambda r: replace(r, fps=r.fps * 4), "30 frames a second are called 120"),
 }

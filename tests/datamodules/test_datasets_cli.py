@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from magnet import cli
-from magnet.datamodules import catalogue
+from magnet.datamodules import catalogue, cmu
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import Reader
@@ -21,8 +21,8 @@ SMALL = {
     "max_agents": "7", "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
     "context_frames": "8", "horizon_frames": "8", "test_limit": "2",
 }  # fmt: skip
-FRAMES = {"duobox": 480, "interx": 480, "remocap": 40}
-"""Of a fake's takes at its own rate, where 150 are too few at 30 fps, or fitting so many takes too long."""
+FRAMES = {"remocap": 40}
+"""Of a fake's takes, where fitting 150 takes too long."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""
 
@@ -120,11 +120,25 @@ def fit_and_test(*data: str) -> None:
     assert json.loads(Path("tested/results.json").read_text())
 
 
-def test_a_fake_of_cmu_trains_without_being_prepared(tmp_path, monkeypatch, capsys):
+def test_a_fake_of_cmu_is_fitted_by_a_check_and_trains_without_being_prepared(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    magnet("data", "fake", "cmu", "dl", "--frames", "60", "--takes", "3")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    magnet("data", "fake", "cmu", "dl", "--frames", "30", "--takes", "3")
     assert "magnet fit --data CMU --data.root dl" in capsys.readouterr().out
-    fit_and_test("--data", "CMU", "--data.root", "dl", "--data.cache", "cache")
+    magnet("data", "check", "dl")
+    said = capsys.readouterr().out
+    assert "all assertions hold" in said and Path("cmu_check.png").stat().st_size > 10_000
+    assert re.search(r"train.* 2 .*2 \(1 of 1, 1 of 2\).*\n.*val.* 1 .*\n.*test.* 1 \(1 of 2\) .* 30 ", said)
+    monkeypatch.setattr(cmu, "fit_take", None)  # all fits are there
+    fit_and_test("--data", "CMU", "--data.root", "dl")
+    damaged = Path("dl/singles/02_01.amc")
+    damaged.write_bytes(damaged.read_bytes()[:9000])
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cli.main(["data", "check", "dl", "--picture", "none"]) == 1
+    heard = capsys.readouterr()
+    assert "1 of 4 takes broke an assertion" in heard.err and re.search(r"02_01: .*02_01\.amc:\d+", heard.out)
 
 
 @pytest.mark.parametrize("name", catalogue.NAMES)

@@ -164,7 +164,7 @@ DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "wrong shape": (saved(POSE, lambda a: a[:, :60]), r"got shape \(12, 60\), expected \(T, 63\)"),
     "text": (saved(TRANSL, lambda a: a.astype(str)), r"expected numbers"),
     "odd mask": (saved("missing", lambda a: a + 1), r"holds 2, expected only 0 and 1"),
-    "reversed mask": (saved("missing", lambda a: 1 - a), r"only 0% of 12 frames hold 1, .* give good=0"),
+    "reversed mask": (saved("missing", lambda a: 1 - a), r"only 0% of 12 frames hold 1, .* give --reader.good 0"),
 }
 
 

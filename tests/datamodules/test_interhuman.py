@@ -18,7 +18,7 @@ from .reading import Foreign, check_damaged, cut, rewritten
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 3, 12)
+    write(tmp_path, 3, 6)
     return tmp_path
 
 

@@ -37,7 +37,7 @@ def content(store: Path) -> dict[str, bytes]:
 def couples(tmp_path_factory) -> Order:
     """A fake that worker processes know, too."""
     root = tmp_path_factory.mktemp("couples")
-    catalogue.find("chi3d").load_fake()(root, takes=5, frames=100)
+    catalogue.find("chi3d").load_fake()(root, takes=5, frames=60)
     return Order("chi3d", str(root), {}, str(root / "body.npz"), Steps())
 
 

@@ -135,7 +135,7 @@ def test_a_users_list_needs_none_of_the_data_sets_own(
 ) -> None:
     name, root = DOWNLOADS[form]
     monkeypatch.chdir(tmp_path)
-    NAMES[name].load_fake()(Path("dl"), 1 if name == "duobox" else 4, 480 if name == "duobox" else 100)
+    NAMES[name].load_fake()(Path("dl"), 1 if name == "duobox" else 4, 100)
     if root == "fits":
         write_fits(Path("fits"), frames=60)
     takes = NAMES[name].load_reader()(root).found()

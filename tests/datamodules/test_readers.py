@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import tempfile
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from magnet.datamodules.catalogue import NAMES
-from magnet.datamodules.common import Steps
+from magnet.datamodules.common import Steps, times
 from magnet.datamodules.draws import whole_clips
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, turned
@@ -39,6 +40,14 @@ GENDERS = {
 """Of the fakes whose layout says them."""
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_messages_name_options_as_the_command_line_takes_them(name: str) -> None:
+    reader = NAMES[name].load_reader()
+    text = Path(inspect.getsourcefile(reader) or "").read_text()
+    assert set(re.findall(r"--reader\.(\w+)", text)) <= set(inspect.signature(reader).parameters)
+    assert not re.search(r"give \w+=", text)
+
+
 # -- joints ------------------------------------------------------------------------------------
 
 
@@ -57,6 +66,15 @@ def test_a_recording_is_what_was_written_at_its_own_rate_and_axes(form: str, tmp
             np.testing.assert_allclose(found.betas, shown.betas, atol=1e-6)  # type: ignore[arg-type]
         else:
             np.testing.assert_allclose(found.positions, shown.positions[:, :, list(found.joints)], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp_path: Path) -> None:
+    NAMES[name].load_fake()(tmp_path, 1 if name == "duobox" else 4, 20)
+    reader = NAMES[name].load_reader()(tmp_path)
+    lengths = [len(times(found.frames, found.fps)[0]) for take in reader.takes() if take.split == "test"
+               for found in [reader.read(take)]]  # fmt: skip
+    assert set(lengths) == {20}
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -44,7 +44,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
         names = (f"{pair}_{action} {number}" for number in range(1, 100 + takes) for action in ACTIONS)
         split = "val" if index % 4 == 1 else "train"
         name = next(name for name in names if name not in written and hashed_split(name, test=0.0) == split)
-        written[name] = turned(people(frames, 2, FPS, seed + index), "+z")
+        written[name] = turned(people(round(frames * FPS / 30), 2, FPS, seed + index), "+z")
     return written
 
 

@@ -42,7 +42,7 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
     Args:
         out: root of the fake.
         takes: of the couple.
-        frames: of each, at 60 frames a second; 120 of the one alone.
+        frames: of each at 30 fps; files have 60 a second, of the one alone 120.
         seed: of the motion.
     """
     numbers = [TEST, VAL, *islice((n for n in count(1) if n not in (TEST, VAL) and n % 5), max(takes - 2, 0))][:takes]
@@ -52,7 +52,7 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
             write_asf(out / folder / f"{subject:02}.asf")
             for take in numbers if len(subjects) > 1 else [1]:
                 amc, rate = out / folder / f"{subject:02}_{take:02}.amc", 60.0 if len(subjects) > 1 else 120.0
-                write_amc(amc, frames, x, 1000 * seed + 10 * subject + take, rate=rate)
+                write_amc(amc, round(frames * rate / 30), x, 1000 * seed + 10 * subject + take, rate=rate)
 
 
 def bones() -> list[tuple[str, str, tuple[float, float, float], float, str, str]]:

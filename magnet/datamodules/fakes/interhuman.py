@@ -40,7 +40,8 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     """What is written, by take."""
-    return {str(index + 1): turned(people(frames, 2, FPS, seed + index, kind="smpl"), "+z") for index in range(takes)}
+    long = round(frames * FPS / 30)
+    return {str(index + 1): turned(people(long, 2, FPS, seed + index, kind="smpl"), "+z") for index in range(takes)}
 
 
 def _person(motion: FakeMotion, p: int) -> dict[str, np.ndarray | str]:
