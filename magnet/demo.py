@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import lightning as L
 import torch
@@ -24,7 +23,6 @@ from magnet.evaluation import Evaluation, aligned
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
 from magnet.motion.scene import Scene
-from magnet.sampling.guidance import Guidance
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.base import Task
 from magnet.tasks.joint import Generation, JointFuture
@@ -36,12 +34,6 @@ LONG = 1800
 LONG_SHOWN = 10.0
 """Seconds of it that the moving picture shows, the last ones."""
 COLUMNS = 9
-LIVELY = Guidance("history", 0.3)
-"""For the shows: without it the model that comes along moves people less than was recorded (docs/results.md)."""
-
-CALM: dict[str, Any] = {"guidance": Guidance()}
-"""For groups of three, which the model knows from synthetic scenes alone: livelier, it lifts people off the floor."""
-
 MADE = "duet"
 """A scene that the model made from nothing, and that comes with it."""
 
@@ -57,7 +49,6 @@ class Show:
         scene: coupling and number of people of the test scene it starts from; or a scene that comes with the model.
         context: frames of it that are given.
         frames: generated after them.
-        sampler: changes to the sampler's options.
     """
 
     name: str
@@ -66,17 +57,10 @@ class Show:
     scene: tuple[str, int]
     context: int = CONTEXT
     frames: int = HORIZON
-    sampler: dict[str, Any] | None = None
 
 
 SHOWS = (
-    Show(
-        "joint_future",
-        "three people's future, from a second of their past",
-        JointFuture(),
-        ("circle", 3),
-        sampler=CALM,
-    ),
+    Show("joint_future", "three people's future, from a second of their past", JointFuture(), ("circle", 3)),
     Show("duet", "two people from nothing", Generation(), ("handshake", 2), context=0),
     Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
     Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
@@ -146,7 +130,6 @@ def perform(
 ) -> list[str]:
     """Sample a show's scene, write it, a strip and a moving picture. -> what to say about it"""
     frames = min(show.frames, minute)
-    sampler = replace(sampler, **{"guidance": LIVELY, **(show.sampler or {})})
     truth = test_scene(data, *show.scene)
     generator = torch.Generator().manual_seed(data.seed)
     began = time.perf_counter()
