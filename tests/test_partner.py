@@ -1,5 +1,8 @@
 """A partner who answers live."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 import torch
 
@@ -99,3 +102,13 @@ def test_a_loaded_model_gives_a_partner(denoiser, duet):
     one, two = (each.answer(duet.cut(32, 40)) for each in (partner, again))
     assert torch.equal(one.T_world_root, two.T_world_root)
     assert torch.equal(one.T_world_root[:, :, 0], duet.T_world_root[:, 32:40, 0])
+
+
+def test_the_partner_in_the_docs_answers():
+    """As it stands there."""
+    page = (Path(__file__).parents[1] / "docs" / "tasks.md").read_text()
+    blocks = [part.split("```")[0] for part in page.split("```python\n")[1:]]
+    told: dict[str, Any] = {}
+    exec(next(block for block in blocks if "partner.answer" in block), told)
+    assert told["answer"].frames == 4
+    assert torch.equal(told["answer"].T_world_root[:, :, 1], told["coming"].T_world_root[:, :, 1])

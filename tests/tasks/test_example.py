@@ -68,9 +68,10 @@ def test_an_uninstalled_task_is_named_by_a_variable(tmp_path: Path, monkeypatch:
 
 
 def test_the_task_in_the_docs_obeys_the_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The first block of python on the author's page, as it stands there."""
+    """As it stands on the author's page."""
     page = (EXAMPLE.parents[1] / "docs" / "tasks.md").read_text()
-    (tmp_path / "duel_of_the_docs.py").write_text(page.split("```python\n")[1].split("```")[0])
+    blocks = [part.split("```")[0] for part in page.split("```python\n")[1:]]
+    (tmp_path / "duel_of_the_docs.py").write_text(next(block for block in blocks if "class Duel" in block))
     monkeypatch.syspath_prepend(tmp_path)
     duel = importlib.import_module("duel_of_the_docs").Duel
     assert all(grid.agents > 1 for grid in task_laws(duel()))
