@@ -110,9 +110,7 @@ class Motion(Scene):
         path = Path(path)
         if path.suffix == ".npz" and not options:
             return super().save(path)
-        known = None if self.given is None else self.given[0]
-        given = {"known": known, "context_frames": self.context, **options}
-        return formats.write(self.plain(), path, self._body(), **given)[0]
+        return formats.write(self.plain(), path, self._body(), **{"context_frames": self.context, **options})[0]
 
     @property
     def context(self) -> int:

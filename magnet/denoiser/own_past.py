@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from magnet.denoiser.generation import SamplerOptions
 from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, place, project_se2
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, transforms
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
 
 FAINTEST, CLEAREST = 0.75, 0.1
 """Between which of the even levels, as shares of K, a past is drowned in noise before the model restores it."""
-
-TRUST = 0.02
-"""As `SamplerOptions.trust`: a past is placed as sampling would place it."""
 
 
 @torch.no_grad()
@@ -64,8 +62,8 @@ def with_own_past(
             T_prev_can,
             pairwise(T_world_can) if layout.slots else None,
             T_world_can[:, 0],
-            "fuse",
-            TRUST,
+            SamplerOptions.placement,
+            SamplerOptions.trust,
             present=scene.present[few],
         )
         T_world_can = torch.where(own[..., None, None], placed, T_world_can)
