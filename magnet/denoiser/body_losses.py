@@ -9,17 +9,19 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.losses import masked_mean
-from magnet.motion.frames import from_9d, partners, pose_features
+from magnet.motion.frames import partners, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, relations_by_frame
 from magnet.sampling.noise import alpha_bar
-from magnet.tokenizer.losses import matrices
+from magnet.tokenizer.losses import length, matrices, moved, over_ground
 
 if TYPE_CHECKING:
     from magnet.body import Body
     from magnet.denoiser.module import Denoiser
 
 FPS = 30.0
+
+BODY_LOSSES = ("pose", "motion", "partner")
 
 Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
 """latent (B, N, P, C), betas (B, P, 10), steps (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
@@ -38,10 +40,15 @@ def decoded_losses(
     chosen = surest(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
     few, kind = scene.pick(chosen), model.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
+    people = few.present
 
     def decode(latent: Tensor, betas: Tensor, steps: Tensor) -> Tensor:
+        """Poses of those who are there; empty slots, half of them or more, cost nothing and stay at rest."""
+        by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, steps)]
         with torch.autocast(kind, dtype, half):  # only networks may run in half precision
-            return model.tokenizer.decode(latent, betas, steps)
+            decoded = model.tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
+        rest = pose_features(few).transpose(1, 2)
+        return rest.index_put((people,), decoded).transpose(1, 2)
 
     with torch.autocast(kind, enabled=False):
         return body_losses(
@@ -105,29 +112,18 @@ def body_losses(
     own = counts[..., 0]
     losses = {"pose": masked_mean(weight * _mean_length(mine - real), own)}
 
-    velocity = _velocity(mine, by_frame(steps)) - _velocity(real, by_frame(true_steps))
+    velocity = over_ground(mine, by_frame(steps)) - over_ground(real, by_frame(true_steps))
     both = own[:, 1:] & own[:, :-1]
     losses["motion"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
     if layout.slots:
         other = partners(layout.agents, tokens.device)
-        seen = _apply(relations_by_frame(relations), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)
-        seen_real = _apply(relations_by_frame(true_relations), real[:, :, other])
+        seen = moved(relations_by_frame(relations), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)
+        seen_real = moved(relations_by_frame(true_relations), real[:, :, other])
         least = torch.minimum(weight[..., None], weight[:, :, other])
         losses["partner"] = masked_mean(least * _mean_length(seen - seen_real), counts[..., 1:])
     return losses
 
 
-def _velocity(joints: Tensor, steps: Tensor) -> Tensor:
-    """Way of the joints from frame to frame over the ground. (B, T, P, 22, 3), (B, T, P, 9) -> (B, T - 1, P, 22, 3)"""
-    return _apply(steps[:, 1:], joints[:, 1:]) - joints[:, :-1]
-
-
-def _apply(nine: Tensor, points: Tensor) -> Tensor:
-    """Points (..., 22, 3) moved by transforms (..., 9)."""
-    T = from_9d(nine)
-    return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
-
-
 def _mean_length(away: Tensor) -> Tensor:
-    """Mean over joints, with a slope at 0 that is finite. (..., 22, 3) -> (...)"""
-    return (away.square().sum(-1) + 1e-8).sqrt().mean(-1)
+    """Mean length over joints. (..., 22, 3) -> (...)"""
+    return length(away).mean(-1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from magnet import weights
 from magnet.body import Body, load_body
 from magnet.denoiser import stream as streaming
-from magnet.denoiser.body_losses import decoded_losses
+from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.levels import NoiseLevels, draw_levels
 from magnet.denoiser.losses import consistency_losses, token_losses
 from magnet.denoiser.own_past import with_own_past
@@ -311,10 +311,9 @@ class Denoiser(L.LightningModule):
             losses["consistency"] = rotation + translation
             ramp = min(1.0, (self.global_step + 1) / max(h.consistency_warmup, 1)) if self.training else 1.0
             total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
-        if h.pose_weight or h.motion_weight or h.partner_weight:
+        if any(h[f"{name}_weight"] for name in BODY_LOSSES):
             bodies = decoded_losses(self, clean, tokens, levels, scene.pad_agents(P), there, self._require_body())
-            weighted = {"pose": h.pose_weight, "motion": h.motion_weight, "partner": h.partner_weight}
-            total = total + sum(weighted[name] * value for name, value in bodies.items())
+            total = total + sum(h[f"{name}_weight"] * value for name, value in bodies.items())
             losses |= bodies
         return {"loss": total, **losses}
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.scene import Scene
+from magnet.tokenizer.losses import FPS
 
 LIMBS = {
     "left leg": (1, 4, 7, 10),
@@ -17,6 +18,9 @@ LIMBS = {
     "right arm": (14, 17, 19, 21),
 }
 """Joints of SMPL-X that move together; an arm begins at the collar."""
+
+DRIFT_FRAMES = 6.0
+"""Over how many frames a drift keeps its direction; what sampled feet slid by was nearly straight over ten."""
 
 
 def exchange_limbs(scene: Scene, probability: float, generator: torch.Generator) -> Scene:
@@ -54,6 +58,25 @@ def turn_joints(scene: Scene, angle: float, generator: torch.Generator) -> Scene
         body_rot=torch.where(present[..., None], scene.body_rot @ turns[..., 1:, :, :], scene.body_rot),
         T_world_root=torch.where(present, scene.T_world_root @ tilt, scene.T_world_root),
     )
+
+
+def drift(steps: Tensor, speed: float, generator: torch.Generator) -> Tensor:
+    """Steps that lead people astray over the ground, slowly and each in another way, as sampled steps do.
+
+    Args:
+        steps: (B, T, P, 9) canonical steps.
+        speed: each person's standard deviation in m/s along either axis is drawn from 0 to this.
+        generator: source of all randomness.
+    """
+    B, T, P, _ = steps.shape
+    draws = torch.randn(B, T, P, 2, generator=generator, device=generator.device).to(steps)
+    most = torch.rand(B, 1, P, 1, generator=generator, device=generator.device).to(steps)
+    time = torch.arange(T, device=steps.device, dtype=steps.dtype)
+    near = torch.exp(-0.5 * ((time[:, None] - time) / DRIFT_FRAMES).square())
+    smooth = torch.einsum("st,btpg->bspg", near / near.norm(dim=1, keepdim=True), draws)
+    astray = steps.clone()
+    astray[..., [6, 8]] += speed / FPS * most * smooth
+    return astray
 
 
 def _rand(n: int, generator: torch.Generator, like: Tensor) -> Tensor:

@@ -17,6 +17,11 @@ FPS = 30.0
 FEET = (7, 8, 10, 11)
 """Ankles and toes."""
 
+TOES = (10, 11)
+
+STANDS = (0.05, 0.2)
+"""Height in metres and speed in m/s under which a recorded toe stands."""
+
 BODY = 21 * 6
 """Where the 21 joint rotations of a pose end and T_can_root begins."""
 
@@ -41,9 +46,14 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def reconstruction_losses(
-    decoded: Tensor, truth: Tensor, mask: Tensor, joints: Callable[[Tensor], Tensor] | None = None
+    decoded: Tensor,
+    truth: Tensor,
+    mask: Tensor,
+    joints: Callable[[Tensor], Tensor] | None = None,
+    steps: Tensor | None = None,
+    true_steps: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The terms of paper Eq. 4, each a mean over people, frames and joints; and three of ours.
+    """The terms of paper Eq. 4, each a mean over people, frames and joints; and four of ours.
 
     A smooth-L1 of the angle is quadratic below 1 radian: gentle to the many small errors, not led by a few flips.
 
@@ -53,12 +63,15 @@ def reconstruction_losses(
         mask: (B, T, P) bool, the frames that count.
         joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`,
             `velocity` and `foot` (ours).
+        steps: (B, T, P, 9) canonical steps that the decoder was given; adds `stance` (ours).
+        true_steps: the same of the recording.
 
     Returns:
         body: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of the
         joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that
         flicker cost nothing else, and are what an eye sees first. foot: the same of ankles and toes alone, whose
-        flicker is seen as sliding.
+        flicker is seen as sliding. stance: error over the ground of the velocities of toes that stand in the recording,
+        m/s, on the way that the given steps lead.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -72,18 +85,44 @@ def reconstruction_losses(
         "root_translation": masked_mean(_huber(T_can_root[..., :3, 3] - true_T_can_root[..., :3, 3]), mask),
     }
     if joints is not None:
-        away = joints(decoded) - joints(truth)
-        losses["joint"] = masked_mean(_length(away), mask)
-        slip = FPS * _length(away.diff(dim=1))
+        mine, real = joints(decoded), joints(truth)
+        away = mine - real
+        losses["joint"] = masked_mean(length(away), mask)
+        slip = FPS * length(away.diff(dim=1))
         losses["velocity"] = masked_mean(slip, both)
         losses["foot"] = masked_mean(slip[..., FEET], both)
+        if steps is not None and true_steps is not None:
+            slide = (over_ground(mine, steps) - over_ground(real, true_steps))[..., TOES, :]
+            losses["stance"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_steps))
     return losses
 
 
-def _length(vector: Tensor) -> Tensor:
+def length(vector: Tensor) -> Tensor:
     """Length of a vector, with a slope at 0 that is finite. (..., 3) -> (...)"""
     return (vector.square().sum(-1) + 1e-8).sqrt()
 
 
 def _huber(difference: Tensor) -> Tensor:
     return F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")
+
+
+def moved(nine: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 22, 3) moved by transforms (..., 9)."""
+    T = from_9d(nine)
+    return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
+
+
+def over_ground(joints: Tensor, steps: Tensor) -> Tensor:
+    """Way of joints from frame to frame in the world, as seen from the canonical frame before.
+
+    (B, T, P, 22, 3) in canonical frames, (B, T, P, 9) -> (B, T - 1, P, 22, 3) metres
+    """
+    return moved(steps[:, 1:], joints[:, 1:]) - joints[:, :-1]
+
+
+def standing(joints: Tensor, steps: Tensor) -> Tensor:
+    """Which toes stand from a frame to the next, being low and slow. Arguments as above -> (B, T - 1, P, 2) bool"""
+    height, speed = STANDS
+    low = joints[..., TOES, 1] < height
+    slow = FPS * over_ground(joints, steps)[..., TOES, :].norm(dim=-1) < speed
+    return low[:, 1:] & low[:, :-1] & slow

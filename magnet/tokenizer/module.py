@@ -18,7 +18,7 @@ from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
 from magnet.optim import adamw_cosine
 from magnet.seeding import derive
-from magnet.tokenizer.augment import exchange_limbs, turn_joints
+from magnet.tokenizer.augment import drift, exchange_limbs, turn_joints
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
 from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
 from magnet.tokenizer.features import Features, features, statistics, step_known
@@ -56,6 +56,10 @@ class Tokenizer(L.LightningModule):
         joint_weight: adds the distance of the joints in metres to the loss (ours).
         velocity_weight: adds the error of the joints' velocities in m/s to the loss, against flicker (ours).
         foot_weight: adds the error of ankles' and toes' velocities in m/s to the loss, against sliding feet (ours).
+        stance_weight: adds the speed at which toes slide that stand in the recording, in m/s, on the way that the
+            decoder is given (ours).
+        drift: in training the steps that the decoder is given lead astray by up to so many m/s, as sampled ones do;
+            with a stance_weight it learns to keep feet where they stand (ours).
         exchange_limbs: share of limbs that in training move as somebody else's of the batch do (ours).
         turn_joints: radians by which joints are turned at random in training (ours); with exchanged limbs it
             keeps a small data set from being learnt by heart.
@@ -88,6 +92,8 @@ class Tokenizer(L.LightningModule):
         joint_weight: float = 0.0,
         velocity_weight: float = 0.0,
         foot_weight: float = 0.0,
+        stance_weight: float = 0.0,
+        drift: float = 0.0,
         exchange_limbs: float = 0.0,
         turn_joints: float = 0.0,
         start_from: str | None = None,
@@ -280,11 +286,14 @@ class Tokenizer(L.LightningModule):
         with torch.set_grad_enabled(torch.is_grad_enabled() and not h["decoder_only"]):
             embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
         quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
-        pose = self._reconstruct(quantised.latent, seen.betas, by_token(seen.steps), seen.valid)
+        steps = seen.steps
+        if self.training and h["drift"]:
+            steps = drift(steps, h["drift"], self._generator("drift", self.global_step, batch_idx))
+        pose = self._reconstruct(quantised.latent, seen.betas, by_token(steps), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
-            bodies = h["joint_weight"] or h["velocity_weight"] or h["foot_weight"]
+            bodies = any(h[f"{name}_weight"] for name in ("joint", "velocity", "foot", "stance"))
             joints = self._canonical_joints(seen) if bodies else None
-            losses = reconstruction_losses(pose, seen.pose, seen.counts, joints)
+            losses = reconstruction_losses(pose, seen.pose, seen.counts, joints, steps, seen.steps)
         losses["commitment"] = quantised.commitment
         return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantised
 

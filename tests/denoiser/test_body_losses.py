@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.body import load_body
-from magnet.denoiser.body_losses import body_losses, surest
+from magnet.denoiser.body_losses import BODY_LOSSES, body_losses, surest
 from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, scene_transforms
@@ -88,7 +88,7 @@ def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
     model.train()
     losses = model._losses(random_scene(4, 32, 3, generator), generator)
     losses["loss"].backward()
-    assert {"pose", "motion", "partner"} <= losses.keys()
+    assert set(BODY_LOSSES) <= losses.keys()
     assert all(weight.grad is not None for weight in model.transformer.blocks.parameters())
     assert all(weight.grad is None for weight in model.tokenizer.parameters())
     assert not [name for name in model.state_dict() if name.startswith("body")], "a body is no part of a checkpoint"
@@ -104,3 +104,20 @@ def test_a_denoiser_starts_from_anothers_weights(tmp_path):
         assert torch.equal(value, first.transformer.state_dict()[name])
     with pytest.raises(ValueError, match=r"start_from: .* does not fit this model: size mismatch"):
         tiny_denoiser(width=64)._start_from(str(tmp_path / "first.ckpt"))
+
+
+def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, monkeypatch):
+    model = tiny_denoiser(max_agents=3, window=8, pose_weight=1.0, decoded_share=1.0).eval()
+    scene = random_scene(4, 32, 3, generator)
+    scene.present[1:, 2] = False
+    decoded = []
+    plain = model.tokenizer.decode
+    monkeypatch.setattr(
+        model.tokenizer, "decode", lambda *given: decoded.append((given, plain(*given))) or decoded[-1][1]
+    )
+    assert model._losses(scene, generator)["pose"].isfinite()
+    (latent, betas, steps), poses = decoded[0]
+    assert latent.shape == (9, 8, 1, model.layout.latent), "nine people of four scenes"
+    together = [x.transpose(0, 2) for x in (latent, steps)]  # the same people as one scene of nine
+    whole = plain(together[0], betas.transpose(0, 1), together[1])
+    assert torch.allclose(whole.transpose(0, 2), poses, atol=1e-5)

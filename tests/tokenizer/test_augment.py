@@ -4,7 +4,7 @@ import torch
 from magnet.motion.frames import canonical_frame, pose_features
 from magnet.motion.rotations import geodesic
 from magnet.testing import random_scene
-from magnet.tokenizer.augment import LIMBS, exchange_limbs, turn_joints
+from magnet.tokenizer.augment import LIMBS, drift, exchange_limbs, turn_joints
 from magnet.tokenizer.module import Tokenizer
 
 
@@ -48,6 +48,16 @@ def test_joints_turn_by_the_same_in_all_frames_and_by_as_much_as_asked(people, g
     assert angle.square().mean().sqrt() == pytest.approx(0.1 * 3**0.5, rel=0.1)
     relative = many.body_rot.transpose(-1, -2) @ turned.body_rot
     assert torch.allclose(relative[:, 0], relative[:, -1], atol=1e-5)
+
+
+def test_drift_is_slow_and_smooth_and_over_the_ground_alone(generator):
+    steps = torch.randn(400, 64, 1, 9, generator=generator)
+    assert torch.equal(drift(steps, 0.0, generator), steps)
+    away = 30 * (drift(steps, 0.3, generator) - steps)
+    assert not away[..., [0, 1, 2, 3, 4, 5, 7]].any()
+    speed = away[:, :, 0, [6, 8]]
+    assert speed.std(dim=1).mean() < 0.3 and speed.std() == pytest.approx(0.3 / 3**0.5, rel=0.15)
+    assert speed.diff(dim=1).abs().mean() < 0.2 * speed.abs().mean(), "from frame to frame it hardly changes"
 
 
 def test_augmented_people_are_still_lawful(people, generator):

@@ -1,0 +1,73 @@
+import math
+
+import pytest
+import torch
+
+from magnet.body import load_body
+from magnet.motion.frames import canonical_frame, pose_features
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import scene_steps
+from magnet.testing import random_scene
+from magnet.tokenizer.losses import TOES, matrices, moved, over_ground, reconstruction_losses, standing
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+def in_frames(body, scene: Scene) -> torch.Tensor:
+    """Joints in each one's own canonical frame. (B, T, P, 22, 3)"""
+    return body.forward_kinematics(*matrices(pose_features(scene)), scene.betas[:, None])
+
+
+def test_ways_over_the_ground_are_those_of_joints_in_the_world(body, generator):
+    scene = random_scene(2, 12, 3, generator)
+    ways = over_ground(in_frames(body, scene), scene_steps(scene))
+    world = body.joints(scene).diff(dim=1)
+    turn = canonical_frame(scene.T_world_root)[:, :-1, :, :3, :3]
+    assert torch.allclose(ways, world @ turn, atol=1e-5)
+
+
+def toes(height: float, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two frames of somebody whose canonical frame goes 1 cm forward, and whose toes move at a speed in the world."""
+    joints = torch.zeros(1, 2, 1, 22, 3)
+    joints[..., TOES, 1] = height
+    joints[:, 1, ..., TOES, 2] = speed / 30 - 0.01
+    steps = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0.01]).expand(1, 2, 1, 9)
+    return joints, steps
+
+
+@pytest.mark.parametrize(("height", "speed", "stands"), [(0.02, 0.1, True), (0.08, 0.1, False), (0.02, 0.5, False)])
+def test_a_toe_stands_that_is_low_and_slow(height, speed, stands):
+    assert standing(*toes(height, speed)).all() == stands
+
+
+def test_stance_is_the_speed_at_which_given_steps_make_standing_toes_slide(body):
+    """Somebody stands; the steps that the decoder was given lead over the ground at 0.3 m/s."""
+    scene = random_scene(1, 1, 2, torch.Generator().manual_seed(1))
+    still = scene.replace(
+        body_rot=scene.body_rot.expand(-1, 16, -1, -1, -1, -1),
+        T_world_root=scene.T_world_root.expand(-1, 16, -1, -1, -1),
+    )
+    lowest = body.joints(still)[..., TOES, 1].amax()
+    pose = pose_features(still)
+    pose[..., -2] -= lowest  # both toes on the floor or under it
+    steps = scene_steps(still)
+    away = steps.clone()
+    away[..., 8] += 0.3 / 30
+    mask = torch.ones(pose.shape[:3], dtype=torch.bool)
+
+    def joints(pose: torch.Tensor) -> torch.Tensor:
+        return body.forward_kinematics(*matrices(pose), still.betas[:, None])
+
+    assert standing(joints(pose), steps).all()
+    got = reconstruction_losses(pose, pose, mask, joints, away, steps)
+    assert got["stance"] == pytest.approx(0.3, rel=1e-2)
+    assert reconstruction_losses(pose, pose, mask, joints, steps, steps)["stance"] == pytest.approx(0, abs=1e-2)
+    assert "stance" not in reconstruction_losses(pose, pose, mask, joints)
+
+
+def test_moving_points_is_what_a_turn_and_a_shift_do():
+    quarter = torch.tensor([math.cos(math.pi / 2), 0, -1, 0, 1, 0, 1.0, 0, 2.0])
+    assert torch.allclose(moved(quarter, torch.tensor([[0.0, 1.0, 1.0]])), torch.tensor([[2.0, 1.0, 2.0]]), atol=1e-6)
