@@ -47,6 +47,10 @@ for example:
 """
 
 
+UNION = "Does not validate against any of the Union subtypes"
+"""How jsonargparse begins to tell that a class refused its options."""
+
+
 class CommandError(Exception):
     """Something the user can put right; shown as one line."""
 
@@ -123,7 +127,8 @@ def explain(error: Exception) -> str | None:
     if isinstance(error, ImportError) and "pip install" in text:
         return text
     if isinstance(error, (ValueError, OSError)) or type(error).__name__ == "MisconfigurationException":
-        return f"{text or type(error).__name__} (--debug shows where)"
+        said = re.findall(r"^ *- (?!Expected )(.+)", text, re.MULTILINE) if text.startswith(UNION) else []
+        return f"{said[0] if said else text or type(error).__name__} (--debug shows where)"
     return None
 
 
@@ -141,3 +146,32 @@ def misfit(text: str) -> str:
     keys = re.search(r"(Missing|Unexpected) key\(s\) in state_dict: \"([^\"]+)\"", text)
     what = f"{keys[1].lower()} {keys[2]}" if keys else text.splitlines()[0]
     return f"the checkpoint is of another model: {what}; {advice}"
+
+
+KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "tuple": "a list such as [0,1]",
+    "list": "a list such as [0,1]",
+    "dict": "options",
+    "NoneType": "null",
+}
+
+
+def wrong_value(message: str, flag: str | None = None) -> str | None:
+    """The parser's lines about a value that does not fit its field, as one; None where it says something else.
+
+    Args:
+        message: jsonargparse's.
+        flag: the field as the user wrote it; by default its key.
+    """
+    key = re.search(r'Parser key "([\w.]+)"', message)
+    got = re.search(r"(?:Got|Given) value: (.*)", message)
+    kinds = re.findall(r"Expected an? (?:<class '(?:\w+\.)*(\w+)'>|\S*Literal\[(.*?)\])", message)
+    told = re.search(r"^ *- (?!Expected )", message, re.MULTILINE)  # a class that has said itself what it wants
+    if told or not (key and got and kinds):
+        return None
+    wanted = dict.fromkeys(KINDS.get(kind, kind) if kind else choices.replace("'", "") for kind, choices in kinds)
+    return f"{flag or '--' + key[1]}: got {got[1]}, expected {' or '.join(wanted)}"

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnet.cli import CommandError, no_such
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
 from magnet.cli_data_shown import bar, file_bars, show_persons, show_skipped, show_splits
 
@@ -34,14 +35,18 @@ def main(arguments: Sequence[str]) -> int:
     """`magnet data ...`. Returns the exit code.
 
     Raises:
+        CommandError: no such command.
         ValueError: a data set, option or folder that does not fit; says what does.
         OSError: a folder or disk that cannot be used.
     """
-    command, *words = arguments or [""]
-    if command not in COMMANDS:
-        parser().parse_known_args(arguments)
+    command, *words = arguments or ["--help"]
+    if command in ("-h", "--help"):
         parser().print_help()
         return 0
+    if command not in COMMANDS:
+        raise CommandError(
+            no_such("command", f"data {command}", [f"data {name}" for name in COMMANDS], "magnet data --help")
+        )
     # Intermixed, so that OUT may come after options: argparse would take it as left out once another came before them.
     known, rest = command_parser(command).parse_known_intermixed_args(words)
     if rest and not (command in ("prepare", "check") and all_reader_options(rest)):
@@ -149,9 +154,10 @@ def needed(given: argparse.Namespace, *names: str) -> list[str]:
     Raises:
         ValueError: one is not.
     """
-    for name in names:
-        if getattr(given, name) is None:
-            raise ValueError(f"{given.parser.prog}: {name} is missing; see {given.parser.prog} --help")
+    for action in given.parser._actions:
+        if action.dest in names and getattr(given, action.dest) is None:
+            name, prog = "".join(action.option_strings[:1]) or action.dest, given.parser.prog
+            raise ValueError(f"{prog}: {name} is missing ({action.help}); see {prog} --help")
     return [getattr(given, name) for name in names]
 
 
@@ -308,7 +314,7 @@ def run_prepare(given: argparse.Namespace) -> int:
     data = catalogue.find(name).data.partition(":")[2]
     body = "" if given.body == "open" else f" --data.body_model {given.body}"
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
-    print(f"  magnet fit --data {data} --data.path {out}{body}")
+    print(f"  magnet fit --model Tokenizer --data {data} --data.path {out}{body}")
     return 0
 
 
@@ -321,7 +327,7 @@ def run_fake(given: argparse.Namespace) -> int:
     if name == "cmu":
         from magnet.datamodules.fakes.cmu import write
 
-        then = f"train on it:\n  magnet fit --data CMU --data.root {folder}"
+        then = f"train on it:\n  magnet fit --model Tokenizer --data CMU --data.root {folder}"
     else:
         write = catalogue.find(name).load_fake()
         then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}"
@@ -351,7 +357,7 @@ def run_download(given: argparse.Namespace) -> int:
     print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
     if got.unlike:
         print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")
-    print(f"to train on them: magnet fit --data CMU --data.root {out}")
+    print(f"to train on them: magnet fit --model Tokenizer --data CMU --data.root {out}")
     return 0
 
 

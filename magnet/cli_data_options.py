@@ -39,12 +39,15 @@ def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
     """
     from jsonargparse import ArgumentError
 
+    from magnet.cli import wrong_value
+
     options = reader_parser(kind)
     try:
         config = options.parse_args(list(words)).as_dict().get("reader", {})
     except ArgumentError as error:
         known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
-        raise ValueError(f"{kind.title}: {error}; its options are {', '.join(known) or 'none'}") from error
+        said = wrong_value(str(error)) or str(error)
+        raise ValueError(f"{kind.title}: {said}; its options are {', '.join(known) or 'none'}") from error
     flags = {word.split("=")[0].removeprefix("--reader.") for word in words if word.startswith("--reader.")}
     return {name: value for name, value in config.items() if name in flags}
 

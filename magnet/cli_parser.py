@@ -1,4 +1,4 @@
-"""The parser behind the command: help that explains every field, and errors in a line or two."""
+"""The parser behind the command: help that explains every field, and errors in a line."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import Any, ClassVar, NoReturn
 import yaml
 from lightning.pytorch.cli import LightningArgumentParser
 
+from magnet.cli import wrong_value
+
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
     "{more}[--ckpt_path FILE] [--trainer.FIELD VALUE]"
@@ -22,6 +24,9 @@ USAGE = (
 
 SHARING = ("model", "data")
 """Their classes have many fields in common, which help tells once. Of a task all fields are told."""
+
+TRAINER = "Customize every aspect of training via flags"
+"""Lightning's title over the Trainer's options."""
 
 REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
@@ -46,6 +51,8 @@ class Parser(LightningArgumentParser):
         self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
         for key in self.classes:
             self._name_choices(key)
+        longest_last = sorted(self._action_groups, key=lambda group: (group.title or "").startswith(TRAINER))
+        self._action_groups = longest_last
         parts = [super().format_help(*args, **kwargs)]
         for key, classes in self.classes.items():
             shared: set[str] = set()
@@ -70,16 +77,22 @@ class Parser(LightningArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Say what is wrong, and the closest thing that would be right."""
         told = self if self.command or Parser.root is None else Parser.root
-        print(f"magnet {told.command}: error: {told.clearer(message)}", file=sys.stderr)
-        print(f"magnet {told.command} --help explains all options", file=sys.stderr)
+        said = told.clearer(message)
+        stop = "" if said.endswith("?") else "."
+        print(f"magnet {told.command}: error: {said}{stop} See magnet {told.command} --help", file=sys.stderr)
         sys.exit(2)
 
     def clearer(self, message: str) -> str:
         """The parser's message without its internals."""
         unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
         refused = re.search(REFUSED, message)
+        if unknown and not unknown[1].startswith("-"):
+            meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
+            hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
+            return f"{unknown[1]} is no option; {hint}"
         if unknown or refused:
-            name = unknown[1].partition("=")[0] if unknown else self._written(refused[1])  # type: ignore[index]
+            field = refused[1] if refused else ""
+            name = unknown[1].partition("=")[0] if unknown else self._written(field, field)
             return f"no option {name}{_closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:
@@ -90,14 +103,17 @@ class Parser(LightningArgumentParser):
         if named and path and named[1] in self.classes:
             known = ", ".join(self.classes[named[1]])
             return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
+        key = re.search(r'Parser key "([\w.]+)"', message)
+        if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
+            return told
         message = re.sub(r"Call to compute_fn of link .* failed: ", "", message)
         lines = [line.strip() for line in message.splitlines() if line.strip()]
-        return "\n  ".join(line for line in lines if not line.startswith(NOISE)) or message
+        return " ".join(line for line in lines if not line.startswith(NOISE)) or message
 
-    def _written(self, field: str) -> str:
+    def _written(self, field: str, otherwise: str) -> str:
         """A field as the user wrote it: `--model.foo` for `foo`."""
         flags = [argument.partition("=")[0] for argument in self.arguments]
-        return next((flag for flag in flags if flag.startswith("--") and flag.endswith(f".{field}")), field)
+        return next((flag for flag in flags if flag.startswith("--") and flag.endswith(f".{field}")), otherwise)
 
     def _flags(self) -> list[str]:
         flags = [flag for action in self._actions for flag in action.option_strings]
@@ -125,18 +141,23 @@ class Parser(LightningArgumentParser):
 def _closest(name: str, known: list[str]) -> str:
     """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
     group, _, leaf = name.rpartition(".")
-    if group:  # --model.foo: a field of the model is meant
-        fields = [flag for flag in known if flag.startswith(f"{group}.") and not flag.endswith((".help", "+"))]
-        close = difflib.get_close_matches(name, fields, n=1)
-        there = ", ".join(dict.fromkeys(fields))
-        return f"; did you mean {close[0]}?" if close else f"; there are {there}" if there else ""
-    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(known)}
+    flags = [flag for flag in known if not flag.endswith((".help", "+"))]
+    fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
+    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
     leaf = leaf.lstrip("-")
-    if leaf in by_leaf:
-        return f"; did you mean {by_leaf[leaf]}?"
-    close = difflib.get_close_matches(name, known, n=1)
-    close = close or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
-    return f"; did you mean {close[0]}?" if close else ""
+    near = [by_leaf[leaf]] if leaf in by_leaf else []
+    near = near or [flag for each, flag in by_leaf.items() if leaf in _words(each)][:-5:-1]
+    near = near or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
+    near = near or difflib.get_close_matches(name, [] if fields else flags, n=1)
+    if near:
+        return f"; did you mean {' or '.join(near)}?"
+    return f"; there are {', '.join(dict.fromkeys(fields))}" if group and fields else ""
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """What a field may be called in short: each of its words, and their first letters, as `lr`."""
+    words = name.split("_")
+    return (*words, "".join(word[:1] for word in words))
 
 
 def _options(key: str, kind: type) -> list[str]:

@@ -30,11 +30,17 @@ LATEST = "latest"
 
 
 def run_folder(root: Path, out: str | None) -> Path:
-    """Folder of this run: `out`, else a new one under `root` named by the time. Processes it starts share it."""
+    """Folder of this run: `out`, else a new one under `root` named by the time. Processes it starts share it.
+
+    Raises:
+        CommandError: `out` is a file.
+    """
     child = "LOCAL_RANK" in os.environ and FOLDER_VARIABLE in os.environ
     if child:
         return Path(os.environ[FOLDER_VARIABLE])
     folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    if folder.is_file():
+        raise CommandError(f"--out {out}: got a file, expected a folder for what the run leaves behind")
     number = 1
     while out is None and folder.exists():
         number += 1
@@ -221,12 +227,24 @@ class Record(Callback):
         self, folder: Path, config: str, options: dict[str, Any], facts: dict[str, Any], latest: bool = False
     ) -> None:
         self.folder, self.config, self.options, self.facts, self.latest = folder, config, options, facts, latest
+        self.begun = False
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if trainer.is_global_zero and not getattr(trainer, "fast_dev_run", False):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "config.yaml").write_text(self.config)
-            (self.folder / "run.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
+    def _begin(self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any) -> None:
+        """Write, once data, model and task have turned out to fit: a run that never began leaves nothing behind."""
+        if self.begun or not trainer.is_global_zero or getattr(trainer, "fast_dev_run", False):
+            return
+        self.begun = True
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "config.yaml").write_text(self.config)
+        (self.folder / "run.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
+
+    on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Say how an interrupted training goes on."""
+        last = self.folder / "checkpoints" / "last.ckpt"
+        if isinstance(exception, KeyboardInterrupt) and trainer.is_global_zero and last.exists():
+            print(f"interrupted; the same command with --ckpt_path {last} goes on", file=sys.stderr)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[CONFIG_KEY] = self.options

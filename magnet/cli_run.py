@@ -22,6 +22,7 @@ from magnet.cli_parser import Parser
 from magnet.cli_stored import Arguments
 from magnet.cli_tasks import NamedTask, alias_path, aliases, task_of
 from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 
@@ -307,6 +308,8 @@ class MagnetCLI(LightningCLI):
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
         if self.checkpoint is not None and not getattr(self.model, "built", True):
             self.model.on_load_checkpoint(weights.read(self.checkpoint))
+        if isinstance(self.model, Denoiser):  # now, and not once data are made and files are written
+            self.model.require_tokenizer()
 
     before_test = _evaluate
     before_predict = _evaluate
@@ -318,7 +321,9 @@ class MagnetCLI(LightningCLI):
     def after_fit(self) -> None:
         """Say where things are."""
         if self.trainer.is_global_zero and not getattr(self.trainer, "fast_dev_run", False):
-            print(f"the run is in {self.folder}; its best checkpoint: {self.folder / 'checkpoints' / 'best.ckpt'}")
+            files = {name: self.folder / "checkpoints" / f"{name}.ckpt" for name in ("best", "last")}
+            kept = next((f"; its {name} checkpoint: {file}" for name, file in files.items() if file.exists()), "")
+            print(f"the run is in {self.folder}{kept}")
 
     def after_validate(self) -> None:
         """Show what was logged."""
@@ -348,9 +353,8 @@ class MagnetCLI(LightningCLI):
         first = sorted((self.folder / "scenes").glob("*.npz"))[:1]
         if not first or not self.trainer.is_global_zero:
             return
-        words = [str(first[0]), "--context", str(self.datamodule.context_frames)]
-        print(f"watch it: magnet view {' '.join(words)}")
+        print(f"watch it: magnet view {first[0]}")
         if self._option("view"):
             from magnet.cli_view import show_at_the_end
 
-            show_at_the_end(words)
+            show_at_the_end([str(first[0])])

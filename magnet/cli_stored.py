@@ -57,12 +57,18 @@ class Arguments:
         return found
 
     def flag(self, key: str) -> str | None:
-        """The last value that a flag gives."""
+        """The last value that a flag gives.
+
+        Raises:
+            CommandError: the flag stands at the end, without one.
+        """
         value = None
-        for position, argument in enumerate(self.flags):
+        for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):
             name, equals, text = argument.partition("=")
             if name == f"--{key}":
-                value = text if equals else next(iter(self.flags[position + 1 : position + 2]), None)
+                value = text if equals else after
+                if value is None:
+                    raise CommandError(f"--{key}: got nothing, expected a value behind it")
         return value
 
     def value(self, key: str) -> Any:

@@ -77,6 +77,7 @@ def list_tasks(arguments: list[str]) -> int:
 
     if arguments[:1] == ["show"]:
         return show_task(arguments[1:])
+    arguments = arguments[1:] if arguments[:1] == ["list"] else arguments
     if arguments and arguments[0] not in ("-h", "--help"):
         raise CommandError(f"magnet tasks {arguments[0]}: give nothing, or {SHOW_USAGE}")
     console = Console(highlight=False)
@@ -209,7 +210,7 @@ def parse_shown(name: str, task: type, arguments: list[str]) -> tuple[Any, Shown
     Raises:
         CommandError: an option that neither has, or a value that does not fit.
     """
-    from magnet.cli import CommandError, no_such
+    from magnet.cli import CommandError, no_such, wrong_value
 
     parser = show_parser(task)
     try:
@@ -218,7 +219,7 @@ def parse_shown(name: str, task: type, arguments: list[str]) -> tuple[Any, Shown
         message = str(error)
         unknown = re.search(r"(?:[Uu]nrecognized arguments: |Key ')([^\s=']+)", message)
         if not unknown:
-            raise CommandError(message) from error
+            raise CommandError(wrong_value(message) or message) from error
         flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
         known = [flag for flag in flags if not flag.startswith(("--print", "--task.help"))]
         flag = "--" + unknown[1].removeprefix("--")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from magnet import __version__, cli, cli_run
 from tests import toys
 
+ROOT = Path(__file__).parents[1]
 HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
 
 
@@ -101,18 +103,46 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
         (["fit", "--model", "Nosuch"], "no model Nosuch; there are ToyModel"),
         (["fit", "--model", "ToyModel", "--lr", "1"], "no option --lr; did you mean --model.lr?"),
         (["fit", "--model", "ToyModel", "--model.lrr", "1"], "no option --model.lrr; did you mean --model.lr?"),
-        (["fit", "--model", "ToyModel", "--data.max_agents", "two"], "Got value: two"),
+        (["fit", "--model", "ToyModel", "--data.max_agents", "two"], "got two, expected a whole number"),
+        (["test", "generation"], "generation is no option; did you mean --task generation?"),
+        (["test", "2"], "options are written --NAME VALUE"),
+        (["test", "--out", __file__], "got a file, expected a folder"),
+        (["test", "--frames", "9"], "did you mean --data.window_frames?"),
+        (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
+        (["test", "--sampler.rolling", "four"], "--sampler.rolling: got four, expected a whole number or null"),
+        (["test", "--task", "inbetweening", "--task.keys", "20"], "--task.keys: got 20, expected a list such as [0,1]"),
         (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
         (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),
         (["fit", "--config", "nosuch.yaml"], "no configuration file nosuch.yaml"),
         (["fit", "--model", "ToyModel", "--ckpt_path", "last"], "no run with a checkpoints/last.ckpt"),
+        (["test", "--ckpt_path"], "--ckpt_path: got nothing, expected a value"),
         (["test", "--ckpt_path", "nosuch.ckpt"], "no checkpoint nosuch.ckpt"),
     ],
 )
 def test_a_mistake_is_answered_by_what_would_be_right(
     toy: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
-    assert message in complaint(capsys, *arguments)
+    said = complaint(capsys, *arguments)
+    assert message in said and len(said.splitlines()) == 1
+    assert not (toy / "runs").exists()
+
+
+def test_options_that_a_class_refuses_are_told_in_its_own_words(
+    toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: object, *_: object) -> None:
+        raise ValueError("takes: got 0, expected at least 1")
+
+    monkeypatch.setattr(toys.LightningDataModule, "__init__", refuse)
+    error = complaint(capsys, "fit", "--model", "ToyModel", "--trainer.accelerator", "cpu")
+    assert "magnet: error: takes: got 0, expected at least 1 (" in error and "subtypes" not in error
+
+
+def test_a_denoiser_without_a_tokenizer_is_refused_before_anything_is_written(
+    toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = complaint(capsys, "fit", "--model", "magnet.denoiser.module.Denoiser", "--trainer.accelerator", "cpu")
+    assert "has no tokenizer" in error
     assert not (toy / "runs").exists()
 
 
@@ -172,3 +202,9 @@ def test_our_own_faults_are_not_hidden(toy: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(toys.ToyModel, "on_fit_start", broken)
     with pytest.raises(AttributeError, match="a bug"):
         cli.main(["fit", "--model", "ToyModel", "--trainer.accelerator", "cpu"])
+
+
+@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]), ids=lambda page: page.name)
+def test_every_training_that_a_page_names_says_what_is_trained(page: Path) -> None:
+    for line in re.findall(r"^ {4}(magnet fit .*)", page.read_text(), re.MULTILINE):
+        assert "--config" in line or "--model " in line, line

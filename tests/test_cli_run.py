@@ -122,6 +122,19 @@ def test_a_finished_run_is_not_overwritten(trained: Path, capsys: pytest.Capture
     assert (trained / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
+@pytest.mark.parametrize(("command", "start"), [("validate", "validation"), ("test", "test"), ("predict", "predict")])
+def test_a_run_that_never_began_leaves_nothing_behind(
+    trained: Path, toy: Path, monkeypatch: pytest.MonkeyPatch, command: str, start: str
+) -> None:
+    def refuse(self: object) -> None:
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(ToyModel, f"on_{start}_start", refuse)
+    before = set(toy.rglob("*"))
+    assert cli.main([command, "--ckpt_path", "trained/checkpoints/last.ckpt", *CPU]) == 2
+    assert set(toy.rglob("*")) == before
+
+
 def test_a_run_records_how_it_came_about(trained: Path) -> None:
     facts = json.loads((trained / "run.json").read_text())
     assert facts["seed"] == 1111

@@ -52,10 +52,10 @@ NAMES: dict[str, Entry] = {
 }
 UNPREPARED = {
     "cmu": (
-        "cmu trains without being prepared: the first magnet fit --data CMU --data.root FOLDER fits bodies to its "
-        "recordings and keeps each in a cache; magnet data check FOLDER does so ahead"
+        "cmu trains without being prepared: the first magnet fit --model Tokenizer --data CMU --data.root FOLDER fits "
+        "bodies to its recordings and keeps each in a cache; magnet data check FOLDER does so ahead"
     ),
-    "synthetic": "synthetic has no files: magnet fit --data Synthetic makes its scenes on the spot",
+    "synthetic": "synthetic has no files: magnet fit --model Tokenizer --data Synthetic makes its scenes on the spot",
 }
 """Data sets without a reader, and what to do instead."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
@@ -14,6 +15,7 @@ import torch
 from magnet.body import Body, load_body
 from magnet.datamodules import catalogue
 from magnet.datamodules.cmu import CMU
+from magnet.datamodules.fields import listing
 from magnet.datamodules.prepare import absent_note, chosen
 from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all
 from magnet.datamodules.recording import Reader
@@ -172,22 +174,20 @@ def recognise(root: Path) -> str:
     Raises:
         ValueError: none does, or several do.
     """
-    found, said = [], []
+    found = []
     for name, entry in catalogue.NAMES.items():
-        try:
-            if entry.load_reader()(root).found():
-                found.append(name)
-        except (ValueError, OSError) as error:
-            said.append(f"\n  {name}: {str(error)[:200]}")
-    try:
+        with suppress(ValueError, OSError):  # what this one lacks
+            found += [name] if entry.load_reader()(root).found() else []
+    with suppress(OSError):
         found += ["cmu"] if CMU(str(root)).takes() else []
-    except OSError as error:
-        said.append(f"\n  cmu: {str(error)[:200]}")
     if len(found) == 1:
         return found[0]
     if found:
         raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name")
-    raise ValueError(f"{root} is neither a prepared store nor a download that is known:{''.join(said)}")
+    raise ValueError(
+        f"{root} is neither a prepared store nor a download that is known; it holds {listing(root)}; give "
+        "another folder, or say which data set it should be with --name, to be told what is missing"
+    )
 
 
 def check_download(

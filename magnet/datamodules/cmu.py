@@ -30,10 +30,10 @@ COUPLE = (60, 61)
 RATES = {"60": 60.0, "61": 60.0, "143": 60.0}
 """Subject 143 jumps in 143_35 and falls with 10.2 m/s2 at 60 fps; at 120 it would be four times that."""
 WHERE = (
-    "CMU's recordings come from mocap.cs.cmu.edu: put NN.asf and NN_TT.amc of subjects 60 and 61 (salsa couples) and "
-    "of any single people into one folder, and give it as `root` or in the variable MAGNET_CMU. Published results "
-    'must say: "The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with '
-    'funding from NSF EIA-0196217."'
+    "CMU's recordings come from mocap.cs.cmu.edu: `magnet data download cmu FOLDER` fetches them, or put NN.asf and "
+    "NN_TT.amc of subjects 60 and 61 (salsa couples) and of any single people into one folder yourself; say where with "
+    '--data.root or MAGNET_CMU. Published results must say: "The data used in this project was obtained from '
+    'mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."'
 )
 
 

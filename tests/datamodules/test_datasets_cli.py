@@ -124,7 +124,7 @@ def test_a_fake_of_cmu_is_fitted_by_a_check_and_trains_without_being_prepared(tm
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     magnet("data", "fake", "cmu", "dl", "--frames", "30", "--takes", "3")
-    assert "magnet fit --data CMU --data.root dl" in capsys.readouterr().out
+    assert "magnet fit --model Tokenizer --data CMU --data.root dl" in capsys.readouterr().out
     magnet("data", "check", "dl")
     said = capsys.readouterr().out
     assert "all assertions hold" in said and Path("cmu_check.png").stat().st_size > 10_000
