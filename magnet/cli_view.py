@@ -53,7 +53,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     look.add_argument(
         "--no-shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
     )
-    look.add_argument("--html", metavar="OUT.html", help="write the first scene as a page of its own, and end")
+    look.add_argument("--html", metavar="OUT.html", help="write a page of its own that plays all of it, and end")
     live = parser.add_argument_group("generating")
     live.add_argument("--live", action="store_true", help="a model generates while you watch")
     live.add_argument(
@@ -150,14 +150,7 @@ def _write_page(options: argparse.Namespace) -> int:
     takes, body = _read(options)
     truth = _truth(options, body, takes[0].scene.fps)
     styles = (options.style,) if options.style else None
-    path = save_html(
-        takes[0].scene,
-        options.html,
-        body,
-        truth=None if truth is None else truth.scene,
-        title=takes[0].label,
-        styles=styles,
-    )
+    path = save_html(takes, options.html, body, truth=None if truth is None else truth.scene, styles=styles)
     print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0
 

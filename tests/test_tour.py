@@ -36,7 +36,7 @@ def test_the_tour_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.Mo
         shown.append(run(source, space))
     assert (space["FRAMES"], space["STEPS"]) == (48, 2)
     players = [player for player in shown if hasattr(player, "_repr_html_")]
-    assert len(players) == 6 and all("<iframe" in player._repr_html_() for player in players)
+    assert len(players) == 5 and all("<iframe" in player._repr_html_() for player in players)
     assert space["group"].present.sum() == 4 and space["company"].present.sum() == 2
     said = re.search(r"differ by at most ([\d.]+) mm", capsys.readouterr().out)
     assert said and float(said[1]) < 1

@@ -117,7 +117,8 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
         ValueError: no scene, or scenes of different length.
     """
     if isinstance(scenes, Scene):
-        labels = scenes.names or ("",) * scenes.scenes
+        names = scenes.names or ("",) * scenes.scenes
+        labels = [f"{name} · {b + 1}" if name and names.count(name) > 1 else name for b, name in enumerate(names)]
         pairs = [(label, scenes.pick([b])) for b, label in enumerate(labels)]
     else:
         items = list(scenes.items()) if isinstance(scenes, dict) else list(scenes)
@@ -132,16 +133,12 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
     return pairs
 
 
-def known_frames(scene: Scene, context_frames: int, known: Tensor | None) -> Tensor:
-    """(T, P) bool: what `known` says of a scene (B = 1), else the scene itself, else the first frames of everybody.
+def known_frames(scene: Scene, context_frames: int) -> Tensor:
+    """(T, P) bool: which frames a model was given, as a scene (B = 1) says, else the first ones of everybody.
 
     Raises:
-        ValueError: the mask has another shape, or more context than frames.
+        ValueError: more context than frames.
     """
-    if known is not None:
-        if tuple(known.shape) != (scene.frames, scene.agents):
-            raise ValueError(f"known: got {tuple(known.shape)}, expected (T, P) = {(scene.frames, scene.agents)}")
-        return known
     if not 0 <= context_frames <= scene.frames:
         raise ValueError(f"context_frames: got {context_frames}, expected 0 to {scene.frames}, the scene's frames")
     if scene.given is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.export.bvh import Unit, save_bvh
@@ -124,6 +123,8 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str]]
     """A scene of ours or SMPL-X's keys, told apart by what they hold."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
     try:
         with np.load(path, allow_pickle=False) as file:
             keys = set(file.files)
@@ -154,15 +155,14 @@ def write(
     unit: Unit = "m",
     smplx: bool = False,
     context_frames: int = 0,
-    known: Tensor | None = None,
     style: Style | Literal["light"] = "body",
     title: str | None = None,
     progress: bool | Report = False,
 ) -> list[Path]:
     """Write a scene in the format of the path's suffix.
 
-    Of several scenes (B > 1), npz and csv hold all, pictures show them side by side, and every other format gets a
-    file each: out_scene0.glb ...
+    Of several scenes (B > 1), npz and csv hold all, pictures and pages show them side by side, and every other format
+    gets a file each: out_scene0.glb ...
 
     Args:
         body: the scene's body model; None: the open one.
@@ -170,7 +170,6 @@ def write(
         unit: of lengths in BVH.
         smplx: npz with SMPL-X's conventional keys.
         context_frames: how many first frames were given to a model, where the scene does not say; pictures mark them.
-        known: (T, P) bool instead, whatever the scene says.
         style: how pictures show people: `body`, `capsules` or `skeleton`; of pages also `light`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function told (done, all).
@@ -189,12 +188,14 @@ def write(
     body = body or load_body("open")
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
-    given = _Given(context_frames, known, style, title)
+    look: dict[str, Any] = {"body": body, "style": style, "title": title}
     if suffix == ".png" or suffix in PICTURES:
-        return [_save_picture(scene, path, body, given, fps, progress)]
+        return [_save_picture(scene, path, context_frames, look, fps, progress)]
     if fps is not None and abs(fps - scene.fps) > 1e-6:
-        given = given.resampled(scene, fps)
+        context_frames = round(context_frames * fps / scene.fps)
         scene = resampled(scene, fps)
+    if suffix == ".html":
+        return [_save_page(scene, path, context_frames, **look)]
     if suffix == ".csv":
         return [save_csv(scene, path, body)]
     if suffix == ".npz" and not smplx:
@@ -203,7 +204,6 @@ def write(
         ".npz": lambda one, to: save_smplx(one, to, body),
         ".bvh": lambda one, to: save_bvh(one, to, body, unit=unit),
         ".glb": lambda one, to: [save_glb(one, to, body)],
-        ".html": lambda one, to: [_save_page(one, to, body, given)],
     }
     if scene.scenes == 1:
         return each[suffix](scene, path)
@@ -211,49 +211,23 @@ def write(
     return [written for b, place in enumerate(places) for written in each[suffix](scene.pick([b]), place)]
 
 
-@dataclass(frozen=True)
-class _Given:
-    """What pictures and pages show beyond the scene."""
-
-    context: int
-    known: Tensor | None
-    style: Style | Literal["light"]
-    title: str | None
-
-    def resampled(self, scene: Scene, fps: float) -> _Given:
-        """The same moments at another rate, as `retime.resampled` makes them."""
-        context = round(self.context * fps / scene.fps)
-        if self.known is None:
-            return replace(self, context=context)
-        frames = resampled(scene, fps).frames
-        nearest = (torch.arange(frames) * scene.fps / fps).round().long().clamp(max=scene.frames - 1)
-        return replace(self, context=context, known=self.known[nearest])
-
-
 def _save_picture(
-    scene: Scene, path: Path, body: Body, given: _Given, fps: float | None, progress: bool | Report
+    scene: Scene, path: Path, context: int, look: dict[str, Any], fps: float | None, progress: bool | Report
 ) -> Path:
-    look: dict[str, Any] = {
-        "context_frames": given.context,
-        "known": given.known,
-        "body": body,
-        "style": given.style,
-        "title": given.title,
-    }
     if path.suffix.lower() == ".png":
         from magnet.export.picture import contact_sheet
 
-        return contact_sheet(scene, path, **look)
+        return contact_sheet(scene, path, context_frames=context, **look)
     from magnet.export.video import render_video
 
-    return render_video(scene, path, fps=fps or scene.fps, progress=progress, **look)
+    return render_video(scene, path, context_frames=context, fps=fps or scene.fps, progress=progress, **look)
 
 
-def _save_page(scene: Scene, path: Path, body: Body, given: _Given) -> Path:
+def _save_page(
+    scene: Scene, path: Path, context: int, body: Body, style: Style | Literal["light"], title: str | None
+) -> Path:
     from magnet.viewer.html import save_html  # late: the viewer stands on this room
 
     # A body's skin is only written where the page itself thinks it may be.
-    styles: Any = None if given.style == "body" else (given.style,)
-    return save_html(
-        scene, path, body, context=given.context, known=given.known, title=given.title or "", styles=styles
-    )
+    styles: Any = None if style == "body" else (style,)
+    return save_html(scene, path, body, context=context, title=title or "", styles=styles)

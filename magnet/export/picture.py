@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from torch import Tensor
 
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.stage import BACKGROUND, INK, PALE, TILE, Array, Camera, Size, font, plan_views
@@ -21,7 +20,6 @@ def contact_sheet(
     *,
     context_frames: int,
     frames: Sequence[int] | None = None,
-    known: Tensor | None = None,
     body: Posable | None = None,
     style: Style = "body",
     cell: Size = (240, 240),
@@ -33,9 +31,9 @@ def contact_sheet(
     Args:
         scenes: a scene, each of its B a row, or labelled scenes; all of one length.
         columns: how many moments, evenly spread from the first frame to the last.
-        context_frames: how many first frames were given to the model; they are pink, and times count from the last.
+        context_frames: how many first frames were given to the model, where the scene does not say; they are pink, and
+            times count from the last.
         frames: which frames instead, in place of `columns`.
-        known: (T, P) bool, when not everybody's first frames were given.
         body: the scenes' body model; the packaged one if None.
         cell: pixels of one picture in the sheet.
 
@@ -48,7 +46,7 @@ def contact_sheet(
     rows = panels(scenes)
     first = rows[0][1]
     body = body or default_body(first)
-    people = [cast(s, body, style, known_frames(s, context_frames, known)) for _, s in rows]
+    people = [cast(s, body, style, known_frames(s, context_frames)) for _, s in rows]
     moments = np.linspace(0, first.frames - 1, columns).round().astype(int).tolist() if frames is None else list(frames)
     if not moments or not all(0 <= moment < first.frames for moment in moments):
         raise ValueError(f"frames {moments}: expected some of 0 to {first.frames - 1}")
@@ -80,7 +78,6 @@ def topview(
     path: str | Path,
     *,
     context_frames: int,
-    known: Tensor | None = None,
     body: Posable | None = None,
     cell: Size = (420, 420),
     columns: int = 4,
@@ -93,7 +90,7 @@ def topview(
     """
     rows = panels(scenes)
     body = body or default_body(rows[0][1])
-    people = [cast(s, body, "skeleton", known_frames(s, context_frames, known)) for _, s in rows]
+    people = [cast(s, body, "skeleton", known_frames(s, context_frames)) for _, s in rows]
     columns = min(columns, len(rows))
     unit = cell[1] / 420
     top = round((40 if title else 0) * unit)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch import Tensor
 
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.figures import add_ghosts, add_shadows
@@ -32,7 +31,6 @@ def render_video(
     path: str | Path,
     *,
     context_frames: int,
-    known: Tensor | None = None,
     body: Posable | None = None,
     style: Style = "skeleton",
     fps: float = 30.0,
@@ -48,8 +46,8 @@ def render_video(
     Args:
         scenes: a scene, each of its B a panel, or labelled scenes; all of one length.
         path: .mp4 (needs PyAV), .gif or .webp.
-        context_frames: how many first frames were given to the model; they are pink and marked in the time bar.
-        known: (T, P) bool instead, when not everybody's first frames were given.
+        context_frames: how many first frames were given to the model, where the scene does not say; they are pink and
+            marked in the time bar.
         body: the scenes' body model; the packaged one if None.
         style: `skeleton` strokes, `capsules` mannequins, or the `body`'s own skin.
         fps: frames a second of the picture; the scene's are repeated or left out.
@@ -70,7 +68,7 @@ def render_video(
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
     if size[0] % 2 or size[1] % 2:
         raise ValueError(f"size {size}: video needs even numbers of pixels")
-    film = Film(scenes, context_frames, known, body, style, fps, size, title, ghosts, camera or Camera(), trail)
+    film = Film(scenes, context_frames, body, style, fps, size, title, ghosts, camera or Camera(), trail)
     path.parent.mkdir(parents=True, exist_ok=True)
     # A name of its own until it is whole, so that an interrupted run leaves no half picture behind.
     part = path.with_name(f".{path.stem}.part{path.suffix}")
@@ -90,7 +88,6 @@ class Film:
         self,
         scenes: Scenes,
         context_frames: int,
-        known: Tensor | None,
         body: Posable | None,
         style: Style,
         fps: float,
@@ -106,7 +103,7 @@ class Film:
         self.fps, self.size, self.title, self.trail = fps, size, title, trail
         self.scene_fps = first.fps
         self.labels = [label for label, _ in labelled]
-        self.casts = [cast(s, body, style, known_frames(s, context_frames, known)) for _, s in labelled]
+        self.casts = [cast(s, body, style, known_frames(s, context_frames)) for _, s in labelled]
         self.ghost = None if ghosts is None else cast(ghosts, body, "skeleton").joints
         if self.ghost is not None and len(self.ghost) != self.casts[0].frames:
             raise ValueError(f"ghosts have {len(self.ghost)} frames, the scenes {self.casts[0].frames}; cut them alike")

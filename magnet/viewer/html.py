@@ -1,23 +1,24 @@
-"""A scene as one web page that plays by itself: no server, no network, opened by a double click."""
+"""Scenes as one web page that plays by itself: no server, no network, opened by a double click."""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from magnet.body.base import PARENTS, Body
 from magnet.motion.scene import Scene
 from magnet.viewer.palette import GHOST, agent_colours, pale
-from magnet.viewer.rig import STYLES, VIEWS, Rig, Style, bone_poses, rigs
-from magnet.viewer.takes import Take, same_length, take
+from magnet.viewer.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
+from magnet.viewer.takes import Take, in_a_row, numbered, same_length, take, takes
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
 FULL = 32767
@@ -26,64 +27,65 @@ CHUNK = 512
 
 
 def save_html(
-    scene: Scene,
+    scene: Scene | Sequence[Take],
     path: str | Path,
     body: Body,
     *,
     context: int = 0,
-    known: Tensor | None = None,
     truth: Scene | None = None,
     title: str = "",
     styles: tuple[Style, ...] | None = None,
 ) -> Path:
-    """Write a scene (B = 1) as a self-contained web page with its own small player.
+    """Write scenes as a self-contained web page with its own small player.
 
     Args:
+        scene: each of its B a take, or takes; several stand side by side, and each can be looked at alone.
         context: first frames, shown paler as given to the model, where the scene does not say which were.
-        known: (T, P) bool, the frames of whom to show paler, whatever the scene says.
-        truth: a scene (B = 1) shown as ghosts; held or cut to the scene's length.
-        styles: looks to choose from, the first one first. By default body, capsules and skeleton, but no skin of a
-            body that is not the open one: the file would carry a model that its owner may not pass on. Name "body" or
-            "light" to have it all the same.
+        truth: a scene (B = 1) shown as ghosts in every take; held or cut to their length.
+        styles: looks to choose from, the first one first. By default body (light bodies of a crowd), capsules and
+            skeleton, but no skin of a body that is not the open one: the file would carry a model that its owner may
+            not pass on. Name "body" or "light" to have it all the same.
 
     Returns:
         The path written.
 
     Raises:
-        ValueError: several scenes, nobody there, no such style, or another body's scene.
+        ValueError: nobody there, takes of several frame rates, no such style, or another body's scene.
     """
     path = Path(path).with_suffix(".html")
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = page(scene, body, context=context, known=known, truth=truth, title=title, styles=styles)
+    text = page(scene, body, context=context, truth=truth, title=title, styles=styles)
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def page(
-    scene: Scene,
+    scene: Scene | Sequence[Take],
     body: Body,
     *,
     context: int = 0,
-    known: Tensor | None = None,
     truth: Scene | None = None,
     title: str = "",
     styles: tuple[Style, ...] | None = None,
 ) -> str:
     """What `save_html` writes, for a notebook's inline frame; the same arguments."""
-    if scene.scenes != 1 or (truth is not None and truth.scenes != 1):
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to a page of its own")
+    shown = numbered(takes(scene, title or "scene", context, scene.scenes) if isinstance(scene, Scene) else list(scene))
+    if truth is not None and truth.scenes != 1:
+        raise ValueError(f"truth: got {truth.scenes} scenes, expected one: truth.pick([b])")
+    rates = sorted({each.scene.fps for each in shown})
+    if len(rates) != 1:
+        raise ValueError(f"takes of {rates or 'no'} frames a second, expected one rate: magnet export --fps")
     if styles is None:
-        styles = STYLES if body.id.startswith("open") else tuple(s for s in STYLES if s != "body")
+        skin = first_style(sum(len(each.slots) for each in shown))
+        styles = ((skin,) if body.id.startswith("open") else ()) + ("capsules", "skeleton")
     unknown = [style for style in styles if style not in VIEWS]
     if unknown or not styles:
         raise ValueError(f"styles {styles}: choose from {', '.join(VIEWS)}")
-    title = title or (scene.names[0] if scene.names else "") or "magnet"
-    shown = take(title, scene, min(context, scene.frames), known=known)
-    ghosts = None if truth is None else same_length(take("ground truth", truth), shown)
+    ghosts = None if truth is None else take("ground truth", truth.replace(given=None))
     meta, arrays = _contents(shown, body, ghosts, styles)
     data, meta["arrays"] = _packed(arrays)
     words = {
-        "title": html.escape(title),
+        "title": html.escape(title or (shown[0].label if len(shown) == 1 else "magnet")),
         "meta": json.dumps(meta, separators=(",", ":")).replace("</", "<\\/"),
         "data": base64.b64encode(data).decode("ascii"),
         "player": _packaged("player.js"),
@@ -99,39 +101,54 @@ def _packaged(name: str) -> str:
 
 
 def _contents(
-    shown: Take, body: Body, ghosts: Scene | None, styles: tuple[Style, ...]
+    shown: Sequence[Take], body: Body, truth: Take | None, styles: tuple[Style, ...]
 ) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """What the player reads: facts, and arrays by name."""
-    groups = [shown.scene] if ghosts is None else [shown.scene, ghosts]
-    colours = agent_colours(shown.slots)
-    people = [
-        {"colour": own.tolist(), "pale": given.tolist(), "ghost": False}
-        for own, given in zip(colours, pale(colours), strict=True)
-    ]
-    for group in groups[1:]:
-        people += [{"colour": list(GHOST), "pale": list(GHOST), "ghost": True}] * group.agents
-    turns, roots = (np.concatenate(parts, axis=1) for parts in zip(*(_poses(body, g) for g in groups), strict=True))
+    longest = max(shown, key=lambda each: each.frames)
+    offsets = in_a_row(shown) if len(shown) > 1 else [np.zeros(3)]
+    people, scenes, turns, roots = [], [], [], []
+    for number, (each, offset) in enumerate(zip(shown, offsets, strict=True)):
+        for group in [each] if truth is None else [each, truth]:
+            people += _people(group, number, group is truth)
+            scenes.append(same_length(group, longest))
+            own_turns, own_roots = _poses(body, scenes[-1])
+            turns.append(own_turns)
+            roots.append(own_roots + offset.astype(np.float32))
+    # A mesh is written once for all who are of one shape, as samples and ghosts mostly are.
+    shapes, whose = torch.cat([scene.betas[0].float().cpu() for scene in scenes]).unique(dim=0, return_inverse=True)
+    for person, shape in zip(people, whose.tolist(), strict=True):
+        person["shape"] = shape
+    known = [torch.zeros(s.T_world_root.shape[:3]) if s.given is None else s.given for s in scenes]
     arrays: dict[str, NDArray] = {
-        "turns": turns,
-        "roots": roots,
-        "known": np.pad(shown.known, ((0, 0), (0, len(people) - len(shown.slots)))).astype(np.uint8),
+        "turns": np.concatenate(turns, axis=1),
+        "roots": np.concatenate(roots, axis=1),
+        "known": torch.cat(known, dim=2)[0].numpy().astype(np.uint8),
     }
-    everybody = {style: [rig for group in groups for rig in rigs(body, group, style)] for style in styles}
-    reach = max(float(np.abs(rig.skin.vertices).max()) for each in everybody.values() for rig in each)
-    arrays["rest"] = np.stack([rig.rest for rig in everybody[styles[0]]]).astype(np.float32)
-    for style, each in everybody.items():
-        arrays |= _mesh(style, each, reach)
-    spread = np.quantile(np.ptp(roots[..., [0, 2]], axis=1).max(axis=-1), 0.8) / 2
+    looks = {style: rigs(body, shapes, style) for style in styles}
+    reach = max(float(np.abs(rig.skin.vertices).max()) for bodies in looks.values() for rig in bodies)
+    arrays["rest"] = np.stack([rig.rest for rig in looks[styles[0]]]).astype(np.float32)
+    for style, bodies in looks.items():
+        arrays |= _mesh(style, bodies, reach)
     meta = {
-        "fps": shown.scene.fps,
-        "frames": shown.frames,
+        "fps": longest.scene.fps,
+        "frames": longest.frames,
         "people": people,
+        "takes": [each.label for each in shown],
         "parents": list(PARENTS),
         "styles": list(styles),
         "unit": reach / FULL,
-        "distance": round(max(3.6, 2.2 * (float(spread) + 0.7)), 2),
     }
     return meta, arrays
+
+
+def _people(group: Take, number: int, ghosts: bool) -> list[dict[str, Any]]:
+    """Facts about the people of a take."""
+    colours = np.array([GHOST] * len(group.slots), dtype=np.uint8) if ghosts else agent_colours(group.slots)
+    paler = colours if ghosts else pale(colours)
+    return [
+        {"take": number, "name": f"person {slot + 1}", "colour": own.tolist(), "pale": light.tolist(), "ghost": ghosts}
+        for slot, own, light in zip(group.slots, colours, paler, strict=True)
+    ]
 
 
 def _poses(body: Body, scene: Scene) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
@@ -147,10 +164,10 @@ def _poses(body: Body, scene: Scene) -> tuple[NDArray[np.int16], NDArray[np.floa
     return (wxyz * FULL).round().astype(np.int16), np.concatenate(roots).astype(np.float32)
 
 
-def _mesh(style: str, people: list[Rig], reach: float) -> dict[str, NDArray]:
-    """One style's mesh: vertices of everybody in 1 / 32767 of `reach`; faces, bones and weights that all share."""
-    skin = people[0].skin
-    vertices = np.stack([rig.skin.vertices for rig in people]) / reach * FULL
+def _mesh(style: str, shapes: list[Rig], reach: float) -> dict[str, NDArray]:
+    """One style's mesh: vertices of all shapes in 1 / 32767 of `reach`; faces, bones and weights that all share."""
+    skin = shapes[0].skin
+    vertices = np.stack([rig.skin.vertices for rig in shapes]) / reach * FULL
     small = len(skin.vertices) <= 2**16
     return {
         f"{style}_vertices": vertices.round().astype(np.int16),

@@ -44,7 +44,7 @@ def add_people(
 ) -> People:
     """Put the people of a scene (B = 1) into the browser's scene below the node `name`."""
     if style in ("body", "light"):
-        return Skinned(server, name, rigs(body, scene, style), colours, opacity)
+        return Skinned(server, name, rigs(body, scene.betas[0], style), colours, opacity)
     rest = body.rest_joints(scene.betas[0].float().cpu()).numpy()
     return Jointed(server, name, rest, CAPSULES if style == "capsules" else STICKS, colours, opacity)
 

@@ -8,6 +8,9 @@ const BONES = 22;
 const FIELD = 0.62; // vertical angle of view, radians
 const PRESETS = { "three quarters": [0.65, 0.3], front: [0, 0.12], side: [Math.PI / 2, 0.12], above: [0, 1.45] };
 const LIGHT = unit([-0.15, 0.9, 0.62]);
+const ALL = -1; // takes, side by side
+const HEAD_HIGH = 2.3; // metres, where a take's label is
+const MOMENTS = 21; // at which is measured how much room people take
 
 // -- vectors and matrices -----------------------------------------------------------------------
 
@@ -73,7 +76,7 @@ class Motion {
     this.meta = meta;
     this.turns = arrays.turns; // (T, M, 22, 4) wxyz in 1 / 32767
     this.roots = arrays.roots; // (T, M, 3) metres
-    this.rest = arrays.rest; // (M, 22, 3) metres
+    this.rest = arrays.rest; // (shapes, 22, 3) metres
     this.rows = new Float32Array(BONES * 12);
     this.places = new Float32Array(BONES * 3);
   }
@@ -94,7 +97,7 @@ class Motion {
     const [from, to, share] = this.between(time);
     const { turns, rest, rows, places, meta } = this;
     const M = meta.people.length;
-    const restAt = person * BONES * 3;
+    const restAt = meta.people[person].shape * BONES * 3;
     for (let bone = 0; bone < BONES; bone++) {
       const a = ((from * M + person) * BONES + bone) * 4;
       const b = ((to * M + person) * BONES + bone) * 4;
@@ -260,7 +263,7 @@ class Picture {
     gl.vertexAttribPointer(location, size, type, normalised, 0, 0);
   }
 
-  // One vertex array a person: vertices and normals are their own, the rest is everybody's.
+  // One vertex array a shape: vertices and normals are its own, the rest is everybody's.
   mesh(style, arrays) {
     const gl = this.gl;
     const faces = arrays[style + "_faces"];
@@ -268,8 +271,8 @@ class Picture {
     const weights = arrays[style + "_weights"];
     const all = arrays[style + "_vertices"];
     const V = bones.length / 4;
-    const vertexArrays = this.meta.people.map((_, person) => {
-      const vertices = all.subarray(person * V * 3, (person + 1) * V * 3);
+    const vertexArrays = Array.from({ length: all.length / (V * 3) }, (_, shape) => {
+      const vertices = all.subarray(shape * V * 3, (shape + 1) * V * 3);
       const vertexArray = gl.createVertexArray();
       gl.bindVertexArray(vertexArray);
       this.attribute(0, vertices, 3, gl.SHORT);
@@ -295,30 +298,28 @@ class Picture {
     gl.viewport(0, 0, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     const eye = view.eye();
-    const camera = multiply(perspective(FIELD, width / height, 0.05, 200), lookAt(eye, view.target));
-    this.drawFloor(camera, view);
+    this.camera = multiply(perspective(FIELD, width / height, 0.05, 200), lookAt(eye, view.target));
+    this.drawFloor(view);
     const { program, uniforms } = this.people;
     gl.useProgram(program);
-    gl.uniformMatrix4fv(uniforms.camera, false, camera);
+    gl.uniformMatrix4fv(uniforms.camera, false, this.camera);
     gl.uniform3fv(uniforms.light, LIGHT);
     gl.uniform3fv(uniforms.eye, eye);
     gl.uniform1f(uniforms.unit, this.meta.unit);
     const frame = Math.min(Math.floor(time), this.meta.frames - 1);
-    const shown = this.meta.people.map((person, index) => ({ ...person, index }));
-    const solid = shown.filter((person) => !person.ghost);
-    this.shadows(motion, time, solid, view.style);
-    for (const person of solid) {
+    this.shadows(motion, time, view.shown, view.style);
+    for (const person of view.shown) {
       const colour = view.given(frame, person.index) ? person.pale : person.colour;
       this.figure(motion.pose(person.index, time), person.index, view.style, colour, 1);
     }
-    if (view.ghosts) this.ghosts(motion, time, shown.filter((person) => person.ghost), view.style);
+    if (view.ghosts) this.ghosts(motion, time, view.behind, view.style);
   }
 
-  drawFloor(camera, view) {
+  drawFloor(view) {
     const gl = this.gl;
     const { program, uniforms } = this.floor;
     gl.useProgram(program);
-    gl.uniformMatrix4fv(uniforms.camera, false, camera);
+    gl.uniformMatrix4fv(uniforms.camera, false, this.camera);
     gl.uniform3fv(uniforms.centre, view.target);
     gl.uniform1f(uniforms.reach, Math.max(5, 1.8 * view.distance));
     gl.bindVertexArray(this.quad);
@@ -357,6 +358,13 @@ class Picture {
     }
   }
 
+  // Where a place in the world is on the page, or null behind the camera.
+  onPage(place) {
+    const m = this.camera;
+    const [x, y, w] = [0, 1, 3].map((row) => dot([m[row], m[4 + row], m[8 + row]], place) + m[12 + row]);
+    return w > 0 ? [((1 + x / w) * this.canvas.clientWidth) / 2, ((1 - y / w) * this.canvas.clientHeight) / 2] : null;
+  }
+
   figure(rows, person, style, colour, alpha) {
     const gl = this.gl;
     const { uniforms } = this.people;
@@ -364,7 +372,7 @@ class Picture {
     gl.uniform4fv(uniforms.rows, rows);
     gl.uniform3fv(uniforms.colour, colour.map((c) => c / 255));
     gl.uniform1f(uniforms.alpha, alpha);
-    gl.bindVertexArray(vertexArrays[person]);
+    gl.bindVertexArray(vertexArrays[this.meta.people[person].shape]);
     gl.drawElements(gl.TRIANGLES, count, wide ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT, 0);
   }
 }
@@ -390,27 +398,35 @@ function normals(vertices, faces) {
 class View {
   constructor(canvas, meta, arrays) {
     this.known = arrays.known; // (T, M)
-    this.people = meta.people.length;
-    this.shown = meta.people.flatMap((person, index) => (person.ghost ? [] : [{ ...person, index }]));
+    this.anyGiven = this.known.some((given) => given);
+    this.people = meta.people.map((person, index) => ({ ...person, index }));
     this.style = meta.styles[0];
     this.ghosts = true;
     this.follow = true;
     this.target = [0, 0.85, 0];
-    this.distance = meta.distance;
-    this.preset("three quarters");
+    this.preset(meta.takes.length > 1 ? "front" : "three quarters");
+    this.choose(ALL);
     this.listen(canvas);
   }
 
-  given(frame, person) {
-    return this.known[frame * this.people + person] > 0;
+  // Look at one take, or at all side by side.
+  choose(take) {
+    this.take = take;
+    const there = this.people.filter((person) => take === ALL || person.take === take);
+    this.shown = there.filter((person) => !person.ghost);
+    this.behind = there.filter((person) => person.ghost);
   }
 
-  // Whose motion was given in a frame; nothing where none of the scene was.
-  said(frame) {
-    if (!this.known.some((given) => given)) return "";
-    const those = this.shown.filter((person) => this.given(frame, person.index));
-    if (those.length === this.shown.length) return "given";
-    return those.length ? `given: ${those.map((person) => `person ${person.index + 1}`).join(", ")}` : "generated";
+  given(frame, person) {
+    return this.known[frame * this.people.length + person] > 0;
+  }
+
+  // Whose motion was given in a frame; nothing where none at all was.
+  said(frame, people) {
+    if (!this.anyGiven) return "";
+    const those = people.filter((person) => this.given(frame, person.index));
+    if (those.length === people.length) return "given";
+    return those.length ? `given: ${those.map((person) => person.name).join(", ")}` : "generated";
   }
 
   // A stripe a person for the timeline, pale where the motion was given: backgrounds of CSS, and their height.
@@ -510,8 +526,9 @@ class Player {
     this.motion = new Motion(meta, arrays);
     this.picture = new Picture(canvas, meta, arrays);
     this.view = new View(canvas, meta, arrays);
-    this.view.goTo(this.centre(), 1);
+    this.labels = meta.takes.map(() => document.getElementById("labels").appendChild(document.createElement("div")));
     this.controls();
+    this.choose(ALL);
     let last = performance.now();
     const tick = (now) => {
       this.advance(Math.max(0, now - last) / 1000); // the first one may lie before the page was ready
@@ -525,9 +542,25 @@ class Player {
     return Math.min(Math.floor(this.time), this.meta.frames - 1);
   }
 
-  centre() {
-    const roots = this.meta.people.flatMap((person, i) => (person.ghost ? [] : [this.motion.root(i, this.time)]));
+  centre(people = this.view.shown) {
+    const roots = people.map((person) => this.motion.root(person.index, this.time));
     return [0, 1, 2].map((k) => roots.reduce((sum, root) => sum + root[k], 0) / roots.length);
+  }
+
+  // Look at one take or at all, from as far away as these people need for most of the time.
+  choose(take) {
+    const { view, motion, meta } = this;
+    view.choose(take);
+    const widths = Array.from({ length: MOMENTS }, (_, i) => {
+      const roots = view.shown.map(({ index }) => motion.root(index, (i / (MOMENTS - 1)) * (meta.frames - 1)));
+      const along = [0, 2].map((k) => roots.map((root) => root[k]));
+      return Math.max(...along.map((places) => Math.max(...places) - Math.min(...places)));
+    });
+    const wide = widths.sort((a, b) => a - b)[Math.floor(0.8 * (MOMENTS - 1))];
+    view.distance = Math.max(3.6, 2.2 * (wide / 2 + 0.7));
+    view.goTo(this.centre(), 1);
+    const { style } = document.getElementById("time");
+    [style.background, style.height] = view.ribbon(meta.frames);
   }
 
   advance(seconds) {
@@ -563,20 +596,38 @@ class Player {
     get("play").textContent = this.playing ? "Pause" : "Play";
     if (document.activeElement !== get("time") || this.playing) get("time").value = frame;
     get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
-    get("state").textContent = this.view.said(frame);
+    const alone = meta.takes.length === 1 || this.view.take !== ALL;
+    get("state").textContent = alone ? this.view.said(frame, this.view.shown) : "";
+    for (const [take, label] of this.labels.entries()) {
+      const people = alone ? [] : this.view.shown.filter((person) => person.take === take);
+      const place = people.length && this.overhead(people);
+      label.hidden = !place;
+      if (!place) continue;
+      [label.style.left, label.style.top] = place.map((x) => `${x}px`);
+      label.textContent = [meta.takes[take], this.view.said(frame, people)].filter((text) => text).join(": ");
+    }
+  }
+
+  // Where on the page a take's label is.
+  overhead(people) {
+    const [x, , z] = this.centre(people);
+    return this.picture.onPage([x, HEAD_HIGH, z]);
   }
 
   controls() {
     const get = (id) => document.getElementById(id);
     const { meta, view } = this;
     get("time").max = meta.frames - 1;
-    [get("time").style.background, get("time").style.height] = view.ribbon(meta.frames);
     get("time").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     get("play").addEventListener("click", () => this.play(!this.playing));
     get("back").addEventListener("click", () => this.seek(this.frame - 1));
     get("next").addEventListener("click", () => this.seek(this.frame + 1));
     get("speed").addEventListener("change", (event) => (this.speed = Number(event.target.value)));
     get("loop").addEventListener("change", (event) => (this.loop = event.target.checked));
+    get("take").hidden = meta.takes.length === 1;
+    for (const [index, name] of ["side by side", ...meta.takes].entries()) get("take").add(new Option(name, index - 1));
+    get("take").addEventListener("change", (event) => this.choose(Number(event.target.value)));
+    if (meta.takes.length > 1) get("from").value = "front";
     for (const style of meta.styles) get("style").add(new Option(style, style));
     get("style").addEventListener("change", (event) => (view.style = event.target.value));
     get("ghosts").hidden = !meta.people.some((person) => person.ghost);

@@ -23,11 +23,11 @@ from magnet.viewer.light import light
 Array = NDArray[np.floating]
 Index = NDArray[np.integer]
 Style = Literal["body", "light", "capsules", "skeleton"]
-STYLES: tuple[Style, ...] = ("body", "capsules", "skeleton")
-"""What a page of its own holds unless others are asked for."""
 VIEWS: tuple[Style, ...] = ("body", "light", "capsules", "skeleton")
 """All there are; `light` is the body with a twentieth of its vertices."""
 
+CROWD = 8
+"""People in all above whom light bodies are the first choice."""
 INFLUENCES = 4
 """Bones that a vertex can follow in a browser."""
 
@@ -59,9 +59,9 @@ class Rig:
     skin: Skin
 
 
-def rigs(body: Body, scene: Scene, style: Style = "body") -> list[Rig]:
-    """A rig for each of the P people of a scene (B = 1)."""
-    betas = scene.betas[0].float().cpu()
+def rigs(body: Body, betas: Tensor, style: Style = "body") -> list[Rig]:
+    """A rig for each of P people of the shapes betas (P, 10)."""
+    betas = betas.float().cpu()
     rest = body.rest_joints(betas).numpy().astype(np.float32)
     if style not in ("body", "light"):
         table = CAPSULES if style == "capsules" else STICKS
@@ -84,6 +84,11 @@ def strongest(weights: Tensor) -> tuple[Index, Array]:
     top = weights.float().cpu().topk(INFLUENCES, dim=1)
     share = top.values / top.values.sum(dim=1, keepdim=True).clamp_min(1e-9)
     return top.indices.numpy().astype(np.uint8), share.numpy()
+
+
+def first_style(people: int) -> Style:
+    """What people are shown as when nobody says: whole bodies, or light ones of a crowd."""
+    return "light" if people > CROWD else "body"
 
 
 # -- poses -------------------------------------------------------------------------------------

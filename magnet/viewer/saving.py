@@ -7,8 +7,6 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import torch
-
 from magnet.body.base import Body
 from magnet.motion.scene import Scene
 from magnet.viewer.takes import Take
@@ -27,21 +25,17 @@ def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> tupl
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"
-        known = torch.from_numpy(take.known)
-        context = int(take.known.all(axis=1).cumprod().sum())
         if kind == "html":
             from magnet.viewer.html import save_html
 
-            written = [save_html(take.scene, path, body, known=known, truth=truth, title=take.label)]
+            written = [save_html([take], path, body, truth=truth)]
         elif kind in ("gif", "mp4"):
             from magnet.export.video import render_video
 
             look = {"fps": 15.0, "size": (480, 360)} if kind == "gif" else {"fps": take.scene.fps}
-            written = [
-                render_video(take.scene, path, context_frames=context, known=known, body=body, ghosts=truth, **look)
-            ]
+            written = [render_video(take.scene, path, context_frames=0, body=body, ghosts=truth, **look)]
         else:
-            written = formats.write(take.scene, path, body, known=known, context_frames=context)
+            written = formats.write(take.scene, path, body)
         if len(written) == 1:
             return kind, written[0].read_bytes()
         packed = io.BytesIO()

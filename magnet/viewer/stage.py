@@ -228,8 +228,9 @@ class Stage:
     def _follow(self, frame: int, jump: bool) -> None:
         middle = np.mean([troupe.centre(frame) for troupe in self.troupes], axis=0)
         self.floor.under(middle)
-        goal = middle * np.array([1.0, 0.0, 1.0]) if self.follow else np.zeros(3)
-        self.centre = goal if jump else self.centre + 0.08 * (goal - self.centre)
+        if self.follow:
+            goal = middle * np.array([1.0, 0.0, 1.0])
+            self.centre = goal if jump else self.centre + 0.08 * (goal - self.centre)
         self.root.position = tuple(float(-x) for x in self.centre)
 
     def caption(self, frame: int) -> str:

@@ -6,20 +6,24 @@ import json
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from magnet.body.base import Body, load_body
 from magnet.motion.scene import Scene
 from magnet.viewer.recording import Recording
+from magnet.viewer.rig import Array
 
 SAMPLES = 4
 """Scenes of one file that are shown side by side."""
+APART = 0.5
+"""Metres between the takes of a row."""
+WIDEST = 8.0
+"""Metres of the row that one take takes up at most."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,10 @@ class Take:
         return f"given: {those}" if those else ""
 
 
-def take(
-    label: str, scene: Scene, context: int = 0, recording: Recording | None = None, known: Tensor | None = None
-) -> Take:
+def take(label: str, scene: Scene, context: int = 0, recording: Recording | None = None) -> Take:
     """A scene (B = 1) made ready to be shown.
 
-    Which frames a model was given say `known` (T, P) bool, else the scene's own `given`, else `context`, so many first
-    frames of everybody.
+    Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
 
     Raises:
         ValueError: nobody is there, no frames, or numbers that are not finite.
@@ -71,11 +72,7 @@ def take(
         if bool(broken.any()):
             first = int(broken.int().argmax())
             raise ValueError(f"{label}: {name} is not finite in {int(broken.sum())} frames, the first is frame {first}")
-    if known is not None:
-        if tuple(known.shape) != (scene.frames, scene.agents):
-            raise ValueError(f"known: got {tuple(known.shape)}, expected (T, P) = {(scene.frames, scene.agents)}")
-        shown = shown.replace(given=known[None, :, slots].bool().cpu())
-    elif scene.given is None and context > 0:
+    if scene.given is None and context > 0:
         past = torch.arange(scene.frames) < context
         shown = shown.replace(given=past[None, :, None].expand(1, -1, len(slots)))
     given = np.zeros((scene.frames, len(slots)), dtype=bool) if shown.given is None else shown.given[0].numpy()
@@ -129,11 +126,7 @@ def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
     """
     from magnet.export.formats import read  # late: it brings every format's code
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    if path.suffix.lower() == ".npz" and not zipfile.is_zipfile(path):
-        raise ValueError(f"{path}: not readable (no npz archive, or cut short); copy or download it again")
-    if path.suffix.lower() == ".npz" and is_recording(path):
+    if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_recording(path):
         recording = Recording.load(path)
         if recording.scene.body != body.id:
             raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
@@ -162,3 +155,29 @@ def same_length(one: Take, other: Take) -> Scene:
     frame = torch.arange(other.frames).clamp(max=one.frames - 1)
     scene = one.scene
     return scene.picked(frame)
+
+
+def in_a_row(takes: Sequence[Take]) -> list[Array]:
+    """Offsets that put takes side by side along x around the origin, each (3,)."""
+    edges = []
+    for each in takes:
+        x = each.scene.T_world_root[0, :, :, 0, 3]
+        middle = float(x.median())
+        half = min(float((x - middle).abs().flatten()[:: max(x.numel() // 9999, 1)].quantile(0.8)) + 0.5, WIDEST / 2)
+        edges.append((middle, half))
+    width = sum(2 * half for _, half in edges) + APART * (len(takes) - 1)
+    offsets, left = [], -width / 2
+    for (middle, half), each in zip(edges, takes, strict=True):
+        z = float(each.scene.T_world_root[0, :, :, 2, 3].median())
+        offsets.append(np.array([left + half - middle, 0.0, -z]))
+        left += 2 * half + APART
+    return offsets
+
+
+def numbered(takes: list[Take]) -> list[Take]:
+    """The takes with labels that differ, for they name nodes of the scene."""
+    labels = [each.label for each in takes]
+    return [
+        replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
+        for i, each in enumerate(takes)
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,6 @@ from magnet.viewer.rig import Array, Style, bone_poses
 from magnet.viewer.scenery import Marks, Shades, Trails
 from magnet.viewer.takes import Take
 
-APART = 0.5
-"""Metres between the takes of a row."""
-WIDEST = 8.0
-"""Metres of the row that one take takes up at most."""
-CROWD = 8
-"""People in all above whom light bodies are the first choice."""
 HEAD_HIGH = 2.1
 EVEN = 1.2
 """Strength of the light that stands in for surroundings."""
@@ -156,36 +150,5 @@ def light_up(server: Any, plain: bool) -> None:
     server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)
 
 
-def first_style(people: int) -> Style:
-    """What people are shown as when nobody says: whole bodies, or light ones of a crowd."""
-    return "light" if people > CROWD else "body"
-
-
 def _node(label: str) -> str:
     return "take_" + "".join(c if c.isalnum() else "_" for c in label)
-
-
-def in_a_row(takes: list[Take]) -> list[Array]:
-    """Offsets that put takes side by side along x around the origin, each (3,)."""
-    edges = []
-    for each in takes:
-        x = each.scene.T_world_root[0, :, :, 0, 3]
-        middle = float(x.median())
-        half = min(float((x - middle).abs().flatten()[:: max(x.numel() // 9999, 1)].quantile(0.8)) + 0.5, WIDEST / 2)
-        edges.append((middle, half))
-    width = sum(2 * half for _, half in edges) + APART * (len(takes) - 1)
-    offsets, left = [], -width / 2
-    for (middle, half), each in zip(edges, takes, strict=True):
-        z = float(each.scene.T_world_root[0, :, :, 2, 3].median())
-        offsets.append(np.array([left + half - middle, 0.0, -z]))
-        left += 2 * half + APART
-    return offsets
-
-
-def numbered(takes: list[Take]) -> list[Take]:
-    """The takes with labels that differ, for they name nodes of the scene."""
-    labels = [each.label for each in takes]
-    return [
-        replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
-        for i, each in enumerate(takes)
-    ]

@@ -7,10 +7,10 @@ from typing import Any
 from magnet.body.base import Body
 from magnet.viewer.clock import Clock
 from magnet.viewer.levels import level_image
-from magnet.viewer.rig import Style
+from magnet.viewer.rig import CROWD, Style, first_style
 from magnet.viewer.stage import Stage
-from magnet.viewer.takes import Take, same_length
-from magnet.viewer.troupe import CROWD, Look, Troupe, first_style, in_a_row, numbered
+from magnet.viewer.takes import Take, in_a_row, numbered, same_length
+from magnet.viewer.troupe import Look, Troupe
 
 
 class Viewer(Stage):

@@ -130,16 +130,6 @@ def test_what_cannot_be_read_or_written_is_named(duet: Scene, body: Body, tmp_pa
         formats.read([tmp_path / "two.npz", tmp_path / "two.npz"])
 
 
-def test_pictures_mark_what_was_given(duet: Scene, body: Body, tmp_path: Path, pixels_like):
-    from magnet.export.stage import CONTEXT
-
-    known = torch.zeros(12, 2, dtype=torch.bool)
-    plain, marked = (
-        Image.open(formats.write(duet, tmp_path / f"{i}.png", body, known=k)[0]) for i, k in enumerate((known, ~known))
-    )
-    assert pixels_like(marked, CONTEXT[0]) > 10 * pixels_like(plain, CONTEXT[0])
-
-
 def test_the_open_body_is_the_default(duet: Scene, tmp_path: Path):
     (path,) = formats.write(duet, tmp_path / "a.glb")
     assert path.read_bytes() == formats.write(duet, tmp_path / "b.glb", load_body("open"))[0].read_bytes()
@@ -154,8 +144,7 @@ def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, bo
     said = duet.replace(given=given)
     plain, marked = (Image.open(formats.write(s, tmp_path / f"{i}.png", body)[0]) for i, s in enumerate((duet, said)))
     assert pixels_like(marked, CONTEXT[0]) > 5 * pixels_like(plain, CONTEXT[0])
-    assert torch.equal(known_frames(said, 3, None), given[0])
-    assert torch.equal(known_frames(said, 3, ~given[0]), ~given[0])
+    assert torch.equal(known_frames(said, 3), given[0])
     twice = resampled(said, 60.0).given
     assert twice is not None and twice[0].sum(dim=0).tolist() == [11, 0]  # frame 5.5 is half generated
     both = formats.together([said.order([0]), duet.order([1])], ["a", "b"])

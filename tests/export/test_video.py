@@ -23,9 +23,9 @@ Count = Callable[[Image.Image, tuple[int, int, int]], int]
 SMALL = (160, 120)
 
 
-def film(scenes: object, body: Body, context: int = 4, style: Style = "skeleton", known: object = None, **kw) -> Film:  # type: ignore[no-untyped-def]
+def film(scenes: object, body: Body, context: int = 4, style: Style = "skeleton", **kw) -> Film:  # type: ignore[no-untyped-def]
     options = {"fps": 30.0, "size": SMALL, "title": None, "ghosts": None, "camera": Camera(), "trail": 0.0} | kw
-    return Film(scenes, context, known, body, style, **options)  # type: ignore[arg-type]
+    return Film(scenes, context, body, style, **options)  # type: ignore[arg-type]
 
 
 def frames_of(path: Path) -> list[Image.Image]:
@@ -71,8 +71,8 @@ def test_known_frames_are_pink_and_generated_ones_are_not(
 
 
 def test_a_mask_can_give_one_person_only(duet: Scene, body: Body, pixels_like: Count) -> None:
-    known = torch.tensor([[False, True]]).expand(12, 2)
-    image = film(duet, body, known=known).draw(11)
+    given = torch.tensor([[False, True]]).expand(1, 12, 2)
+    image = film(duet.replace(given=given), body).draw(11)
     assert pixels_like(image, CONTEXT[1]) > 60
     assert pixels_like(image, AGENTS[0]) > 60
     assert pixels_like(image, AGENTS[1]) == 0

@@ -62,7 +62,7 @@ def undisturbed(page: Any, seconds: float = 0.0) -> None:
 
 def grey(image: np.ndarray) -> np.ndarray:
     """Pixels of ghosts."""
-    return (np.ptp(image, axis=-1) < 25) & (image.mean(axis=-1) > 120) & (image.mean(axis=-1) < 205)
+    return (np.ptp(image, axis=-1) < 25) & (image.mean(axis=-1) > 120) & (image.mean(axis=-1) < 225)
 
 
 def pale_orange(image: np.ndarray) -> np.ndarray:
@@ -120,52 +120,53 @@ def played(page: Any, live: Live, body: Body) -> Iterator[Any]:
         yield playground
 
 
-def choose(page: Any, label: str, value: str) -> None:
-    """Pick from a drop-down list of the panel."""
-    option = page.get_by_role("option", name=value, exact=True)
+class Panel:
+    """The viewer's controls, as a hand uses them."""
 
-    def picked() -> bool:
-        """A list may close again while the panel is still being laid out."""
-        field(page, label).first.click()
-        with contextlib.suppress(Exception):
-            option.click(timeout=10_000)
-            return True
-        return False
+    def __init__(self, page: Any) -> None:
+        self.page = page
 
-    wait(picked)
+    def field(self, label: str) -> Any:
+        """The inputs beside a label."""
+        return self.page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input")
 
+    def choose(self, label: str, value: str) -> None:
+        """Pick from a drop-down list."""
+        option = self.page.get_by_role("option", name=value, exact=True)
 
-def field(page: Any, label: str) -> Any:
-    """The inputs beside a label of the panel."""
-    return page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input")
+        def picked() -> bool:
+            """A list may close again while the panel is still being laid out."""
+            self.field(label).first.click()
+            with contextlib.suppress(Exception):
+                option.click(timeout=10_000)
+                return True
+            return False
 
+        wait(picked)
 
-def enter(page: Any, label: str, value: object) -> None:
-    """Type a number into a field or beside a slider."""
-    number = field(page, label).last
-    number.fill(str(value))
-    number.press("Enter")
+    def enter(self, label: str, value: object) -> None:
+        """Type a number into a field or beside a slider."""
+        number = self.field(label).last
+        number.fill(str(value))
+        number.press("Enter")
 
+    def tick(self, label: str) -> None:
+        """Click a checkbox."""
+        self.field(label).click()
 
-def tick(page: Any, label: str) -> None:
-    """Click a checkbox."""
-    field(page, label).click()
+    def press(self, name: str) -> None:
+        """Press a button."""
+        self.page.get_by_role("button", name=name, exact=True).click()
 
-
-def press(page: Any, name: str) -> None:
-    """Press a button."""
-    page.get_by_role("button", name=name, exact=True).click()
-
-
-def downloaded(page: Any, kind: str, name: str, folder: Path) -> Path:
-    """Save the take as a format, from the open folder Save; the file that the browser gets."""
-    choose(page, "format", kind)
-    with page.expect_download() as download:
-        press(page, "Download")
-    assert download.value.suggested_filename == name
-    path = folder / name
-    download.value.save_as(path)
-    return path
+    def downloaded(self, kind: str, name: str, folder: Path) -> Path:
+        """Save the take as a format, from the open folder Save; the file that the browser gets."""
+        self.choose("format", kind)
+        with self.page.expect_download() as download:
+            self.press("Download")
+        assert download.value.suggested_filename == name
+        path = folder / name
+        download.value.save_as(path)
+        return path
 
 
 def drag_handle(page: Any, name: str, moved: Callable[[], bool]) -> None:

@@ -14,6 +14,7 @@ from magnet.motion.scene import Scene
 from magnet.synthesis.generate import synthesize
 from magnet.testing import random_scene
 from magnet.viewer.server import start
+from tests.viewer.browser import Panel
 
 SIZE = {"width": 800, "height": 500}
 FLAGS = (
@@ -74,6 +75,11 @@ def page(chromium: Any) -> Iterator[Any]:
     yield page
     page.close()
     assert not errors
+
+
+@pytest.fixture
+def panel(page: Any) -> Panel:
+    return Panel(page)
 
 
 @pytest.fixture(scope="session")

@@ -7,94 +7,81 @@ import torch
 
 from magnet.motion.scene import Scene
 from magnet.viewer.live import FIRST, REACH, Live
-from tests.viewer.browser import (
-    blue,
-    choose,
-    downloaded,
-    drag_handle,
-    enter,
-    orange,
-    played,
-    press,
-    seen,
-    shipped,
-    tick,
-    wait,
-)
+from tests.viewer.browser import blue, drag_handle, orange, played, seen, shipped, wait
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
-def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, body, tmp_path) -> None:
+def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, panel, body, tmp_path) -> None:
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
     live.settings.steps = 10
     with played(page, live, body) as playground:
-        choose(page, "task", "motion_control")
+        panel.choose("task", "motion_control")
         wait(lambda: live.settings.task == "motion_control")
-        choose(page, "whom", "person 2")
+        panel.choose("whom", "person 2")
         wait(lambda: 1 in live.settings.goals)
         assert live.task().target == (0,)
         grown = live.scene.frames
         wait(lambda: live.scene.frames > grown)
-        playground.follow = playground.clock.playing = False
+        playground.clock.playing = False
+        playground.clock.seek(live.scene.frames - 1)  # the handle stands where the newest frames were
         goal = live.settings.goals[1]
         drag_handle(page, "live_handle", lambda: live.settings.goals[1] != goal)
         playground.clock.playing = True
         grown = live.scene.frames
         wait(lambda: live.scene.frames > grown + 32)
         seen(page, "live_steered", lambda image: orange(image).sum() > 300)
-        choose(page, "whom", "nobody")
-        choose(page, "task", "agentic_async")
+        panel.choose("whom", "nobody")
+        panel.choose("task", "agentic_async")
         wait(lambda: live.settings.task == "agentic_async")
         page.get_by_text("offset of turns", exact=True).wait_for()
-        choose(page, "guidance", "history")
+        panel.choose("guidance", "history")
         wait(lambda: live.settings.guidance.kind == "history")
-        choose(page, "task", "partner_inpainting")
+        panel.choose("task", "partner_inpainting")
         page.get_by_text("cannot be played live").wait_for()
-        choose(page, "task", "joint_future")
+        panel.choose("task", "joint_future")
         version = live.version
-        press(page, "Restart from this frame")
+        panel.press("Restart from this frame")
         wait(lambda: live.version > version)
         playground.clock.playing = False
         seen(page, "live", lambda image: blue(image).sum() + orange(image).sum() > 500)
-        enter(page, "smoothing", 0.05)
+        panel.enter("smoothing", 0.05)
         wait(lambda: live.settings.guidance.smooth == 0.05)
-        enter(page, "how many people", 3)
-        press(page, "Start anew")
+        panel.enter("how many people", 3)
+        panel.press("Start anew")
         wait(lambda: live.scene.agents == 3)
         page.get_by_text("Save", exact=True).click()
-        saved = Scene.load(downloaded(page, "npz", "scene.npz", tmp_path))
+        saved = Scene.load(panel.downloaded("npz", "scene.npz", tmp_path))
         assert saved.agents == 3 and saved.frames >= FIRST
         assert torch.equal(saved.T_world_root, live.scene.cut(0, saved.frames).T_world_root)
 
 
-def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(page, body) -> None:
+def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(page, panel, body) -> None:
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
     with played(page, live, body) as playground:
-        tick(page, "loop")
+        panel.tick("loop")
         wait(lambda: playground.worker.paused and playground.clock.loop)
-        press(page, "Pause")
+        panel.press("Pause")
         wait(lambda: not playground.clock.playing)
-        playground.follow = False
         playground.clock.seek(64)
         wait(lambda: playground.shown == 64)
         page.get_by_text("Keyframes", exact=True).click()
-        press(page, "Add keyframe here")
+        panel.press("Add keyframe here")
         wait(lambda: len(live.keys) == 1)
         goal = live.keys[0].goal
         drag_handle(page, "live_keyframe", lambda: live.keys[0].goal != goal)
-        choose(page, "of", "person 2")
-        press(page, "Add keyframe here")
+        panel.choose("of", "person 2")
+        panel.press("Add keyframe here")
         wait(lambda: len(live.keys) == 2)
-        enter(page, "at frame", 112)
+        panel.enter("at frame", 112)
         wait(lambda: sorted((key.agent, key.frame) for key in live.keys) == [(0, 64), (1, 112)])
         page.get_by_text("person 2 at 112: 3.7 s").wait_for()
-        press(page, "Add keyframe here")
+        panel.press("Add keyframe here")
         wait(lambda: len(live.keys) == 3)
-        press(page, "Remove this keyframe")
+        panel.press("Remove this keyframe")
         wait(lambda: len(live.keys) == 2)
         keys = {(key.agent, key.frame): key for key in live.keys}
-        press(page, "Generate between")
+        panel.press("Generate between")
         page.get_by_text("in-betweening made").wait_for()
         assert live.scene.frames == 116
         wait(lambda: playground.clock.playing)
@@ -108,6 +95,6 @@ def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(pa
         playground.clock.seek(65)
         page.get_by_text("given: person 1").wait_for()
         seen(page, "live_between", lambda image: orange(image).sum() > 300)
-        tick(page, "loop")
+        panel.tick("loop")
         playground.clock.playing = True
         wait(lambda: live.scene.frames > 116)

@@ -58,6 +58,27 @@ def test_the_page_draws_what_the_body_says(page, handshake, body, tmp_path) -> N
     np.testing.assert_allclose(np.reshape(places, (22, 3)), truth, atol=1e-3)
 
 
+def test_the_page_shows_takes_side_by_side_and_each_alone(page, handshake, body, tmp_path) -> None:
+    three = handshake.repeat(3).replace(names=())
+    path = save_html(three, tmp_path / "a.html", body, context=32, styles=("skeleton",), title="Three")
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 2")
+    page.locator("#time").fill("60")
+    labels = page.locator("#labels div")
+    page.wait_for_function("document.getElementById('labels').innerText.includes('Three · 3: generated')")
+    all_places = [labels.nth(k).bounding_box()["x"] for k in range(3)]
+    assert all_places == sorted(all_places) and all_places[2] - all_places[0] > 200
+    shot(page, "page_three")
+    page.select_option("#take", "Three · 2")
+    drawn = page.evaluate("player.drawn")
+    page.wait_for_function(f"player.drawn > {drawn + 1}")
+    assert [labels.nth(k).is_visible() for k in range(3)] == [False] * 3
+    assert page.locator("#state").inner_text() == "generated"
+    alone = shot(page, "page_one_of_three")[40:380]
+    columns = (blue(alone) | orange(alone)).any(axis=0).nonzero()[0]
+    assert 0 < np.ptp(columns) < 400
+
+
 def test_the_page_marks_a_given_partner_and_keyframes(page, handshake, body, tmp_path) -> None:
     given = torch.zeros(1, handshake.frames, 2, dtype=torch.bool)
     given[:, :, 1] = True

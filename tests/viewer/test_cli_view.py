@@ -62,7 +62,7 @@ def test_an_unreadable_file_is_named(tmp_path: Path, capsys) -> None:
     pytest.importorskip("viser")
     path = tmp_path / "broken.npz"
     path.write_bytes(b"PK no")
-    assert "broken.npz: not readable" in said(capsys, str(path), "--port", "0")
+    assert "broken.npz: not a readable npz (no archive, or cut short)" in said(capsys, str(path), "--port", "0")
 
 
 def test_mixed_frame_rates_are_named_for_the_truth_too(tmp_path: Path, duet: Scene, capsys) -> None:
@@ -103,6 +103,12 @@ def test_without_a_display_no_browser_is_started(monkeypatch) -> None:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     assert not server.open_browser("http://localhost:1")
+
+
+def test_a_page_holds_all_files_and_samples(tmp_path: Path, duet: Scene) -> None:
+    paths = [str(duet.repeat(2).save(tmp_path / "a.npz")), str(duet.save(tmp_path / "b.npz"))]
+    assert main(["view", *paths, "--html", str(tmp_path / "a.html"), "--style", "skeleton"]) == 0
+    assert '"takes":["a \\u00b7 1","a \\u00b7 2","b"]' in (tmp_path / "a.html").read_text()
 
 
 @pytest.mark.parametrize("style", VIEWS)

@@ -14,6 +14,7 @@ from magnet.body.base import PARENTS
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from magnet.viewer.html import FULL, page, save_html
+from magnet.viewer.takes import take
 
 TYPES = {"i16": "<i2", "u16": "<u2", "u32": "<u4", "u8": "u1", "f32": "<f4"}
 
@@ -42,14 +43,15 @@ def drawn(meta: dict, arrays: dict[str, np.ndarray], person: int, frame: int) ->
         ],
         -2,
     )
-    rest = arrays["rest"].reshape(M, 22, 3)[person].astype(float)
+    shape = meta["people"][person]["shape"]
+    rest = arrays["rest"].reshape(-1, 22, 3)[shape].astype(float)
     place = np.zeros((22, 3))
     place[0] = arrays["roots"].reshape(-1, M, 3)[frame, person]
     for j in range(1, 22):
         place[j] = place[PARENTS[j]] + R[PARENTS[j]] @ (rest[j] - rest[PARENTS[j]])
     bones = arrays["body_bones"].reshape(-1, 4)
     weights = arrays["body_weights"].reshape(-1, 4) / 65535
-    vertices = arrays["body_vertices"].reshape(M, -1, 3)[person] * meta["unit"]
+    vertices = arrays["body_vertices"].reshape(-1, len(bones), 3)[shape] * meta["unit"]
     moved = np.einsum("vkab,vkb->vka", R[bones], vertices[:, None] - rest[bones]) + place[bones]
     return (weights[..., None] * moved).sum(axis=1)
 
@@ -106,8 +108,43 @@ def test_a_licensed_bodys_skin_is_left_out_unless_it_is_asked_for(duet: Scene, b
 FIELDS = ("J_template", "J_shapedirs", "v_template", "shapedirs", "weights", "faces")
 
 
-def test_several_scenes_and_unknown_styles_are_refused(scene: Scene, duet: Scene, body: Body) -> None:
-    with pytest.raises(ValueError, match="got 2 scenes, expected one"):
-        page(scene, body)
+def test_several_scenes_stand_side_by_side_and_share_their_meshes(duet: Scene, body: Body) -> None:
+    given = torch.zeros(1, 24, 2, dtype=torch.bool)
+    given[:, :8, 1] = True
+    samples = duet.replace(given=given).repeat(3)
+    meta, arrays = contents(page(samples, body, truth=duet.cut(0, 12), title="dance"))
+    assert meta["takes"] == ["dance · 1", "dance · 2", "dance · 3"]
+    assert [(person["take"], person["ghost"]) for person in meta["people"]] == [
+        (take, ghost) for take in range(3) for ghost in (False, False, True, True)
+    ]
+    assert {person["shape"] for person in meta["people"]} == {0, 1}
+    assert arrays["rest"].size == 2 * 22 * 3
+    assert (arrays["known"].reshape(24, 3, 4)[:, :, :2] == given[0, :, None].numpy()).all()
+    roots = arrays["roots"].reshape(24, 3, 4, 3)
+    own = duet.T_world_root[0, :, :, :3, 3].numpy()
+    shift = roots[:, :, :2] - own[:, None]
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[:1, :, :1], shift.shape), atol=1e-5)  # a place a take
+    spans = [(roots[:, take, :2, 0].min(), roots[:, take, :2, 0].max()) for take in range(3)]
+    assert spans[0][1] < spans[1][0] and spans[1][1] < spans[2][0]
+
+
+def test_takes_of_several_lengths_and_people_share_a_page(duet: Scene, body: Body) -> None:
+    short = duet.cut(0, 10).order(torch.tensor([1])).replace(given=torch.ones(1, 10, 1, dtype=torch.bool))
+    meta, arrays = contents(page([take("long", duet), take("short", short)], body))
+    assert (meta["frames"], [person["take"] for person in meta["people"]]) == (24, [0, 0, 1])
+    turns = arrays["turns"].reshape(24, 3, 22, 4)
+    assert (turns[9:, 2] == turns[9, 2]).all() and (turns[:10, 2] == turns[:10, 1]).all()
+    with pytest.raises(ValueError, match=r"takes of \[30.0, 60.0\] frames a second"):
+        page([take("a", duet), take("b", duet.replace(fps=60.0))], body)
+
+
+def test_a_crowds_page_holds_light_bodies(body: Body) -> None:
+    crowd = random_scene(3, 4, 3, torch.Generator().manual_seed(3))
+    meta, arrays = contents(page(crowd, body))
+    assert meta["styles"] == ["light", "capsules", "skeleton"]
+    assert not [name for name in arrays if name.startswith("body")]
+
+
+def test_unknown_styles_are_refused(duet: Scene, body: Body) -> None:
     with pytest.raises(ValueError, match="choose from body, light, capsules, skeleton"):
         page(duet, body, styles=("cartoon",))  # type: ignore[arg-type]

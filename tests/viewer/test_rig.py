@@ -15,7 +15,7 @@ MILLIMETRE = 1e-3
 def test_bending_by_bone_poses_gives_the_bodys_vertices_within_a_millimetre(duet: Scene, body: Body) -> None:
     turns, places = bone_poses(body, duet)
     truth = body.vertices(duet)[0].numpy()
-    for p, rig in enumerate(rigs(body, duet)):
+    for p, rig in enumerate(rigs(body, duet.betas[0])):
         for t in (0, 7, 23):
             assert np.abs(bend(rig, turns[t, p], places[t, p]) - truth[t, p]).max() < MILLIMETRE
 
@@ -29,7 +29,7 @@ def test_a_body_whose_vertices_follow_more_than_four_bones_keeps_the_strongest_f
 
 
 def test_dense_weights_are_those_of_the_body(duet: Scene, body: Body) -> None:
-    dense = rigs(body, duet)[0].skin.dense_weights()
+    dense = rigs(body, duet.betas[0])[0].skin.dense_weights()
     np.testing.assert_allclose(dense, body.weights.numpy(), atol=1e-5)
 
 
@@ -37,7 +37,7 @@ def test_dense_weights_are_those_of_the_body(duet: Scene, body: Body) -> None:
 def test_every_limb_of_a_mannequin_stays_around_its_joints_in_any_pose(duet, body, style, table) -> None:
     turns, places = bone_poses(body, duet)
     per_limb = len(capsule(1.0, 0.1, 0.1)[0])
-    for p, rig in enumerate(rigs(body, duet, style)):
+    for p, rig in enumerate(rigs(body, duet.betas[0], style)):
         start, end, radii = (x[0] for x in limbs(places[11, p][None].astype(float), table))
         bent = bend(rig, turns[11, p], places[11, p]).reshape(len(table), per_limb, 3)
         for a, b, r, points in zip(start, end, radii, bent, strict=True):
@@ -75,7 +75,7 @@ def test_world_rotations_of_a_body_at_rest_are_its_pelvis_rotation(duet: Scene) 
 
 @pytest.mark.parametrize("style", VIEWS)
 def test_each_style_has_whole_meshes_with_weights_that_sum_to_one(duet: Scene, body: Body, style) -> None:
-    for rig in rigs(body, duet, style):
+    for rig in rigs(body, duet.betas[0], style):
         skin = rig.skin
         assert skin.faces.max() < len(skin.vertices)
         assert skin.bones.max() < 22

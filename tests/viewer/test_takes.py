@@ -36,14 +36,6 @@ def test_absent_people_are_not_shown_and_the_others_keep_their_slots(scene: Scen
     assert shown.scene.agents == 2
 
 
-def test_known_says_who_was_given_which_frames(duet: Scene) -> None:
-    known = torch.zeros(duet.frames, 2, dtype=torch.bool)
-    known[:, 1] = True
-    assert (take("x", duet, known=known).known == known.numpy()).all()
-    with pytest.raises(ValueError, match=r"known: got \(3, 2\)"):
-        take("x", duet, known=known[:3])
-
-
 def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scene) -> None:
     given = torch.zeros(1, duet.frames, 2, dtype=torch.bool)
     given[:, 5, 0] = True
@@ -51,7 +43,6 @@ def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scen
     shown = take("x", said, context=8)
     assert (shown.known == given[0].numpy()).all()
     assert [shown.said(frame) for frame in (4, 5)] == ["", "given: person 1"]
-    assert (take("x", said, known=~given[0]).known == ~given[0].numpy()).all()
     assert take("x", duet, context=8).scene.given.sum() == 16
     assert take("x", duet).scene.given is None
 

@@ -87,6 +87,26 @@ def test_who_has_moved_the_slider_is_told_the_frame_once_more(body: Body) -> Non
     assert len(heard_of(viewer.slider, heard)) == 2
 
 
+def test_the_camera_follows_people_or_stays_where_it_is(body: Body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(1))
+    viewer = Viewer([take("dance", scene)], body, port=0)
+    places = []
+    try:
+        for follow, frame in ((True, 20), (False, 2), (True, 12)):
+            viewer.follow = follow
+            viewer.clock.seek(frame)
+            viewer.draw()
+            places.append(-torch.as_tensor(viewer.root.position)[[0, 2]].float())
+    finally:
+        viewer.stop()
+    middle = scene.T_world_root[0, :, :, :3, 3].mean(dim=1)[:, [0, 2]]
+    assert torch.equal(places[0], places[1])
+    torch.testing.assert_close(places[2] - places[0], middle[12] - middle[20], atol=1e-4, rtol=0)
+
+
 def heard_of(slider: Any, heard: list[Any]) -> list[int]:
     """Values of a slider among messages."""
     return [message.updates["value"] for message in heard if getattr(message, "uuid", "") == slider._impl.uuid]
