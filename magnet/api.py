@@ -120,20 +120,20 @@ class Motion(Scene):
         whole = (self.given | ~self.present[:, None]).all(dim=0).all(dim=1)
         return int(whole.long().cumprod(dim=0).sum())
 
-    def show(self, scene: int = 0, player: Player = "page", **options: Any) -> Shown:
+    def show(self, scene: int | None = None, player: Player = "page", **options: Any) -> Shown:
         """Something a notebook plays inline.
 
         Args:
-            scene: which of the B scenes.
+            scene: which of the B scenes; None: all, side by side.
             player: `page`, an interactive player that works without a server, or `film`, an animated picture.
             options: of `save` for that kind: style, title, fps.
         """
-        one = Motion.of(self.pick([scene]), self.model)
+        shown = self if scene is None else Motion.of(self.pick([scene]), self.model)
         with tempfile.TemporaryDirectory() as folder:
             kind = {"page": ".html", "film": ".webp"}[player]
             if player == "film":
                 options = {"style": "skeleton", "fps": 15.0, **options}
-            path = one.save(Path(folder) / f"scene{kind}", **options)
+            path = shown.save(Path(folder) / f"scene{kind}", **options)
             return Shown(path.read_bytes(), kind)
 
     def _body(self) -> Body:
@@ -205,7 +205,10 @@ class Model:
         Raises:
             ValueError: fewer than 4 frames.
         """
-        given = min(scene.frames, context or scene.frames) // STRIDE * STRIDE
+        given = scene.frames if context is None else min(scene.frames, context)
+        given = given // STRIDE * STRIDE
+        if given < STRIDE:
+            raise ValueError(f"to go on, the model needs {STRIDE} frames or more; got {max(given, 0)}")
         scene = scene.cut(scene.frames - given)
         return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
 
@@ -217,6 +220,8 @@ class Model:
         An agent beyond those in the scene is added: `inpaint(solo, agent=1)` gives a person a partner.
         """
         targets = (agent,) if isinstance(agent, int) else tuple(agent)
+        if not targets:
+            raise ValueError("agent: got none; name who is to be filled in")
         scene = self._with_room(scene, max(targets) + 1)
         present = scene.present.clone()
         present[:, list(targets)] = True
@@ -268,6 +273,9 @@ class Model:
         slots = scene.agents
         if slots > self.most_people:
             raise ValueError(f"the scene has {slots} agents, the model takes 1 to {self.most_people}")
+        for name, number in (("frames", frames), ("samples", samples)):
+            if number is not None and number < 1:
+                raise ValueError(f"{name}: got {number}, expected 1 or more")
         if frames is None:
             frames = scene.frames // STRIDE * STRIDE - context
         if frames < 1:

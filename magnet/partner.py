@@ -10,7 +10,8 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.motion.scene import Scene, joined, require_rate
 from magnet.motion.tokens import STRIDE
-from magnet.tasks.partner import MotionControl
+from magnet.sampling.schedule import Grid
+from magnet.tasks.partner import MotionControl, chosen
 
 ANSWERED = 4
 """Token steps of the window that are left to an answer; longer ones let go of the earliest past as they proceed."""
@@ -28,7 +29,8 @@ class Partner:
         generator: source of randomness, on the model's device.
 
     Raises:
-        ValueError: another frame rate than the model's, less than a token of past, or nobody is left to be answered.
+        ValueError: another frame rate than the model's, less than a token of past, no such agent, or nobody left to
+            be answered.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class Partner:
             raise ValueError(f"past: got {past.frames} frames, expected at least {STRIDE}, of everybody")
         self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents))
         self.options, self.generator = options or SamplerOptions(), generator
+        chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self.most = max(denoiser.window - ANSWERED, 1) * STRIDE
         self.past = past.replace(valid=None, given=None)
         self._forget()

@@ -162,6 +162,14 @@ def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
         model.inpaint(duet, agent=3)
     with pytest.raises(ValueError, match="leave none to sample after 64 of context"):
         model.react(duet, context=64)
+    with pytest.raises(ValueError, match="needs 4 frames or more; got 0"):
+        model.continue_(duet, context=0)
+    with pytest.raises(ValueError, match="samples: got 0, expected 1 or more"):
+        model.continue_(duet, samples=0)
+    with pytest.raises(ValueError, match="frames: got 0, expected 1 or more"):
+        model.continue_(duet, frames=0)
+    with pytest.raises(ValueError, match="agent: got none"):
+        model.inpaint(duet, agent=())
     with pytest.raises(ValueError, match="no checkpoint trio"):
         magnet.load("trio")
     with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'"):

@@ -93,7 +93,9 @@ def test_what_cannot_be_answered_is_named(denoiser, duet):
     with pytest.raises(ValueError, match="expected at least 4"):
         Partner(denoiser, duet.cut(0, 2))
     with pytest.raises(ValueError, match="not none and not all"):
-        Partner(denoiser, duet.cut(0, 16), (0, 1), FAST).answer(duet.cut(16, 20))
+        Partner(denoiser, duet.cut(0, 16), (0, 1), FAST)
+    with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 1"):
+        Partner(denoiser, duet.cut(0, 16), (5,), FAST)
 
 
 def test_a_loaded_model_gives_a_partner(denoiser, duet):

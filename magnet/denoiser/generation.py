@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import torch
 from torch import Tensor
@@ -57,6 +57,12 @@ class SamplerOptions:
     eta: float = 1.0
     shift: float = 3.0
     guidance: Guidance = field(default_factory=Guidance)
+
+    def __post_init__(self) -> None:
+        if self.placement not in get_args(Placement):
+            raise ValueError(f"placement: got {self.placement!r}, expected {' or '.join(get_args(Placement))}")
+        if self.blend < 0:
+            raise ValueError(f"blend: got {self.blend}, expected 0 or more frames")
 
 
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:

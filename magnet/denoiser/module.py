@@ -151,8 +151,10 @@ class Denoiser(L.LightningModule):
 
     def require_tokenizer(self) -> None:
         if not self.built:
+            path = self.hparams["tokenizer"]
+            given = "not given" if path is None else f"{path!r}, which is no file"
             raise ValueError(
-                f"the denoiser has no tokenizer: --model.tokenizer is {self.hparams['tokenizer']!r}, which is no file. "
+                f"the denoiser has no tokenizer: --model.tokenizer is {given}. "
                 "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint"
             )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -41,6 +41,8 @@ class Guidance:
     context_level: int = 0
 
     def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"kind: got {self.kind!r}, expected {' or '.join(get_args(Kind))}")
         if not 0 <= self.context_level < LEVELS:
             raise ValueError(f"context_level: got {self.context_level}, expected 0 to {LEVELS - 1}")
 

@@ -25,8 +25,11 @@ class Grid:
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
 
     def __post_init__(self) -> None:
-        if not 0 <= self.context <= self.tokens or self.agents < 1 or self.tokens < 1:
-            raise ValueError(f"no such grid: {self}")
+        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: got {getattr(self, name)}, expected at least {least}")
+        if self.context > self.tokens:
+            raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
         if not 1 <= self.stride <= self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
         if not self.shift > 0:
@@ -279,7 +282,7 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is longer than the window, or `grid.rolling` is a number.
+            ValueError: the block is longer than the window, or `grid.rolling` is over 0.
         """
         if grid.rolling:
             raise ValueError(

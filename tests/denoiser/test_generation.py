@@ -267,3 +267,12 @@ def test_bad_requests_are_named(model, scene):
         run(model, scene.cut(0, 12))
     with pytest.raises(ValueError, match="the scene has 4 agents, the model was built for 3"):
         run(model, scene.pad_agents(4))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"placement": "fuze"}, "placement: got 'fuze', expected .* or fuse"), ({"blend": -1}, "blend: got -1")],
+)
+def test_options_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        SamplerOptions(**options)

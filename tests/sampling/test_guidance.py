@@ -114,6 +114,8 @@ def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(g
     assert torch.equal(noisy[:, 4:], tokens[:, 4:])
     expected = add_noise(tokens[:, :4], veil[:, :4], torch.tensor(40))
     assert torch.allclose(noisy[:, :4], expected, atol=1e-6)
+    with pytest.raises(ValueError, match="kind: got 'histry', expected none or history or self or partner"):
+        Guidance("histry")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="context_level: got 1000"):
         Guidance(context_level=1000)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -164,3 +166,14 @@ def test_by_default_half_of_the_window_is_in_the_making(steps, window):
 def test_by_default_a_window_of_one_token_does_not_roll():
     grid = Grid(6, 2, 2, steps=3, window=1, stride=1, rolling=None)
     assert MaskSchedule.together(grid.past(), ~grid.past(), grid).evaluations == 4 * 3
+
+
+@pytest.mark.parametrize("size", ["tokens", "agents", "steps"])
+def test_a_grid_of_nothing_names_the_size(size):
+    with pytest.raises(ValueError, match=f"{size}: got 0, expected at least 1"):
+        replace(Grid(4, 2, 0), **{size: 0})
+
+
+def test_more_context_than_there_is_is_refused():
+    with pytest.raises(ValueError, match="context: got 5 token steps, expected at most the 4 there are"):
+        Grid(4, 2, 5)
