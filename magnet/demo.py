@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import lightning as L
@@ -33,6 +33,8 @@ LONG = 1800
 """Frames of the minute that one scene is continued for."""
 LONG_SHOWN = 10.0
 """Seconds of it that the moving picture shows, the last ones."""
+STEADY = 100
+"""Noise level at which what is finished is shown in a long scene (docs/results.md)."""
 COLUMNS = 9
 MADE = "duet"
 """A scene that the model made from nothing, and that comes with it."""
@@ -49,6 +51,7 @@ class Show:
         scene: coupling and number of people of the test scene it starts from; or a scene that comes with the model.
         context: frames of it that are given.
         frames: generated after them.
+        context_level: noise level at which finished tokens are shown to the model.
     """
 
     name: str
@@ -57,6 +60,7 @@ class Show:
     scene: tuple[str, int]
     context: int = CONTEXT
     frames: int = HORIZON
+    context_level: int = 0
 
 
 SHOWS = (
@@ -65,7 +69,7 @@ SHOWS = (
     Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
     Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
     Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
-    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG),
+    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, context_level=STEADY),
 )
 
 
@@ -133,6 +137,7 @@ def perform(
     truth = test_scene(data, *show.scene)
     generator = torch.Generator().manual_seed(data.seed)
     began = time.perf_counter()
+    sampler = replace(sampler, guidance=replace(sampler.guidance, context_level=show.context_level))
     sampled = model.generate(truth, show.task, show.context, frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
     sampled.save(out / f"{show.name}.npz")
