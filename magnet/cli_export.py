@@ -29,7 +29,11 @@ for example:
 
 def parser() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(
-        "magnet export", description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+        "magnet export",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
     options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")

@@ -11,7 +11,7 @@ from typing import Any
 
 EXAMPLES = """\
 examples:
-  magnet view runs/predict/latest/scenes/0000.npz --context 32
+  magnet view recorded.npz --context 32             the first frames paler, as given
   magnet view sampled.npz --truth recorded.npz      the ground truth as ghosts
   magnet view a.npz b.npz --style capsules          side by side, light
   magnet view dance.npz --html dance.html           one page that needs no server
@@ -30,6 +30,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
         description="Watch scenes in the browser, or let a model play while you interfere.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument(
         "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"

@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser("magnet demo", description=__doc__)
+    options = argparse.ArgumentParser("magnet demo", description=__doc__, allow_abbrev=False)
     options.add_argument("--out", default="demo", help="folder for table and pictures (default: %(default)s)")
     options.add_argument("--ckpt_path", default=None, help="another model; default: the one that comes along")
     options.add_argument("--scenes", type=int, default=9, help="test scenes that are scored (default: %(default)s)")

@@ -55,6 +55,14 @@ def test_help_names_every_command() -> None:
     assert all(f"  {name} " in cli.usage() for name in cli.COMMANDS)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("demo", "--sample", "3"), ("export", "a.npz", "b.glb", "--sce", "0"), ("view", "a.npz", "--ht", "x.html")],
+)
+def test_options_are_written_out(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"unrecognized arguments: {words[-2]}" in complaint(capsys, *words)
+
+
 def test_importing_magnet_imports_nothing_heavy() -> None:
     code = "import sys, magnet; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

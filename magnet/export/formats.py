@@ -220,7 +220,9 @@ def _save_picture(
         return contact_sheet(scene, path, context_frames=context, **look)
     from magnet.export.video import render_video
 
-    return render_video(scene, path, context_frames=context, fps=fps or scene.fps, progress=progress, **look)
+    return render_video(
+        scene, path, context_frames=context, fps=scene.fps if fps is None else fps, progress=progress, **look
+    )
 
 
 def _save_page(

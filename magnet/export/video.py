@@ -60,7 +60,7 @@ def render_video(
         The path written.
 
     Raises:
-        ValueError: unknown suffix, odd size, or scenes that cannot be drawn; says which and why.
+        ValueError: unknown suffix, odd size, no frame rate, or scenes that cannot be drawn; says which and why.
         ImportError: .mp4 without PyAV.
     """
     path = Path(path)
@@ -68,6 +68,8 @@ def render_video(
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
     if size[0] % 2 or size[1] % 2:
         raise ValueError(f"size {size}: video needs even numbers of pixels")
+    if not fps > 0:
+        raise ValueError(f"fps: got {fps:g}, expected more than 0")
     film = Film(scenes, context_frames, body, style, fps, size, title, ghosts, camera or Camera(), trail)
     path.parent.mkdir(parents=True, exist_ok=True)
     # A name of its own until it is whole, so that an interrupted run leaves no half picture behind.

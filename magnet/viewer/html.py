@@ -50,9 +50,13 @@ def save_html(
         The path written.
 
     Raises:
-        ValueError: nobody there, takes of several frame rates, no such style, or another body's scene.
+        ValueError: a path that is not .html, nobody there, takes of several frame rates, no such style, or another
+            body's scene.
     """
-    path = Path(path).with_suffix(".html")
+    path = Path(path)
+    if path.suffix not in ("", ".html"):
+        raise ValueError(f"{path}: a page is a .html file")
+    path = path.with_suffix(".html")
     path.parent.mkdir(parents=True, exist_ok=True)
     text = page(scene, body, context=context, truth=truth, title=title, styles=styles)
     path.write_text(text, encoding="utf-8")

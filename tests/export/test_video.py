@@ -170,6 +170,8 @@ def test_bad_input_is_named_and_leaves_no_file(duet: Scene, body: Body, tmp_path
         render(name="a.avi")
     with pytest.raises(ValueError, match="even"):
         render(size=(161, 120))
+    with pytest.raises(ValueError, match="fps: got 0, expected more than 0"):
+        render(fps=0.0)
     with pytest.raises(ValueError, match="expected one of skeleton"):
         render(style="bones")
     with pytest.raises(ValueError, match="nobody is present"):

@@ -145,6 +145,12 @@ def test_a_crowds_page_holds_light_bodies(body: Body) -> None:
     assert not [name for name in arrays if name.startswith("body")]
 
 
+def test_a_page_is_an_html_file_and_nothing_else(duet: Scene, body: Body, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a\.pdf: a page is a \.html file"):
+        save_html(duet, tmp_path / "a.pdf", body)
+    assert not list(tmp_path.iterdir())
+
+
 def test_unknown_styles_are_refused(duet: Scene, body: Body) -> None:
     with pytest.raises(ValueError, match="choose from body, light, capsules, skeleton"):
         page(duet, body, styles=("cartoon",))  # type: ignore[arg-type]
