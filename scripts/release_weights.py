@@ -13,8 +13,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from magnet import weights
+from magnet import datamodules, weights
 
+RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
+HELD_OUT = ("03", "05", "10", "15")
 ABOUT = {
     "trained on": {
         "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
@@ -41,6 +43,21 @@ def without_folders(value: Any) -> Any:
     return value
 
 
+def manifest() -> dict[str, str]:
+    """Files of recordings, and their sha256, of the takes that were trained on."""
+    held = (
+        {f"60_{take}.amc" for take in HELD_OUT} | {f"61_{take}.amc" for take in HELD_OUT} | {"02_03.amc", "05_12.amc"}
+    )
+    lines = (line.split() for line in RECORDINGS.read_text().splitlines())
+    return {name: digest for digest, name in lines if name not in held}
+
+
+def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:
+    """How a checkpoint came about, where its run's record still lies beside it."""
+    record = checkpoint.parents[1] / "run.json" if checkpoint else None
+    return {key: json.loads(record.read_text())} if record and record.exists() else {}
+
+
 def main() -> None:
     """Read, write, say how large it is."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -48,8 +65,7 @@ def main() -> None:
     options.add_argument("name")
     options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
     given = options.parse_args()
-    run = given.checkpoint.parents[1] / "run.json"
-    about = ABOUT | ({"run": json.loads(run.read_text())} if run.exists() else {})
+    about = ABOUT | {"recordings": manifest()} | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
     checkpoint = weights.read(given.checkpoint)
     if given.decoder:
         checkpoint = weights.with_decoder(checkpoint, weights.read(given.decoder))
