@@ -25,7 +25,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from magnet import cli_record
-from magnet.body import load_body
+from magnet.body import Body, load_body
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
@@ -85,6 +85,27 @@ def slowest(people: Tensor) -> Tensor:
     return speed.unfold(1, 29, 15).mean(dim=-1).min()
 
 
+def measured(long: Scene, body: Body, reference: FrechetDistance) -> list[dict[str, Any]]:
+    """What each 5 seconds after the context are like, beside the recorded ones."""
+    curve: list[dict[str, Any]] = []
+    so_far: list[Tensor] = []
+    for start in range(CONTEXT, long.frames - WINDOW + 1, WINDOW):
+        window = aligned(long.cut(start, start + WINDOW), 0)
+        joints = body.joints(window)
+        so_far.append(joints)
+        cumulative = torch.cat(so_far)
+        there = window.present.repeat(len(so_far), 1)
+        curve.append(
+            {
+                "second": (start - CONTEXT + WINDOW) / 30,
+                "fd": distance(pooled(joints, window.present), reference),
+                "cumulative fd": distance(pooled(cumulative, there), reference),
+                **describe(joints, window.present),
+            }
+        )
+    return curve
+
+
 def main() -> None:
     """Generate, measure, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -118,22 +139,7 @@ def main() -> None:
     real_joints = body.joints(real)
     reference = pooled(real_joints, real.present)
     floor = distance(pooled(body.joints(training), training.present), reference)
-    curve: list[dict[str, Any]] = []
-    so_far: list[Tensor] = []
-    for start in range(CONTEXT, CONTEXT + given.frames - WINDOW + 1, WINDOW):
-        window = aligned(long.cut(start, start + WINDOW), 0)
-        joints = body.joints(window)
-        so_far.append(joints)
-        cumulative = torch.cat(so_far)
-        there = window.present.repeat(len(so_far), 1)
-        curve.append(
-            {
-                "second": (start - CONTEXT + WINDOW) / 30,
-                "fd": distance(pooled(joints, window.present), reference),
-                "cumulative fd": distance(pooled(cumulative, there), reference),
-                **describe(joints, window.present),
-            }
-        )
+    curve = measured(long, body, reference)
     facts = {
         "floor: training windows against test windows": floor,
         "recorded": describe(real_joints, real.present),

@@ -40,21 +40,20 @@ def decoded_losses(
     chosen = surest(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
     few, kind = scene.pick(chosen), model.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
-    people = few.present
+    people, true_pose = few.present, pose_features(few)
 
     def decode(latent: Tensor, betas: Tensor, steps: Tensor) -> Tensor:
-        """Poses of those who are there; empty slots, half of them or more, cost nothing and stay at rest."""
+        """Poses of those who are there; empty slots, half of them or more, cost nothing and stay as they are."""
         by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, steps)]
         with torch.autocast(kind, dtype, half):  # only networks may run in half precision
             decoded = model.tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
-        rest = pose_features(few).transpose(1, 2)
-        return rest.index_put((people,), decoded).transpose(1, 2)
+        return true_pose.transpose(1, 2).index_put((people,), decoded).transpose(1, 2)
 
     with torch.autocast(kind, enabled=False):
         return body_losses(
             model.statistics.restore(clean[chosen]),
             tokens[chosen],
-            pose_features(few),
+            true_pose,
             few.betas,
             signal[chosen],
             there[chosen],

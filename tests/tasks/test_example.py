@@ -58,7 +58,8 @@ def test_its_fields_are_options_as_ours_are(installed: Path, tmp_path: Path):
 
 def test_its_own_tests_pass(installed: Path, tmp_path: Path):
     tests = shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
-    run("pytest", "-q", "-p", "no:cacheprovider", str(tests), installed=installed, cwd=tmp_path)
+    said = run("pytest", "-q", "-p", "no:cacheprovider", str(tests), installed=installed, cwd=tmp_path)
+    assert " passed" in said and "failed" not in said
 
 
 def test_an_uninstalled_task_is_named_by_a_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
