@@ -55,7 +55,8 @@ def all_metrics(fps: float = 30.0, scored: Tensor | None = None, confidence: flo
     """Every metric of the paper's tables and a few more, fed together: `update(generated, truth, present)`.
 
     Args:
-        scored: (P,) bool, whose motion is scored; None: everybody's. Partner tasks score the partner.
+        scored: (P,) or (T, P) bool, what was generated: partner tasks generate the partner, in-betweening the frames
+            between keyframes; None: everything. `update(..., agents=...)` says it for one batch instead.
         confidence: such as 0.95, for metrics that are means over clips; adds `_low` and `_high`.
     """
     means: dict[str, Any] = {"agents": scored, "confidence": confidence}

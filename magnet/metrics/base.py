@@ -26,7 +26,8 @@ class MotionMetric(Metric):
     Args:
         of: `"truth"` measures the recording in place of the samples, under the same names: the ground
             truth's own row of a table.
-        agents: (P,) bool, who is scored where `update` is not told; None: everybody present.
+        agents: (P,) or (T, P) bool, what is scored where `update` is not told: the agents, or the frames of each,
+            that were generated; None: everything of everybody present.
     """
 
     full_state_update = False
@@ -35,10 +36,10 @@ class MotionMetric(Metric):
     def __init__(self, of: Of = "generated", agents: Tensor | None = None) -> None:
         super().__init__()
         self.of = of
-        self.agents = agents
+        self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
 
     def update(self, generated: Tensor, truth: Tensor, present: Tensor, agents: Tensor | None = None) -> None:
-        """(S, B, T, P, 22, 3), (B, T, P, 22, 3), (B, P) bool, (P,) or (B, P) bool; see `Futures.of`."""
+        """(S, B, T, P, 22, 3), (B, T, P, 22, 3), (B, P) bool, and bool: what was generated; see `Futures.of`."""
         if self.of == "truth":
             generated = truth[None]
         self.add(Futures.of(generated, truth, present, self.agents if agents is None else agents))

@@ -26,9 +26,9 @@ class Diversity(ClipMeans):
         super().__init__(["div"], of, agents, confidence)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
-        places = futures.scored.sum(dim=1) * futures.frames
+        places = futures.scored.sum(dim=(1, 2))
         if futures.samples < 2:
             return [(torch.zeros_like(places), torch.zeros_like(places))]
         variance = diversity(futures.generated)  # (B, T, P)
-        total = torch.where(futures.scored[:, None], variance, 0.0).sum(dim=(1, 2))
+        total = torch.where(futures.scored, variance, 0.0).sum(dim=(1, 2))
         return [(total / places.clamp(min=1), places > 0)]

@@ -113,18 +113,18 @@ class FrechetDistance(MotionMetric):
         counts = self._counts(futures)
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
             features = pose_features(joints, self.features, self.fps)
-            kept = features[counts.expand(features.shape[:-1])]
+            kept = features[counts]
             self.count[which] += len(kept)
             self.sum[which] += kept.sum(dim=0)
             self.outer[which] += kept.T @ kept
 
     def _counts(self, futures: Futures) -> Tensor:
-        """Which features are pooled, to be broadcast to (B, T, P) or (B, T, P, P - 1)."""
+        """Which features are pooled: (B, T, P), (B, T - 1, P) or (B, T, P, P - 1) bool"""
         if self.features != "pair":
-            return futures.scored[:, None]
+            return futures.spans(2 if self.features == "velocity" else 1)
         partner = partners(futures.present.shape[1], futures.present.device)
         both = futures.present[:, :, None] & futures.present[:, partner]
-        return (both & (futures.scored[:, :, None] | futures.scored[:, partner]))[:, None]
+        return both[:, None] & (futures.scored[..., None] | futures.scored[..., partner])
 
     def compute(self) -> dict[str, Tensor]:
         if bool((self.count < 2).any()):

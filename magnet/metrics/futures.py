@@ -17,7 +17,7 @@ class Futures:
     generated: Tensor  # (S, B, T, P, 22, 3) metres, world
     truth: Tensor  # (B, T, P, 22, 3)
     present: Tensor  # (B, P) bool
-    scored: Tensor  # (B, P) bool: present, and asked about
+    scored: Tensor  # (B, T, P) bool: present, and this frame of this agent was generated
 
     @staticmethod
     def of(generated: Tensor, truth: Tensor, present: Tensor, agents: Tensor | None = None) -> Futures:
@@ -27,10 +27,13 @@ class Futures:
             generated: (S, B, T, P, 22, 3) future joints of S samples a scene.
             truth: (B, T', P, 22, 3).
             present: (B, P) bool; an absent agent never counts, whatever its numbers.
-            agents: (P,) or (B, P) bool, who is scored (partner tasks); None: everybody present.
+            agents: bool, what was generated and is scored: (P,), (B, P), (T, P) or (B, T, P), where in the last
+                form B and T may be 1; None: everything of everybody present. What is not scored was given, so
+                `generated` is expected to repeat it there.
 
         Raises:
-            ValueError: shapes do not fit, or a joint of a present agent is not finite.
+            ValueError: shapes do not fit, B = T leave open what two axes of `agents` are, or a joint of a present
+                agent is not finite.
         """
         if generated.ndim != 6 or truth.ndim != 5 or generated.shape[-2:] != (BODY_JOINTS, 3):
             raise ValueError(
@@ -45,15 +48,14 @@ class Futures:
             )
         if present.shape != (B, P) or present.dtype != torch.bool:
             raise ValueError(f"present: got {tuple(present.shape)} {present.dtype}, expected {(B, P)} bool")
-        if agents is not None and (agents.dtype != torch.bool or agents.shape not in ((P,), (B, P))):
-            raise ValueError(f"agents: got {tuple(agents.shape)} {agents.dtype}, expected {(P,)} or {(B, P)} bool")
-        frames = min(generated.shape[2], truth.shape[1])
+        lengths = (generated.shape[2], truth.shape[1])
+        frames = min(lengths)
         there = present[:, None, :, None, None]
         cut = Futures(
             generated=torch.where(there, generated[:, :, :frames].double(), 0.0),
             truth=torch.where(there, truth[:, :frames].double(), 0.0),
             present=present,
-            scored=present if agents is None else present & agents.to(present.device),
+            scored=present[:, None] & _by_frame(agents, B, lengths, P).to(present.device),
         )
         _demand_finite("generated", cut.generated.isfinite().all(dim=0))
         _demand_finite("truth", cut.truth.isfinite())
@@ -67,16 +69,56 @@ class Futures:
     def samples(self) -> int:
         return self.generated.shape[0]
 
+    def spans(self, frames: int) -> Tensor:
+        """Which differences over so many frames in a row count: those with a scored frame. (B, T - frames + 1, P)
+
+        So a step between two given frames never counts, and the step at a seam does: it is the generated end
+        that makes it.
+        """
+        if frames > self.frames:
+            return self.scored[:, :0]
+        return self.scored.unfold(1, frames, 1).any(dim=-1)
+
     def pairs(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Every two agents p < q, and where they count: both there, at least one scored. (Q,), (Q,), (B, Q) bool"""
+        """Every two agents p < q, and where they count. (Q,), (Q,), (B, T, Q) bool
+
+        A pair counts in the frames in which both are there and at least one is scored.
+        """
         first, second = torch.triu_indices(self.truth.shape[2], self.truth.shape[2], offset=1, device=self.truth.device)
         both = self.present[:, first] & self.present[:, second]
-        return first, second, both & (self.scored[:, first] | self.scored[:, second])
+        return first, second, both[:, None] & (self.scored[..., first] | self.scored[..., second])
 
 
 def without_pelvis(joints: Tensor) -> Tensor:
     """The 21 joints that are measured. (..., 22, 3) -> (..., 21, 3)"""
     return joints[..., 1:, :]
+
+
+def _by_frame(agents: Tensor | None, B: int, lengths: tuple[int, int], P: int) -> Tensor:
+    """`agents` of `Futures.of` as (B or 1, T, P) bool, T the shorter of two lengths."""
+    frames = min(lengths)
+    if agents is None:
+        return torch.ones(1, frames, P, dtype=torch.bool)
+    shape = tuple(agents.shape)
+    if agents.ndim == 2 and B in lengths and shape == (B, P):
+        raise ValueError(
+            f"agents: got {shape} for {B} scenes of {B} frames, which may mean either; "
+            f"expected {(B, 1, P)} or {(1, B, P)}"
+        )
+    if shape == (P,):
+        agents = agents[None, None]
+    elif shape == (B, P):
+        agents = agents[:, None]
+    elif agents.ndim == 2:
+        agents = agents[None]
+    fits = agents.ndim == 3 and agents.shape[0] in (1, B) and agents.shape[1] in (1, *lengths) and agents.shape[2] == P
+    if not fits or agents.dtype != torch.bool:
+        raise ValueError(
+            f"agents: got {shape} {agents.dtype}, expected {(P,)}, {(B, P)}, {(frames, P)} or {(B, frames, P)} bool"
+        )
+    if agents.shape[1] == 1:
+        return agents.expand(-1, frames, -1)
+    return agents[:, :frames]
 
 
 def _demand_finite(name: str, finite: Tensor) -> None:

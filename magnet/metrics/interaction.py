@@ -23,9 +23,10 @@ class Correlation(NamedTuple):
     moves: Tensor  # bool
 
 
-def correlation_sums(x: Tensor, y: Tensor, dim: int) -> Tensor:
-    """n, x, y, xx, yy, xy summed over `dim`, which add up over batches. (...) x 2 -> (..., 6)"""
-    n = torch.ones_like(x).sum(dim=dim)
+def correlation_sums(x: Tensor, y: Tensor, counts: Tensor, dim: int) -> Tensor:
+    """n, x, y, xx, yy, xy summed over `dim` where it counts, which add up over batches. (...) x 3 -> (..., 6)"""
+    x, y = (torch.where(counts, z, 0.0) for z in (x, y))
+    n = counts.to(x).expand_as(x).sum(dim=dim)
     products = [(a * b).sum(dim=dim) for a, b in ((x, x), (y, y), (x, y))]
     return torch.stack([n, x.sum(dim=dim), y.sum(dim=dim), *products], dim=-1)
 
@@ -85,16 +86,18 @@ class MotionInteraction(MotionMetric):
         # Numbered so that two slots keep their place whatever the number of slots of a batch.
         place = second * (second - 1) // 2 + first
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
-            sums = correlation_sums(*paired_coordinates(joints, first, second), dim=1)  # (B, Q, 63, 6)
+            x, y = paired_coordinates(joints, first, second)
+            sums = correlation_sums(x, y, counts[..., None], dim=1)  # (B, Q, 63, 6)
             if self.per_clip:
                 correlation = pearson(sums)  # (B, Q, 63)
-                moves = correlation.moves & counts[:, :, None]
+                some = counts.any(dim=1)[:, :, None]
+                moves = correlation.moves & some
                 value = torch.where(moves, correlation.value, 0.0)
                 totals = torch.stack([value.sum(dim=(0, 2)), moves.sum(dim=(0, 2)).double()], dim=-1)
                 self.clip_totals[which, place] += totals
-                self.still += (~correlation.moves & counts[:, :, None]).sum()
+                self.still += (~correlation.moves & some).sum()
             else:
-                self.sums[which, place] += torch.where(counts[:, :, None, None], sums, 0.0).sum(dim=0)
+                self.sums[which, place] += sums.sum(dim=0)
 
     def compute(self) -> dict[str, Tensor]:
         if self.per_clip:

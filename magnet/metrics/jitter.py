@@ -27,4 +27,4 @@ class Jitter(ClipMeans):
         self.fps = fps
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
-        return [clip_sums(jitter(futures.generated, self.fps), futures.scored[:, None])]
+        return [clip_sums(jitter(futures.generated, self.fps), futures.spans(4))]

@@ -38,8 +38,8 @@ class HandsHeld(ClipMeans):
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         first, second, counts = futures.pairs()
         apart = hand_distance(futures.generated[..., first, :, :], futures.generated[..., second, :, :])
-        held = ((apart < self.within) & counts[:, None]).any(dim=-1)  # (S, B, T)
-        return [clip_sums(held.double(), counts.any(dim=1)[:, None])]
+        held = ((apart < self.within) & counts).any(dim=-1)  # (S, B, T)
+        return [clip_sums(held.double(), counts.any(dim=-1))]
 
 
 class PartnerDistance(MotionMetric):
@@ -61,7 +61,7 @@ class PartnerDistance(MotionMetric):
     def add(self, futures: Futures) -> None:
         first, second, counts = futures.pairs()
         apart = partner_distance(futures.generated[..., first, :, :], futures.generated[..., second, :, :])
-        kept = apart[counts[:, None].expand_as(apart)]
+        kept = apart[counts.expand_as(apart)]
         bins = (kept / self.BIN).long().clamp(max=len(self.histogram) - 1)
         self.histogram += torch.bincount(bins, minlength=len(self.histogram))
 

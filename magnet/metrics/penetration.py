@@ -92,16 +92,16 @@ class Interpenetration(ClipMeans):
         total = futures.generated.new_zeros(S, B, T)
         deepest = torch.zeros_like(total)
         for q, (one, other) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-            clips = counts[:, q]
-            pair = futures.generated[:, clips][..., [one, other], :, :]  # (S, b, T, 2, 22, 3)
-            depths = [penetration_depth(*part.unbind(1)) for part in pair.flatten(0, 2).split(CHUNK)]
-            if not depths:
+            places = counts[..., q]  # (B, T)
+            pair = futures.generated[:, places][..., [one, other], :, :]  # (S, n, 2, 22, 3)
+            if not pair.numel():
                 continue
-            shape = pair.shape[:3]
-            total[:, clips] += torch.cat([depth.sum(dim=(1, 2)) for depth in depths]).view(shape)
+            depths = [penetration_depth(*part.unbind(1)) for part in pair.flatten(0, 1).split(CHUNK)]
+            shape = pair.shape[:2]
+            total[:, places] += torch.cat([depth.sum(dim=(1, 2)) for depth in depths]).view(shape)
             worst = torch.cat([depth.amax(dim=(1, 2)) for depth in depths]).view(shape)
-            deepest[:, clips] = torch.maximum(deepest[:, clips], worst)
-        frames = counts.any(dim=1) * S * T
+            deepest[:, places] = torch.maximum(deepest[:, places], worst)
+        frames = counts.any(dim=-1).sum(dim=1) * S
         hit = deepest > 0
         hits = hit.sum(dim=(0, 2))
         return [(hits, frames), (total.sum(dim=(0, 2)), frames), (deepest.sum(dim=(0, 2)), hits)]

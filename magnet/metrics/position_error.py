@@ -40,11 +40,10 @@ class PositionError(ClipMeans):
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         error = joint_error(futures.generated, futures.truth)  # (S, B, T, P)
-        by_frame = torch.where(futures.scored[:, None], error, 0.0).sum(dim=-1)  # (S, B, T)
-        people, samples, shares = futures.scored.sum(dim=-1), futures.samples, []
+        by_frame = torch.where(futures.scored, error, 0.0).sum(dim=-1)  # (S, B, T)
+        people, samples, shares = futures.scored.sum(dim=-1), futures.samples, []  # people (B, T)
         for until in (futures.frames, *self.until):
-            long_enough = 0 < until <= futures.frames
-            by_sample = by_frame[:, :, : until if long_enough else 0].sum(dim=-1)  # (S, B)
-            count = people * until if long_enough else torch.zeros_like(people)
+            upto = until if 0 < until <= futures.frames else 0
+            by_sample, count = by_frame[:, :, :upto].sum(dim=-1), people[:, :upto].sum(dim=-1)  # (S, B), (B,)
             shares += [(by_sample.sum(dim=0), count * samples), (by_sample.min(dim=0).values, count)]
         return shares

@@ -59,7 +59,7 @@ class FootSkating(ClipMeans):
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         speed, stands = toe_steps(futures.generated, self.fps, self.height)
-        scored = futures.scored[:, None, :, None].expand_as(speed)
+        scored = futures.spans(2)[..., None].expand_as(speed)
         slides = stands & (speed > self.speed) & scored
         return [
             clip_sums(speed, slides),

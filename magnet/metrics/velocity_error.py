@@ -37,4 +37,4 @@ class VelocityError(ClipMeans):
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         error = velocity_error(futures.generated, futures.truth) * self.scale
-        return [clip_sums(error, futures.scored[:, None])]
+        return [clip_sums(error, futures.spans(2))]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
 from magnet.metrics import (
@@ -31,51 +30,21 @@ from magnet.metrics import (
 from magnet.metrics.frechet import pose_features
 from magnet.motion.frames import from_planar
 
-Batch = tuple[Tensor, Tensor, Tensor]
-
-
-def draw_batch(scenes: int = 3, people: int = 3, samples: int = 4, frames: int = 20, seed: int = 0) -> Batch:
-    """Crowded made-up joints, low enough to touch the floor; the last agent of every second scene is absent, NaN."""
-    draw = torch.Generator().manual_seed(seed)
-    place = torch.randn(scenes, 1, people, 1, 3, generator=draw) * torch.tensor([0.3, 0.0, 0.3])
-    steps = torch.randn(scenes, frames, people, 22, 3, generator=draw) * 0.02
-    truth = place + torch.rand(scenes, 1, people, 22, 3, generator=draw) * 0.8 + steps.cumsum(dim=1)
-    generated = truth + (torch.randn(samples, scenes, frames, people, 22, 3, generator=draw) * 0.02).cumsum(dim=2)
-    present = torch.ones(scenes, people, dtype=torch.bool)
-    if people > 2:
-        present[::2, -1] = False
-        truth[::2, :, -1] = math.nan
-        generated[:, ::2, :, -1] = math.nan
-    return generated, truth, present
-
-
-def result(metric: Metric, *batch: Tensor, agents: Tensor | None = None) -> dict[str, float]:
-    metric.update(*batch, agents=agents)
-    return {name: float(value) for name, value in metric.compute().items()}
-
-
-def people(batch: Batch, agents: Tensor | None = None) -> list[tuple[int, int]]:
-    """(scene, agent) of everybody scored."""
-    scored = batch[2] if agents is None else batch[2] & agents
-    return [(b, p) for b, p in itertools.product(*map(range, scored.shape)) if scored[b, p]]
-
-
-ONLY_SECOND = torch.tensor([False, True, False])
-WHO = pytest.mark.parametrize("agents", [None, ONLY_SECOND], ids=["everybody", "one agent"])
-
+from .batches import EVERY, ONLY_SECOND, WHO, Choose, draw_batch, result, scored, some_frames
 
 # -- against slow references -------------------------------------------------------------------
 
 
 @WHO
-def test_position_errors_equal_a_plain_loop(agents: Tensor | None) -> None:
+def test_position_errors_equal_a_plain_loop(choose: Choose) -> None:
     batch = draw_batch(frames=40)
     generated, truth, _ = (x.double().numpy() for x in batch)
+    counts = scored(batch, choose)
     distances: dict[tuple[int, ...], float] = {}
-    for b, p in people(batch, agents):
-        for s, t, j in itertools.product(range(4), range(40), range(1, 22)):
+    for b, t, p in itertools.product(range(3), range(40), range(3)):
+        for s, j in itertools.product(range(4), range(1, 22)) if counts[b][t][p] else ():
             distances[b, p, s, t, j] = math.dist(generated[s, b, t, p, j], truth[b, t, p, j])
-    got = result(PositionError(fps=30.0), *batch, agents=agents)
+    got = result(PositionError(fps=30.0), *batch, agents=choose(batch))
     assert got["mpjpe"] == pytest.approx(np.mean(list(distances.values())), abs=1e-12)
     for name, until in (("mpjpe@0.5s", 15), ("mpjpe@1s", 30)):
         upto = [d for (_, _, _, t, _), d in distances.items() if t < until]
@@ -83,7 +52,7 @@ def test_position_errors_equal_a_plain_loop(agents: Tensor | None) -> None:
     assert "mpjpe@2s" not in got  # 40 frames are not 2 s
     for name, until in (("mpjpe_best", 40), ("mpjpe_best@0.5s", 15), ("mpjpe_best@1s", 30)):
         best, weight = 0.0, 0
-        for b in {b for b, _ in people(batch, agents)}:
+        for b in {b for b, *_ in distances}:
             found = [
                 [d for (c, _, r, t, _), d in distances.items() if (c, r) == (b, s) and t < until] for s in range(4)
             ]
@@ -93,108 +62,113 @@ def test_position_errors_equal_a_plain_loop(agents: Tensor | None) -> None:
 
 
 @WHO
-def test_velocity_error_equals_a_plain_loop(agents: Tensor | None) -> None:
+def test_velocity_error_equals_a_plain_loop(choose: Choose) -> None:
     batch = draw_batch()
     generated, truth, _ = (x.double().numpy() for x in batch)
+    counts = scored(batch, choose)
     errors = [
         math.dist(generated[s, b, t + 1, p, j] - generated[s, b, t, p, j], truth[b, t + 1, p, j] - truth[b, t, p, j])
-        for b, p in people(batch, agents)
-        for s, t, j in itertools.product(range(4), range(19), range(1, 22))
+        for s, b, t, p, j in itertools.product(range(4), range(3), range(19), range(3), range(1, 22))
+        if counts[b][t][p] or counts[b][t + 1][p]
     ]
-    assert result(VelocityError(), *batch, agents=agents)["mpjve"] == pytest.approx(np.mean(errors), abs=1e-12)
-    per_second = result(VelocityError(fps=30.0, per_second=True), *batch, agents=agents)["mpjve"]
+    assert result(VelocityError(), *batch, agents=choose(batch))["mpjve"] == pytest.approx(np.mean(errors), abs=1e-12)
+    per_second = result(VelocityError(fps=30.0, per_second=True), *batch, agents=choose(batch))["mpjve"]
     assert per_second == pytest.approx(30 * np.mean(errors), abs=1e-10)
 
 
 @WHO
-def test_diversity_equals_a_plain_loop(agents: Tensor | None) -> None:
+def test_diversity_equals_a_plain_loop(choose: Choose) -> None:
     batch = draw_batch()
     generated = batch[0].double().numpy()
     by_clip: dict[int, list[float]] = {}
-    for b, p in people(batch, agents):
-        for t in range(20):
+    counts = scored(batch, choose)
+    for b, t, p in itertools.product(range(3), range(20), range(3)):
+        if counts[b][t][p]:
             by_clip.setdefault(b, []).append(np.var(generated[:, b, t, p, 1:], axis=0, ddof=1).sum())
     expected = np.mean([np.mean(values) for values in by_clip.values()])
-    assert result(Diversity(), *batch, agents=agents)["div"] == pytest.approx(expected, abs=1e-12)
+    assert result(Diversity(), *batch, agents=choose(batch))["div"] == pytest.approx(expected, abs=1e-12)
 
 
 @WHO
 @pytest.mark.parametrize("features", ["world_joints", "canonical_joints", "velocity", "pair"])
-def test_frechet_distance_equals_the_textbook_with_sqrtm(features: str, agents: Tensor | None) -> None:
+def test_frechet_distance_equals_the_textbook_with_sqrtm(features: str, choose: Choose) -> None:
     batch = draw_batch(scenes=6, frames=60)
     generated, truth, present = (x.double() if x.is_floating_point() else x for x in batch)
     rows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    scored = people(batch, agents)
+    counts = scored(batch, choose)
     for b, p in itertools.product(range(6), range(3)):
         for which, motions in enumerate((generated[:, b], truth[None, b])):
             for motion in motions:
                 found = pose_features(motion, features)  # type: ignore[arg-type]
-                if features != "pair":
-                    if (b, p) in scored:
-                        rows[which].append(found[:, p].numpy())
-                    continue
-                for slot, q in enumerate(q for q in range(3) if q != p):
-                    if present[b, p] and present[b, q] and ((b, p) in scored or (b, q) in scored):
-                        rows[which].append(found[:, p, slot].numpy())
+                for t in range(len(found)):
+                    if features != "pair":
+                        if counts[b][t][p] or (features == "velocity" and counts[b][t + 1][p]):
+                            rows[which].append(found[t, p].numpy())
+                        continue
+                    for slot, q in enumerate(q for q in range(3) if q != p):
+                        if present[b, p] and present[b, q] and (counts[b][t][p] or counts[b][t][q]):
+                            rows[which].append(found[t, p, slot].numpy())
     moments = []
     for part in rows:
-        every = np.concatenate(part)
+        every = np.stack(part)
         cov = np.cov(every, rowvar=False)
         moments.append((every.mean(axis=0), cov + 1e-6 * (np.trace(cov) + 1) * np.eye(63)))
     (mu1, s1), (mu2, s2) = moments
     expected = ((mu1 - mu2) ** 2).sum() + np.trace(s1 + s2 - 2 * scipy.linalg.sqrtm(s1 @ s2).real)
     name = "fd" if features == "world_joints" else f"fd_{features}"
-    got = result(FrechetDistance(features), *batch, agents=agents)  # type: ignore[arg-type]
+    got = result(FrechetDistance(features), *batch, agents=choose(batch))  # type: ignore[arg-type]
     assert got[name] == pytest.approx(expected, rel=1e-7, abs=1e-9)
 
 
 @WHO
-def test_interaction_equals_numpys_correlation(agents: Tensor | None) -> None:
+def test_interaction_equals_numpys_correlation(choose: Choose) -> None:
     batch = draw_batch(scenes=4)
     generated, truth, present = batch[0].double(), batch[1].double(), batch[2]
-    scored = people(batch, agents)
+    counts = scored(batch, choose)
     by_pair = []
     for p, q in itertools.combinations(range(3), 2):
-        clips = [b for b in range(4) if present[b, p] and present[b, q] and ((b, p) in scored or (b, q) in scored)]
-        if clips:
+        there = [b for b in range(4) if present[b, p] and present[b, q]]
+        places = [(b, t) for b in there for t in range(20) if counts[b][t][p] or counts[b][t][q]]
+        if places:
             values = []
-            for motion in (generated[:, clips], truth[None, clips]):
-                x, y = (motion[:, :, :, who, 1:].reshape(-1, 63).numpy() for who in (p, q))
+            for motion in (generated, truth[None]):
+                every = torch.stack([motion[:, b, t] for b, t in places])
+                x, y = (every[:, :, who, 1:].reshape(-1, 63).numpy() for who in (p, q))
                 values.append(np.mean([np.corrcoef(x[:, d], y[:, d])[0, 1] for d in range(63)]))
             by_pair.append(values)
     expected = np.mean(by_pair, axis=0)
-    got = result(MotionInteraction(), *batch, agents=agents)
+    got = result(MotionInteraction(), *batch, agents=choose(batch))
     assert (got["mi_generated"], got["mi_truth"]) == pytest.approx(tuple(expected), abs=1e-9)
     assert got["mi"] == pytest.approx(abs(expected[0] - expected[1]), abs=1e-9)
     assert got["mi_left_out"] == 0
 
 
-def test_interaction_inside_clips_equals_numpys_correlation() -> None:
-    generated, truth, present = draw_batch(people=2)
-    expected = [
-        np.mean(
-            [
-                np.corrcoef(motion[s, b, :, 0, j, c], motion[s, b, :, 1, j, c])[0, 1]
-                for s in range(len(motion))
-                for b, j, c in itertools.product(range(3), range(1, 22), range(3))
-            ]
-        )
-        for motion in (generated.double().numpy(), truth.double().numpy()[None])
-    ]
-    got = result(MotionInteraction(per_clip=True), generated, truth, present)
+@pytest.mark.parametrize("choose", [lambda batch: None, some_frames], ids=["everybody", "some frames"])
+def test_interaction_inside_clips_equals_numpys_correlation(choose: Choose) -> None:
+    batch = generated, truth, present = draw_batch(people=2)
+    counts = scored(batch, choose)
+    expected = []
+    for motion in (generated.double().numpy(), truth.double().numpy()[None]):
+        found = []
+        for s, b in itertools.product(range(len(motion)), range(3)):
+            x = motion[s, b, [t for t in range(20) if any(counts[b][t])]]
+            found += [np.corrcoef(x[:, 0, j, c], x[:, 1, j, c])[0, 1] for j in range(1, 22) for c in range(3)]
+        expected.append(np.mean(found))
+    got = result(MotionInteraction(per_clip=True), generated, truth, present, agents=choose(batch))
     assert (got["mi_generated"], got["mi_truth"]) == pytest.approx(tuple(expected), abs=1e-9)
 
 
 @WHO
 @pytest.mark.parametrize("preset", ["default", "reference"])
-def test_foot_skating_equals_a_plain_loop(preset: str, agents: Tensor | None) -> None:
+def test_foot_skating_equals_a_plain_loop(preset: str, choose: Choose) -> None:
     batch = draw_batch(scenes=8)
     batch[0][..., (10, 11), 1] -= 0.4
     generated = batch[0].double().numpy()
     height = {"default": 0.05, "reference": -0.01}[preset]
     sliding, standing, every = [], 0, 0
-    for b, p in people(batch, agents):
-        for s, t, toe in itertools.product(range(4), range(19), (10, 11)):
+    counts = scored(batch, choose)
+    for b, t, p in itertools.product(range(8), range(19), range(3)):
+        for s, toe in itertools.product(range(4), (10, 11)) if counts[b][t][p] or counts[b][t + 1][p] else ():
             now, then = generated[s, b, t, p, toe], generated[s, b, t + 1, p, toe]
             every += 1
             if now[1] < height and then[1] < height:
@@ -203,29 +177,43 @@ def test_foot_skating_equals_a_plain_loop(preset: str, agents: Tensor | None) ->
                 if speed > 0.05:
                     sliding.append(speed)
     assert sliding
-    got = result(FootSkating(preset=preset), *batch, agents=agents)  # type: ignore[arg-type]
+    got = result(FootSkating(preset=preset), *batch, agents=choose(batch))  # type: ignore[arg-type]
     expected = (np.mean(sliding), len(sliding) / every, standing / every, standing)
     assert tuple(got.values()) == pytest.approx(expected, abs=1e-10)
 
 
 @WHO
-def test_partners_equal_a_plain_loop(agents: Tensor | None) -> None:
+def test_partners_equal_a_plain_loop(choose: Choose) -> None:
     batch = draw_batch(scenes=4)
     generated = batch[0].double().numpy()
-    scored = people(batch, agents)
+    counts = scored(batch, choose)
     held, apart = [], []
     for b, s, t in itertools.product(range(4), range(4), range(20)):
         frame = []
         for p, q in itertools.combinations(range(3), 2):
-            if batch[2][b, p] and batch[2][b, q] and ((b, p) in scored or (b, q) in scored):
+            if batch[2][b, p] and batch[2][b, q] and (counts[b][t][p] or counts[b][t][q]):
                 one, other = generated[s, b, t, p], generated[s, b, t, q]
                 frame.append(min(math.dist(one[i], other[j]) for i in (20, 21) for j in (20, 21)))
                 apart.append(math.dist(one[0, [0, 2]], other[0, [0, 2]]))
         held += [min(frame) < 0.5] if frame else []
     assert 0.1 < np.mean(held) < 0.9
-    assert result(HandsHeld(within=0.5), *batch, agents=agents)["hands_held"] == pytest.approx(np.mean(held), abs=1e-12)
-    median = result(PartnerDistance(), *batch, agents=agents)["partner_distance"]
+    assert result(HandsHeld(within=0.5), *batch, agents=choose(batch))["hands_held"] == pytest.approx(
+        np.mean(held), abs=1e-12
+    )
+    median = result(PartnerDistance(), *batch, agents=choose(batch))["partner_distance"]
     assert median == pytest.approx(np.median(apart), abs=0.006)
+
+
+@WHO
+def test_jitter_equals_a_plain_loop(choose: Choose) -> None:
+    batch = draw_batch()
+    x, counts, lengths = batch[0].double().numpy(), scored(batch, choose), []
+    for s, b, t, p in itertools.product(range(4), range(3), range(17), range(3)):
+        if any(counts[b][t + i][p] for i in range(4)):
+            third = [x[s, b, t + 3, p, j] - 3 * x[s, b, t + 2, p, j] + 3 * x[s, b, t + 1, p, j] - x[s, b, t, p, j]
+                     for j in range(1, 22)]  # fmt: skip
+            lengths += [math.hypot(*difference) * 30**3 / 10 for difference in third]
+    assert result(Jitter(), *batch, agents=choose(batch))["jitter"] == pytest.approx(np.mean(lengths), rel=1e-10)
 
 
 def test_jitter_is_the_third_derivative() -> None:
@@ -317,19 +305,6 @@ def test_feet_that_slide_at_a_known_speed_say_so() -> None:
 
 
 # -- what must hold for all of them ------------------------------------------------------------
-
-
-def every_metric() -> dict[str, Callable[[], Metric]]:
-    makers: dict[str, Callable[[], Metric]] = {
-        f"FD {f}": lambda f=f: FrechetDistance(f) for f in ("canonical_joints", "velocity")
-    }
-    makers["MI per clip"] = lambda: MotionInteraction(per_clip=True)
-    for name in all_metrics():
-        makers[str(name)] = lambda name=name: all_metrics()[name]
-    return makers
-
-
-EVERY = pytest.mark.parametrize("make", every_metric().values(), ids=every_metric().keys())
 
 
 @EVERY

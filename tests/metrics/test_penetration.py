@@ -12,6 +12,8 @@ from magnet.body.capsules import CAPSULES
 from magnet.metrics import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.penetration import FOREARMS
 
+from .batches import WHO, Choose, scored
+
 
 def brute_force(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
     """Distance from a point of a-b to c-d is convex along a-b, so a fine grid and golden section find its least."""
@@ -107,15 +109,15 @@ def gridded(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
     return float((points - c - along[:, None] * (d - c)).norm(dim=-1).min())
 
 
-@pytest.mark.parametrize("agents", [None, torch.tensor([False, False, True])], ids=["everybody", "one agent"])
-def test_penetration_equals_a_plain_loop(agents: Tensor | None) -> None:
-    generated, truth, present = crowd()
-    scored = present if agents is None else present & agents
+@WHO
+def test_penetration_equals_a_plain_loop(choose: Choose) -> None:
+    batch = generated, truth, present = crowd()
+    counts = scored(batch, choose)
     totals, deepest = [], []
     for b, s, t in itertools.product(range(3), range(2), range(4)):
         depths, counted = [0.0], False
         for p, q in itertools.combinations(range(3), 2):
-            if not (present[b, p] and present[b, q] and (scored[b, p] or scored[b, q])):
+            if not (present[b, p] and present[b, q] and (counts[b][t][p] or counts[b][t][q])):
                 continue
             counted = True
             one, other = generated[s, b, t, p], generated[s, b, t, q]
@@ -131,7 +133,7 @@ def test_penetration_equals_a_plain_loop(agents: Tensor | None) -> None:
     hits = [d for d in deepest if d > 0]
     assert 0.1 < len(hits) / len(deepest) < 0.95
     metric = Interpenetration()
-    metric.update(generated, truth, present, agents=agents)
+    metric.update(generated, truth, present, agents=choose(batch))
     got = metric.compute()
     assert float(got["ip_ratio"]) == pytest.approx(len(hits) / len(deepest), abs=1e-12)
     assert float(got["ip_mean_total_depth"]) == pytest.approx(np.mean(totals), abs=1e-3)
