@@ -28,17 +28,25 @@ if TYPE_CHECKING:
 Player = Literal["page", "film"]
 
 
-def load(name_or_path: str | Path | None = None, *, device: str | torch.device = "cpu", steps: int = 30) -> Model:
+def load(
+    name_or_path: str | Path | None = None,
+    *,
+    device: str | torch.device = "cpu",
+    steps: int | None = None,
+    sampler: str = "default",
+) -> Model:
     """A trained model: one that comes with the package by its name ("duet"), or a checkpoint's path.
 
     Args:
         device: where it runs.
-        steps: denoising steps; fewer are faster and coarser.
+        steps: denoising steps; fewer are faster and coarser. None: the sampler's.
+        sampler: how it samples: `default`, or `paper` for the paper's way; see `SamplerOptions.preset`.
 
     Raises:
-        ValueError: no such model; names those there are.
+        ValueError: no such model or sampler; names those there are.
     """
-    return Model(Denoiser.load(name_or_path).to(device), SamplerOptions(steps=steps))
+    options = SamplerOptions.preset(sampler, **({} if steps is None else {"steps": steps}))
+    return Model(Denoiser.load(name_or_path).to(device), options)
 
 
 def read(

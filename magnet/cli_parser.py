@@ -74,6 +74,12 @@ class Parser(LightningArgumentParser):
                     group.title = f"--{key} NAME"
                     group.description = f"One of {names}{default}. What each is and its --{key}.FIELD VALUE is below."
 
+    def explain(self, key: str, value: str, text: str) -> None:
+        """Say of an option that is a group of others what else may stand behind it."""
+        for action in self._actions:
+            if action.option_strings == [f"--{key}"]:
+                action.metavar, action.help = value, text
+
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Say what is wrong, and the closest thing that would be right."""
         told = self if self.command or Parser.root is None else Parser.root

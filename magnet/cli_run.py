@@ -16,13 +16,14 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from magnet import cli_output, cli_record, cli_stored, weights
+from magnet import cli_layers, cli_output, cli_record, cli_stored, weights
 from magnet.cli import CommandError
 from magnet.cli_parser import Parser
 from magnet.cli_stored import Arguments
 from magnet.cli_tasks import NamedTask, alias_path, aliases, task_of
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.presets import PRESETS
 from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 
@@ -82,9 +83,10 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         stored = cli_stored.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
         layer = cli_stored.defaults(stored, given, command == "fit", path_of(DATA), keep_data)
-    files = [word for file in given.files for word in ("--config", file)]
+    files = [word for option in given.layers for word in ("--config", option.word())]
     folder = cli_record.run_folder(RUNS / name, out)
-    MagnetCLI(command, [*cli_stored.as_argument(layer), *files, *words], checkpoint, folder)
+    preset, words = sampler_words(command, words)
+    MagnetCLI(command, [*cli_stored.as_argument(layer), *files, *preset, *words], checkpoint, folder)
     return 0
 
 
@@ -151,6 +153,19 @@ def task_words(command: str, given: Arguments) -> list[str]:
     return ["--task", path, *rest]
 
 
+def sampler_words(command: str, flags: list[str]) -> tuple[list[str], list[str]]:
+    """A preset that `--sampler NAME` asks for, as options before all flags; and the other flags, which beat it.
+
+    Raises:
+        CommandError: no such preset.
+    """
+    name = Arguments(flags).flag("sampler")
+    if command not in SAMPLING or name is None or not cli_layers.is_preset(name):
+        return [], flags
+    options = {"sampler": cli_layers.sampler_preset(name)}
+    return cli_stored.as_argument(options), Arguments(flags).without("sampler")
+
+
 class MagnetCLI(LightningCLI):
     """LightningCLI for one command, with this project's order of precedence: flag, file, checkpoint, default.
 
@@ -210,6 +225,7 @@ class MagnetCLI(LightningCLI):
             parser.add_subclass_arguments(NamedTask, "task", required=False, instantiate=False)
             parser.set_defaults({"task": {"class_path": alias_path(DEFAULT_TASK)}})
             parser.add_class_arguments(SamplerOptions, "sampler")
+            parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
             parser.add_class_arguments(Evaluation, skip={"task", "options"}, instantiate=False)
         if self.command == "predict":
             parser.add_argument("--pictures", type=int, default=1, help="so many of the first scenes are drawn")

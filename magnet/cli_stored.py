@@ -17,10 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from magnet import weights
 from magnet.cli import CommandError
+from magnet.cli_layers import Layer, read_layers, read_yaml
 from magnet.motion.tokens import STRIDE
 
 Spec = dict[str, Any]
@@ -36,14 +35,14 @@ class Arguments:
 
     flags: list[str]
     files: list[str] = field(default_factory=list)
-    configs: list[dict[str, Any]] = field(default_factory=list)
+    layers: list[Layer] = field(default_factory=list)
 
     @classmethod
     def split(cls, arguments: Iterable[str]) -> Arguments:
         """Take the configuration files out, so that they can go first and any flag beats any file.
 
         Raises:
-            CommandError: a file that is not there, is no YAML, or holds no mapping.
+            CommandError: as `read_layers`.
         """
         found = cls([])
         rest = iter(arguments)
@@ -53,8 +52,13 @@ class Arguments:
                 found.files.append(value if equals else next(rest, ""))
             else:
                 found.flags.append(argument)
-        found.configs = [_read_yaml(file) for file in found.files]
+        found.layers = [layer for file in found.files for layer in read_layers(file)]
         return found
+
+    @property
+    def configs(self) -> list[dict[str, Any]]:
+        """What the files say, and those that they extend; later ones win."""
+        return [layer.options for layer in self.layers]
 
     def flag(self, key: str) -> str | None:
         """The last value that a flag gives.
@@ -82,7 +86,7 @@ class Arguments:
         """The class that the user asks for under `model`, `data` or `task`."""
         value = self.flag(f"{key}.class_path") or self.value(key)
         if isinstance(value, str) and value.endswith((".yaml", ".yml")) and Path(value).is_file():
-            value = _read_yaml(value)
+            value = read_yaml(value)
         return value.get("class_path") if isinstance(value, dict) else value
 
     def without(self, key: str) -> list[str]:
@@ -95,21 +99,6 @@ class Arguments:
             elif not argument.startswith(f"--{key}="):
                 kept.append(argument)
         return kept
-
-
-def _read_yaml(file: str) -> dict[str, Any]:
-    path = Path(file)
-    if not path.is_file():
-        near = sorted(str(p) for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-        hint = f"; there are {', '.join(near)}" if near else ""
-        raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CommandError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
-        raise CommandError(f"{file} holds {type(content).__name__}, expected options such as `model:` and `data:`")
-    return content
 
 
 def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:

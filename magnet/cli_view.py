@@ -9,6 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from magnet.denoiser.presets import PRESETS, preset_name
+
+STEPS = 10
+"""Denoising steps where nothing is said: quick enough to watch."""
+
 EXAMPLES = """\
 examples:
   magnet view recorded.npz --context 32             the first frames paler, as given
@@ -17,6 +22,7 @@ examples:
   magnet view dance.npz --html dance.html           one page that needs no server
   magnet view --live                                the shipped model plays; choose, steer, save
   magnet view --live start.npz --ckpt_path last     goes on from a scene
+  magnet view --live --sampler paper                samples as the paper does
   magnet view start.npz --context 32 --record steps.npz --task joint_future
 
 over ssh: magnet view FILE --no-browser, and on your own machine ssh -L 8080:localhost:8080 HOST
@@ -64,7 +70,10 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     live.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
     live.add_argument("--task", default="joint_future", help="task to begin with (default: %(default)s)")
     live.add_argument("--people", type=int, default=2, metavar="N", help="people of a scene from nothing (default: 2)")
-    live.add_argument("--steps", type=int, default=10, metavar="N", help="denoising steps (default: %(default)s)")
+    live.add_argument("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
+    live.add_argument(
+        "--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)"
+    )
     live.add_argument("--seed", type=int, default=1, help="of the sampling (default: %(default)s)")
     web = parser.add_argument_group("where")
     web.add_argument("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
@@ -176,7 +185,6 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
     import torch
 
     from magnet import cli_stored
-    from magnet.denoiser.generation import SamplerOptions
     from magnet.denoiser.module import Denoiser
     from magnet.tasks import registry
     from magnet.viewer.recording import record
@@ -184,9 +192,17 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
     task = registry.get(options.task)()
     model = Denoiser.load(cli_stored.find_checkpoint(options.ckpt_path, [Path("runs")]))
     generator = torch.Generator().manual_seed(options.seed)
-    sampler = SamplerOptions(steps=options.steps)
+    sampler = _sampler(options)
     recording = record(model, scene, task, options.context, options.frames, sampler, generator)
     print(f"written: {recording.save(options.record)}")
+
+
+def _sampler(options: argparse.Namespace) -> Any:
+    """How to sample, as --sampler and --steps say."""
+    from magnet.denoiser.generation import SamplerOptions
+
+    steps = STEPS if options.sampler is None and options.steps is None else options.steps
+    return SamplerOptions.preset(options.sampler or "default", **({} if steps is None else {"steps": steps}))
 
 
 def _live(options: argparse.Namespace) -> Any:
@@ -212,6 +228,7 @@ def _live(options: argparse.Namespace) -> Any:
         start = takes[0].scene
     model = Denoiser.load(cli_stored.find_checkpoint(options.ckpt_path, [Path("runs")]))
     live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
-    live.settings.task, live.settings.steps = options.task, options.steps
+    live.settings.task, live.settings.sampler = options.task, _sampler(options)
+    live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
     look = Look(style=options.style or "body", shadows=not options.no_shadows)
     return Playground(live, body, options.host, options.port, look)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.presets import preset_fields
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class SamplerOptions:
     """How scenes are sampled.
+
+    `preset` gives sets of these options by name; `paper` is the paper's sampler.
 
     Args:
         steps: denoising steps S, paper A.3.
@@ -63,6 +66,18 @@ class SamplerOptions:
             raise ValueError(f"placement: got {self.placement!r}, expected {' or '.join(get_args(Placement))}")
         if self.blend < 0:
             raise ValueError(f"blend: got {self.blend}, expected 0 or more frames")
+
+    @classmethod
+    def preset(cls, name: str, **fields: Any) -> SamplerOptions:
+        """The options of a preset (`magnet.denoiser.presets`), some fields replaced: `preset("paper", steps=50)`.
+
+        Raises:
+            ValueError: no such preset; suggests the closest.
+        """
+        said = preset_fields(name)
+        if "guidance" in said:
+            said = {**said, "guidance": Guidance(**said["guidance"])}
+        return cls(**{**said, **fields})
 
 
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:

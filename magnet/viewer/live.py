@@ -44,6 +44,7 @@ class Settings:
         fields: the task's own options, where they differ from its defaults.
         piece: frames of a piece, whole tokens.
         goals: where agents (slots) are steered to; see `Live`.
+        sampler: all other options of sampling.
     """
 
     task: str = "joint_future"
@@ -52,6 +53,7 @@ class Settings:
     guidance: Guidance = field(default_factory=Guidance)
     piece: int = 16
     goals: dict[int, Goal] = field(default_factory=dict)
+    sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
 
 @dataclass(frozen=True)
@@ -253,7 +255,8 @@ class Live:
 
     def _sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
         # A piece fits into the window, so denoising it all at once costs the fewest steps.
-        options = SamplerOptions(steps=self.settings.steps, rolling=0, guidance=self.settings.guidance)
+        settings = self.settings
+        options = dataclasses.replace(settings.sampler, steps=settings.steps, rolling=0, guidance=settings.guidance)
         longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
         return longer.order(torch.arange(scene.agents)).to("cpu").replace(names=())
 

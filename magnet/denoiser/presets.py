@@ -1,0 +1,48 @@
+"""Ways of sampling that have a name; plain values, so that help can list them without loading a model."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+from typing import Any
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "steps": 30,  # A.3
+        "stride": 4,  # method.md C.5: 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
+        "rolling": 0,  # 3.3: segment by segment
+        "placement": "integrate",  # the paper predicts steps and integrates them
+        "trust": 0.02,  # not read by `integrate`
+        "requantise": True,  # 3.1: what is decoded are codes
+        "paste": True,  # 3.3: what is given stays as given
+        "blend": 0,  # the paper smooths nothing after decoding
+        "eta": 0.0,  # A.3: DDIM
+        "shift": 1.0,  # A.3: even steps
+        "guidance": {"kind": "none", "weight": 1.0, "literal": True, "smooth": 0.0, "context_level": 0},  # A.7: w = 1
+    },
+}
+"""Fields of `SamplerOptions` by name. `default` is the class's own; `paper` gives every field, so that it stays the
+paper's whatever the defaults become."""
+
+
+def preset_fields(name: str) -> dict[str, Any]:
+    """What a preset says of the fields of `SamplerOptions`; guidance as a dictionary of its own.
+
+    Raises:
+        ValueError: no such preset; suggests the closest.
+    """
+    if name not in PRESETS:
+        close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(PRESETS)}"
+        raise ValueError(f"no sampler preset {name}; {hint}")
+    return PRESETS[name]
+
+
+def preset_name(word: str) -> str:
+    """The type of a command-line option that names a preset."""
+    try:
+        preset_fields(word)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return word
