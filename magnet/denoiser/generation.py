@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any, get_args
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number, require_whole
 from magnet.denoiser.presets import preset_fields
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tokenizer.module import Tokenizer
 
@@ -29,7 +31,7 @@ class SamplerOptions:
     `preset` gives sets of these options by name; `paper` is the paper's sampler.
 
     Args:
-        steps: denoising steps S, paper A.3.
+        steps: denoising steps S, paper A.3; no more than pass levels that differ, which depends on `shift`.
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
         rolling: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
             8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
@@ -64,8 +66,14 @@ class SamplerOptions:
     def __post_init__(self) -> None:
         if self.placement not in get_args(Placement):
             raise ValueError(f"placement: got {self.placement!r}, expected {' or '.join(get_args(Placement))}")
-        if self.blend < 0:
-            raise ValueError(f"blend: got {self.blend}, expected 0 or more frames")
+        require_whole("steps", self.steps, 1, LEVELS)
+        require_whole("stride", self.stride, 1)
+        if self.rolling is not None:
+            require_whole("rolling", self.rolling, 0)
+        require_number("trust", self.trust, least=0)
+        require_whole("blend", self.blend, 0)
+        require_number("eta", self.eta, 0, 1)
+        require_number("shift", self.shift, over=0)
 
     @classmethod
     def preset(cls, name: str, **fields: Any) -> SamplerOptions:

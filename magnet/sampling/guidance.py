@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number, require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
@@ -24,7 +25,7 @@ class Guidance:
     Args:
         kind: `none`; `history` (HG): with against without any history; `self` (SHG): one's own history
             against none; `partner` (PHG): the others' history against none.
-        weight: w of paper A.7, which uses 1.
+        weight: w of paper A.7, which uses 1; 0 is no guidance.
         literal: average `self` and `partner` over all branches as A.7 is printed, which makes the two
             the same for two people. By default each agent's output is read from the branch with its own
             (`self`) or the others' (`partner`) history, so that they differ.
@@ -43,8 +44,9 @@ class Guidance:
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise ValueError(f"kind: got {self.kind!r}, expected {' or '.join(get_args(Kind))}")
-        if not 0 <= self.context_level < LEVELS:
-            raise ValueError(f"context_level: got {self.context_level}, expected 0 to {LEVELS - 1}")
+        require_number("weight", self.weight, least=0)
+        require_number("smooth", self.smooth, least=0)
+        require_whole("context_level", self.context_level, 0, LEVELS - 1)
 
     def branches(self, there: Tensor) -> Tensor:
         """Whose history each branch sees, the unguided one first; slots that are free everywhere see and tell nothing.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number, require_whole
 from magnet.seeding import derive
 
 LEVELS = 1000
@@ -92,14 +93,24 @@ def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
     """The levels a token passes in `steps` denoising steps, from K down to 0, `shifted`. -> (S + 1,) int
 
     Raises:
-        ValueError: fewer than one step, or so many that two would be at one level.
+        ValueError: fewer than one step, or so many that two would be at one level; says how many can be.
     """
-    if not 1 <= steps <= K:
-        raise ValueError(f"denoising steps: got {steps}, expected 1 to {K}")
-    levels = shifted(torch.tensor([K * (steps - s) // steps for s in range(steps + 1)]), shift, K)
-    if not bool((levels.diff() < 0).all()):
-        raise ValueError(f"denoising steps: {steps} with a shift of {shift:g} pass the same of {K} levels twice")
+    require_whole("denoising steps", steps, 1, K)
+    require_number("shift", shift, over=0)
+    levels = _levels(steps, shift, K)
+    if levels is None:
+        most = next(more for more in range(steps) if _levels(more + 1, shift, K) is None)
+        advice = f"take {most} or fewer, or a shift nearer to 1" if most else "take a shift nearer to 1"
+        raise ValueError(
+            f"denoising steps: {steps} with a shift of {shift:g} pass the same of {K} levels twice; {advice}"
+        )
     return levels
+
+
+def _levels(steps: int, shift: float, K: int) -> Tensor | None:
+    """`ddim_levels`, or None where two steps would be at one level."""
+    levels = shifted(torch.tensor([K * (steps - s) // steps for s in range(steps + 1)]), shift, K)
+    return levels if bool((levels.diff() < 0).all()) else None
 
 
 @dataclass
@@ -127,8 +138,7 @@ class NoiseStream:
     def __post_init__(self) -> None:
         if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
-        if not 0 <= self.eta <= 1:
-            raise ValueError(f"eta: got {self.eta:g}, expected 0 (no new noise) to 1")
+        require_number("eta", self.eta, 0, 1)
         # Drawn once: the noise of a step then hangs on its place alone, in whatever order places are asked for.
         self._seeds = self._draw_seeds() if self.eta else []
 

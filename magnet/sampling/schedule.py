@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number, require_whole
 from magnet.sampling.noise import LEVELS, ddim_levels
 
 
@@ -25,17 +26,15 @@ class Grid:
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
 
     def __post_init__(self) -> None:
-        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: got {getattr(self, name)}, expected at least {least}")
+        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
+            require_whole(name, getattr(self, name), least)
         if self.context > self.tokens:
             raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
-        if not 1 <= self.stride <= self.window:
+        if self.stride > self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
-        if not self.shift > 0:
-            raise ValueError(f"shift: got {self.shift:g}, expected a number over 0; 1 leaves the levels even")
-        if self.rolling is not None and self.rolling < 0:
-            raise ValueError(f"rolling: got {self.rolling}, expected 0, a number of denoising steps, or null")
+        require_number("shift", self.shift, over=0)
+        if self.rolling is not None:
+            require_whole("rolling", self.rolling, 0)
         if self.rolling and self.rolled >= self.window:
             raise ValueError(
                 f"rolling={self.rolling} with {self.steps} denoising steps keeps {self.rolled} tokens half denoised, "
@@ -282,15 +281,14 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is longer than the window, or `grid.rolling` is over 0.
+            ValueError: the block is no whole number of 1 up to the window, or `grid.rolling` is over 0.
         """
         if grid.rolling:
             raise ValueError(
                 "rolling: here agents act on what they have seen of each other, and a token begun ahead of time would "
                 "be half made up by then; leave rolling out"
             )
-        if not 1 <= block <= grid.window:
-            raise ValueError(f"block: got {block}, expected 1 to the window of {grid.window} token steps")
+        require_whole("block", block, 1, grid.window)
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
         plan = ddim_levels(grid.steps, grid.shift)
         turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)

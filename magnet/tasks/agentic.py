@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import torch
 
+from magnet.checks import require_number, require_wholes
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
@@ -50,8 +51,8 @@ class AgenticAsync:
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
             raise ValueError("agentic_async continues a recording: give it context frames")
-        if not 0 <= self.offset <= 1:
-            raise ValueError(f"offset: got {self.offset}, expected 0 to 1")
+        require_number("offset", self.offset, 0, 1)
+        require_wholes("order", self.order)
         if len(set(self.order)) != len(self.order) or not set(self.order) <= set(range(grid.agents)):
             raise ValueError(f"order {self.order}: name each of the agents 0 to {grid.agents - 1} at most once")
         turns = [*self.order, *(p for p in range(grid.agents) if p not in self.order)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from magnet.checks import require_whole, require_wholes
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
@@ -46,8 +47,13 @@ class Inbetweening:
         Raises:
             ValueError: no such agent or token step, or nothing is left to generate.
         """
-        if self.every < 1:
-            raise ValueError(f"every: got {self.every}, expected at least 1 token step")
+        require_whole("every", self.every, 1)
+        require_wholes("keys", self.keys)
+        require_wholes("agents", self.agents)
+        for pair in self.pairs if isinstance(self.pairs, Sequence) else (self.pairs,):
+            require_wholes("pairs", pair, "(0, 8)")
+            if len(pair) != 2:
+                raise ValueError(f"pairs: got {pair}, expected an agent's slot and a token step, such as (0, 8)")
         steps = self.keys
         if not self.keys and not self.pairs:
             steps = (*range(max(grid.context - 1, 0), grid.tokens, self.every), grid.tokens - 1)

@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from magnet.checks import require_wholes
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
@@ -18,6 +19,7 @@ def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
     Raises:
         ValueError: no such agent, or nobody is left to be given.
     """
+    require_wholes("target", target)
     mask = torch.zeros(grid.agents, dtype=torch.bool)
     for agent in target:
         if not 0 <= agent < grid.agents:
