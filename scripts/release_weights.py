@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from magnet import datamodules, weights
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
 HELD_OUT = ("03", "05", "10", "15")
+SUBJECTS = ("02", "05", "17", "18", "55", "60", "61", "90", "143")
 ABOUT = {
     "trained on": {
         "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
@@ -49,7 +51,7 @@ def manifest() -> dict[str, str]:
         {f"60_{take}.amc" for take in HELD_OUT} | {f"61_{take}.amc" for take in HELD_OUT} | {"02_03.amc", "05_12.amc"}
     )
     lines = (line.split() for line in RECORDINGS.read_text().splitlines())
-    return {name: digest for digest, name in lines if name not in held}
+    return {name: digest for digest, name in lines if name not in held and re.split(r"[._]", name)[0] in SUBJECTS}
 
 
 def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from magnet.datamodules.speeds import at_speed
 from magnet.motion.scene import Scene
 from magnet.threads import one_thread
 
-FIT_VERSION = 3
+FIT_VERSION = 4
 """Raise it whenever the same recordings would be fitted otherwise: caches are then made anew."""
 COUPLE = (60, 61)
 RATES = {"60": 60.0, "61": 60.0, "143": 60.0}
@@ -296,12 +296,18 @@ def report_of(fitted: Fitted) -> dict[str, Any]:
     def cm(metres: float) -> float | None:
         return None if np.isnan(metres) else round(100 * metres, 2)
 
+    def percent(share: float) -> float | None:
+        return None if np.isnan(share) else round(100 * share, 1)
+
     return {
         "frames": scene.frames,
         "frames masked": int((~scene.valid).sum()),
         "limb error cm": cm(fitted.limb_error),
+        "wrist error cm": cm(fitted.wrist_error),
         "nearest wrists recorded cm": cm(fitted.wrist_recorded),
         "nearest wrists fitted cm": cm(fitted.wrist_fitted),
+        "wrists under 20 cm recorded %": percent(fitted.held_recorded),
+        "wrists under 20 cm fitted %": percent(fitted.held_fitted),
         "floor cm": cm(fitted.floor),
         "largest shape number": round(float(scene.betas.abs().max()), 2),
         "glitches": [

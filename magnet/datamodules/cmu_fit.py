@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,15 +23,21 @@ from magnet.motion.scene import Scene
 FPS = 30.0
 ENDS = {
     1: "lhipjoint", 2: "rhipjoint", 4: "lfemur", 5: "rfemur", 7: "ltibia", 8: "rtibia", 10: "lfoot", 11: "rfoot",
-    16: "lclavicle", 17: "rclavicle", 18: "lhumerus", 19: "rhumerus", 20: "lradius", 21: "rradius",
+    16: "lclavicle", 17: "rclavicle", 18: "lhumerus", 19: "rhumerus", 20: "lwrist", 21: "rwrist",
     12: "lowerneck",
 }  # fmt: skip
-"""Joint: the bone whose end it is. The spine's joints lie elsewhere in the two skeletons: only rotations are used."""
+"""Joint: the bone whose end it is. The spine's joints lie elsewhere in the two skeletons: only rotations are used.
+
+The bone `wrist` is the last third of the forearm: it lies in one line with `radius` and only rolls. The hand bends at
+its end, and so there is the wrist (`radius` ends 7 to 10 cm before it).
+"""
 LIMBS = (1, 2, 4, 5, 7, 8, 10, 11, 16, 17, 18, 19, 20, 21)
 WEIGHT = {12: 0.1, 20: 3.0, 21: 3.0}
 """The neck's joint differs too, and so only leans on the fit; dancers hold hands, so that wrists matter."""
 TOUCH, TOUCH_WEIGHT = 0.12, 25.0
 """Metres within which two people's wrists count as touching, and what their weights grow by."""
+HELD = 0.20
+"""Metres within which two people's wrists say that they may hold hands."""
 TURNS = {
     0: "root", 1: "lfemur", 2: "rfemur", 3: "lowerback", 4: "ltibia", 5: "rtibia", 6: "upperback", 7: "lfoot",
     8: "rfoot", 9: "thorax", 10: "ltoes", 11: "rtoes", 12: "upperneck", 15: "head", 16: "lhumerus", 17: "rhumerus",
@@ -47,8 +54,8 @@ FLIP_MARGIN = 4
 """Frames at 30 fps in which a foot swings over into the wrong way round and back."""
 ROLL_LIMIT, WRIST_LIMIT = 120.0, 85.0
 """The same for a hand against its forearm: about the forearm's length and away from it."""
-FASTEST_PELVIS, FASTEST_HAND, SLOWEST_HAND, LIKELY_FALL = 4.5, 10.0, 0.1, 24.0
-"""Metres a second at the 99th percentile (2.8, 7.3 and 1.6 in the recordings); and m/s2 downwards at the 1st."""
+FASTEST_PELVIS, FASTEST_HAND, SLOWEST_HAND, LIKELY_FALL = 4.5, 11.5, 0.1, 24.0
+"""Metres a second at the 99th percentile (3.1, 8.3 and 1.8 in the recordings); and m/s2 downwards at the 1st."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,11 @@ class Fitted:
     fit: Fit
     glitches: tuple[Glitches, ...]
     limb_error: float  # metres, mean over limb joints, valid frames and people
+    wrist_error: float  # the same over both wrists
     wrist_recorded: float  # metres between two people's nearest wrists over the take; NaN for one person
     wrist_fitted: float
+    held_recorded: float  # share of frames with two people's wrists closer than HELD; NaN for one person
+    held_fitted: float
     floor: float  # metres that the recording's ground lay above its y = 0
 
 
@@ -170,12 +180,17 @@ def fit_recordings(
     limbs = [joints.index(j) for j in LIMBS]
     found = body.joints(fit.scene)[0]
     scene, floor = on_floor(fit.scene, found, body)
+    wrists = [joints.index(20), joints.index(21)]
+    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, 20:22]))
     return Fitted(
         fit=Fit(scene, fit.residual),
         glitches=tuple(glitches),
         limb_error=float(fit.residual[good][:, limbs].mean()),
-        wrist_recorded=nearest_wrists(targets[:, :, [joints.index(20), joints.index(21)]], good),
-        wrist_fitted=nearest_wrists(found[:, :, 20:22], good),
+        wrist_error=float(fit.residual[good][:, wrists].mean()),
+        wrist_recorded=float(recorded.amin()) if len(recorded) else math.nan,
+        wrist_fitted=float(fitted.amin()) if len(fitted) else math.nan,
+        held_recorded=float((recorded < HELD).double().mean()),
+        held_fitted=float((fitted < HELD).double().mean()),
         floor=floor,
     )
 
@@ -201,16 +216,18 @@ def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
     return grown
 
 
-def nearest_wrists(wrists: Tensor, valid: Tensor) -> float:
-    """Smallest distance over the valid frames between wrists of two people. (T, P, 2, 3), (T, P) -> metres or NaN"""
-    P, nearest = wrists.shape[1], float("nan")
-    for p in range(P):
-        for q in range(p):
-            both = valid[:, p] & valid[:, q]
-            if both.any():
-                apart = float(torch.cdist(wrists[both, p], wrists[both, q]).min())
-                nearest = apart if nearest != nearest else min(nearest, apart)
-    return nearest
+def wrists_apart(wrists: Tensor, valid: Tensor) -> Tensor:
+    """Metres between the nearest wrists of two people, in frames with two who are valid; none for one person.
+
+    (T, P, 2, 3), (T, P) -> (frames,)
+    """
+    pairs = [(p, q) for p in range(wrists.shape[1]) for q in range(p)]
+    nearest = torch.full((len(wrists), 1), torch.inf, dtype=wrists.dtype)
+    for p, q in pairs:
+        apart = torch.cdist(wrists[:, p], wrists[:, q]).amin(dim=(-1, -2))
+        nearest = torch.cat([nearest, torch.where(valid[:, p] & valid[:, q], apart, torch.inf)[:, None]], dim=1)
+    nearest = nearest.amin(dim=1)
+    return nearest[nearest.isfinite()]
 
 
 def on_floor(scene: Scene, found: Tensor, body: Body) -> tuple[Scene, float]:
@@ -234,14 +251,14 @@ def check_rate(recording: Recording) -> None:
     120 fps, was found so.
 
     Raises:
-        ValueError: speeds that no person reaches, or nothing that moves at all.
+        ValueError: speeds that no person reaches, or nobody moves at all.
     """
     if recording.frames < recording.fps:
         return  # too short to say
     _, end = recording.resampled(FPS).world()
     names = recording.skeleton.names
     pelvis = np.diff(end[:, names.index("root")], axis=0) * FPS
-    wrists = np.diff(end[:, [names.index("lradius"), names.index("rradius")]], axis=0) * FPS
+    wrists = np.diff(end[:, [names.index(ENDS[20]), names.index(ENDS[21])]], axis=0) * FPS
     speed = float(np.percentile(np.linalg.norm(pelvis, axis=-1), 99))
     hand = float(np.percentile(np.linalg.norm(wrists, axis=-1), 99))
     fall = float(-np.percentile(np.diff(pelvis[:, 1]) * FPS, 1))
@@ -249,7 +266,9 @@ def check_rate(recording: Recording) -> None:
         f"{recording.path}: at {recording.fps:g} fps the pelvis moves at {speed:.1f} m/s, hands at {hand:.1f} m/s "
         f"and the pelvis falls with {fall:.0f} m/s2"
     )
-    if speed > FASTEST_PELVIS or hand > FASTEST_HAND or hand < SLOWEST_HAND:
+    if hand < SLOWEST_HAND:
+        raise ValueError(f"{found}: somebody stands still, which nobody does for long; leave the recording out")
+    if speed > FASTEST_PELVIS or hand > FASTEST_HAND:
         raise ValueError(f"{found}, which nobody does; give the frame rate of its subject with `fps`")
     if fall > LIKELY_FALL:
         warnings.warn(f"{found}, which is unlikely; check the frame rate of its subject (`fps`)", stacklevel=2)

@@ -22,7 +22,11 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
         "collar": ("collar", "thorax", "clavicle"), "shoulder": ("shoulder",), "elbow": ("elbow",),
         "wrist": ("wrist",), "neck": ("neck", "neck1"), "head": ("head",),
     },
-    "Mixamo, MotionBuilder, CMU": {
+    "CMU": {
+        "hip": ("upleg",), "knee": ("leg",), "ankle": ("foot",), "foot": ("toebase",), "collar": ("shoulder",),
+        "shoulder": ("arm",), "elbow": ("forearm",), "wrist": ("fingerbase",), "neck": ("neck",), "head": ("head",),
+    },
+    "Mixamo, MotionBuilder": {
         "hip": ("upleg", "upperleg", "thigh"), "knee": ("leg", "lowleg", "lowerleg", "shin"), "ankle": ("foot",),
         "foot": ("toebase", "toe"), "collar": ("shoulder", "collar"), "shoulder": ("arm", "uparm", "upperarm"),
         "elbow": ("forearm", "lowarm", "lowerarm"), "wrist": ("hand",), "neck": ("neck", "neck1"), "head": ("head",),
@@ -38,10 +42,17 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "Acclaim": {
         "hip": ("femur",), "knee": ("tibia",), "ankle": ("foot",), "foot": ("toes",), "collar": ("clavicle",),
-        "shoulder": ("humerus",), "elbow": ("radius",), "wrist": ("wrist",), "neck": ("lowerneck",), "head": ("head",),
+        "shoulder": ("humerus",), "elbow": ("radius",), "wrist": ("hand", "wrist"), "neck": ("lowerneck",),
+        "head": ("head",),
     },
 }  # fmt: skip
-"""Names of each role without the side, spaces or punctuation. One word means another joint in another scheme."""
+"""Names of each role without the side, spaces or punctuation. One word means another joint in another scheme.
+
+CMU's bone `wrist`, which its conversions call Hand, is the last third of the forearm: the wrist is where the next one
+begins.
+"""
+SIGNS = {"CMU": "left:hipjoint"}
+"""A joint without which a skeleton does not follow a scheme, where its other names are another scheme's as well."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,8 @@ def recognised(names: Sequence[str], given: Mapping[str, str] | None = None) -> 
     words = [split_side(name) for name in plain(names)]
     best = Naming("none", {})
     for scheme, roles in SCHEMES.items():
+        if scheme in SIGNS and not any(SIGNS[scheme] in rests for _, rests in words):
+            continue
         found = _matched(words, roles)
         if _score(found) > _score(best.joints):
             best = Naming(scheme, found)

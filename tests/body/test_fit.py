@@ -16,6 +16,7 @@ from magnet.datamodules.cmu_fit import LIMBS, fit_recordings
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
+from tests.datamodules.slow_cmu import slow_ends
 
 ALL = tuple(range(22))
 MOST = tuple(j for j in ALL if j not in (6, 13, 14))  # what other captures lack
@@ -175,6 +176,16 @@ def test_a_real_couple_fits_within_the_bars(cmu_root: Path, body: Body) -> None:
     assert abs(fitted.wrist_fitted - fitted.wrist_recorded) < 0.01
     assert scene.betas.abs().max() < 3
     joints = body.joints(scene)[0]
+    for p, subject in enumerate((60, 61)):
+        for frame in (0, 75, 149):
+            files = cmu_root / f"salsa/{subject}.asf", cmu_root / f"salsa/{subject}_10.amc"
+            ends = slow_ends(*files, 700 + 2 * frame)
+            for joint, bone in ((20, "lwrist"), (21, "rwrist")):
+                recorded = torch.from_numpy(ends[bone]).float() - torch.tensor([0.0, fitted.floor, 0.0])
+                assert (joints[frame, p, joint] - recorded).norm() < 0.01, (subject, frame, bone)
+    forearm = (joints[0, :, [20, 21]] - joints[0, :, [18, 19]]).norm(dim=-1)
+    upper_arm = (joints[0, :, [18, 19]] - joints[0, :, [16, 17]]).norm(dim=-1)
+    assert ((forearm / upper_arm) > 0.8).all() and ((forearm / upper_arm) < 1.0).all()
     lowest = (joints[:, :, [10, 11], 1] - clearance(body, scene.betas[0])[:, 2:]).amin(dim=-1)
     assert lowest.min() > -0.03 and lowest.median().abs() < 0.01
     angles = geodesic(scene.body_rot[0], torch.eye(3)).rad2deg()

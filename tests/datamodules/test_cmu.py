@@ -7,14 +7,16 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from magnet.datamodules import cmu
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.cmu import CMU
-from magnet.datamodules.cmu_fit import check_rate
+from magnet.datamodules.cmu_fit import ENDS, check_rate, fit_recordings, wrists_apart
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
+from tests.datamodules.slow_cmu import slow_ends
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +117,39 @@ def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_wrist_is_where_the_hand_begins_on_one_line_with_the_forearm(filled: CMU, made: Path) -> None:
+    """The bone `wrist` only rolls: whoever ends an arm at `radius` cuts a third of the forearm off."""
+    skeleton = read_asf(made / "02.asf")
+    fitted = fit_recordings([read_amc(made / "02_01.amc", skeleton, 120)], filled.body)
+    found = filled.body.joints(fitted.fit.scene)[0, :, 0]
+    for joint, side in ((20, "l"), (21, "r")):
+        for frame in (0, 30, 60):
+            ends = slow_ends(made / "02.asf", made / "02_01.amc", 4 * frame)
+            at = {bone: ends[side + bone] - [0.0, fitted.floor, 0.0] for bone in ("humerus", "radius", "wrist")}
+            bent = np.cross(at["radius"] - at["humerus"], at["wrist"] - at["radius"])
+            assert np.linalg.norm(bent) < 1e-9
+            assert np.linalg.norm(found[frame, joint].numpy() - at["wrist"]) < 0.02
+        assert skeleton.names[skeleton.parents[skeleton.names.index(f"{side}hand")]] == ENDS[joint]
+
+
+def test_wrists_apart_are_the_nearest_of_any_two_people_who_are_seen(generator: torch.Generator) -> None:
+    wrists, valid = torch.randn(7, 3, 2, 3, generator=generator), torch.ones(7, 3, dtype=torch.bool)
+    valid[2], valid[4, 0] = False, False
+    valid[2, 1] = True  # nobody is seen beside them: the frame does not count
+    expected = [
+        min(
+            float((wrists[t, p, i] - wrists[t, q, j]).norm())
+            for p, q in ((0, 1), (0, 2), (1, 2))
+            for i in (0, 1)
+            for j in (0, 1)
+            if valid[t, p] and valid[t, q]
+        )
+        for t in (0, 1, 3, 4, 5, 6)
+    ]
+    assert wrists_apart(wrists, valid).tolist() == pytest.approx(expected, abs=1e-5)
+    assert len(wrists_apart(wrists[:, :1], valid[:, :1])) == 0
+
+
 # -- bad input ---------------------------------------------------------------------------------
 
 
@@ -173,7 +208,7 @@ def test_speeds_that_nobody_reaches_are_refused(tmp_path: Path) -> None:
         check_rate(lively)
     with pytest.raises(ValueError, match=r"60_01\.amc: at 480 fps .* nobody does; give the frame rate .* `fps`"):
         check_rate(replace(lively, fps=480.0))
-    with pytest.raises(ValueError, match="nobody does"):
+    with pytest.raises(ValueError, match=r"somebody stands still.*leave the recording out"):
         check_rate(replace(lively, local=lively.local[[0] * 600], root=lively.root[[0] * 600]))
 
 
@@ -186,9 +221,20 @@ def test_a_real_jump_at_twice_its_rate_is_warned_of(cmu_root: Path) -> None:
         check_rate(replace(recording, fps=120.0))
 
 
+def test_in_every_real_skeleton_the_bone_called_wrist_goes_on_where_the_forearm_points(cmu_root: Path) -> None:
+    for asf in sorted(cmu_root.rglob("*.asf")):
+        ends = slow_ends(asf, sorted(asf.parent.glob(f"{asf.stem}_*.amc"))[0], 0)
+        for side in "lr":
+            upper = np.linalg.norm(ends[f"{side}humerus"] - ends[f"{side}clavicle"])
+            forearm = ends[f"{side}radius"] - ends[f"{side}humerus"]
+            rest = ends[f"{side}wrist"] - ends[f"{side}radius"]
+            assert forearm @ rest > (1 - 1e-6) * np.linalg.norm(forearm) * np.linalg.norm(rest), asf
+            assert 0.66 < np.linalg.norm(forearm + rest) / upper < 1.16, asf
+
+
 def test_takes_of_the_real_recordings(cmu_root: Path) -> None:
     data = CMU(str(cmu_root))
     split = {take.name: data.split_of(take) for take in data.takes() if take.couple}
     assert [name for name, part in split.items() if part == "test"] == ["60_05+61_05", "60_10+61_10", "60_15+61_15"]
     assert [name for name, part in split.items() if part == "val"] == ["60_03+61_03"]
-    assert len(split) == 11 and sum(not take.couple for take in data.takes()) == 38
+    assert len(split) == 11 and sum(not take.couple for take in data.takes()) == 62

@@ -85,6 +85,17 @@ def test_every_naming_scheme_is_recognised_whole(naming):
     assert len(got) == 18
 
 
+def test_the_wrist_of_cmus_conversions_is_where_the_fingers_begin_and_nobody_elses_is():
+    """Their Hand begins in the middle of the forearm; MotionBuilder's own skeletons have a FingerBase in the palm."""
+    names = list(CMU_NAMES.values())
+    found = recognised(names)
+    assert (found.scheme, names[found.joints[20]], names[found.joints[18]]) == ("CMU", "LeftFingerBase", "LeftForeArm")
+    others = [name for name in names if "HipJoint" not in name]
+    assert others[recognised(others).joints[21]] == "RightHand"
+    bones = list(CMU_NAMES)
+    assert bones[recognised(bones).joints[20]] == "lhand" and recognised(bones).scheme == "Acclaim"
+
+
 CASES = {
     "mixamo, T pose": {"naming": "mixamo"},
     "biped, A pose, centimetres, z up": {"naming": "biped", "arms": 45, "legs": 8, "metres": 0.01, "up": UP["z"].T},
@@ -250,7 +261,7 @@ def test_recorded_dancers_as_bvh_fit_as_well_as_their_own_reader_does(take, cmu_
     short = replace(slow, root=slow.root[60:120], local=slow.local[60:120])
     found = load_bvh(as_bvh(short, tmp_path / f"{take}.bvh"), body)
     (source,) = found.sources
-    assert source.unit.startswith("CMU") and source.scheme.startswith("Mixamo") and len(source.joints) >= 20
+    assert source.unit.startswith("CMU") and source.scheme == "CMU" and len(source.joints) >= 20
     own = fit_recordings([short], body)
     assert source.residual < own.limb_error + 0.01 < 0.04
     ours, theirs = body.joints(own.fit.scene)[0, :, 0], body.joints(found.scene)[0, :, 0]
