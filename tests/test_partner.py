@@ -10,6 +10,7 @@ import magnet
 from magnet.api import Model
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.generation import SamplerOptions
+from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, joined
 from magnet.partner import Partner
 from magnet.testing import random_scene, tiny_denoiser
@@ -75,6 +76,15 @@ def test_answers_of_the_model_that_ships_go_on_from_one_another():
     root, of_whole = (each.T_world_root[0, 31:, 1, :3, 3].diff(dim=0).norm(dim=-1) for each in (live, whole))
     assert root[::4].max() < 1.5 * of_whole.max()
     assert (live.T_world_root[0, -1, 1, :3, 3] - scene.T_world_root[0, -1, 1, :3, 3]).norm() < 0.5
+
+
+def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(denoiser, duet):
+    """Also where the frames in which they lay down have been let go."""
+    T_world_root = duet.T_world_root.clone()
+    T_world_root[:, 10:30, 1, :3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    scene, move = duet.replace(T_world_root=T_world_root).cut(0, 40), from_planar(torch.tensor(1.2), torch.ones(2))
+    here, there = answered(denoiser, scene).moved(move), answered(denoiser, scene.moved(move))
+    assert (here.T_world_root - there.T_world_root).abs().max() < 1e-4
 
 
 def test_memory_of_the_past_does_not_grow(denoiser, duet):

@@ -24,6 +24,7 @@ from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.optim import adamw_cosine
+from magnet.precision import dtype_of
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.module import RawPose, Tokenizer
@@ -215,7 +216,7 @@ class Denoiser(L.LightningModule):
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        return self.transformer(self._without_lead(noisy), levels, present)
+        return self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present)
 
     def _without_lead(self, tokens: Tensor) -> Tensor:
         lead = slice(self.layout.latent, self.layout.latent + 9)

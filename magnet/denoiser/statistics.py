@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from magnet.motion.tokens import STRIDE, TokenLayout
+from magnet.precision import Float32
 
 
-class Statistics(nn.Module):
+class Statistics(Float32):
     """Mean and standard deviation of each number of a token.
 
     Latents share one scale and no shift, so that a distance between codes stays a distance; the nine

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from magnet.motion.rotations import about_y, from_6d, to_6d, yaw_of
+from magnet.motion.rotations import about_y, about_y_of, from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
 
 Placement = Literal["integrate", "anchor", "fuse"]
@@ -22,7 +22,7 @@ FIXED = 1e9
 """Weight of a step that is known: `fuse` moves such an agent by less than rounding does."""
 
 UPRIGHT = 1e-3
-"""Below this horizontal length of the left axis the person lies on the side and has no yaw."""
+"""Below this horizontal length of the left axis the person lies on the side, and the axis tells no yaw."""
 
 
 # -- transforms --------------------------------------------------------------------------------
@@ -59,8 +59,13 @@ def to_planar(T_a_b: Tensor) -> tuple[Tensor, Tensor]:
 
 def from_planar(yaw: Tensor, ground: Tensor) -> Tensor:
     """Inverse of `to_planar`. (...), (..., 2) -> (..., 4, 4)"""
+    return _on_ground(about_y(yaw), ground)
+
+
+def _on_ground(rotation: Tensor, ground: Tensor) -> Tensor:
+    """(..., 3, 3), (..., 2) -> (..., 4, 4)"""
     x, z = ground.unbind(-1)
-    return rigid(about_y(yaw), torch.stack([x, torch.zeros_like(x), z], dim=-1))
+    return rigid(rotation, torch.stack([x, torch.zeros_like(x), z], dim=-1))
 
 
 def turn(yaw: Tensor, ground: Tensor) -> Tensor:
@@ -74,22 +79,19 @@ def turn(yaw: Tensor, ground: Tensor) -> Tensor:
 
 
 def canonical_frame(T_world_root: Tensor) -> Tensor:
-    """Frame on the ground under the pelvis, facing where the pelvis faces. (..., T, P, 4, 4) -> same
+    """Frame on the ground under the pelvis, facing where the pelvis faces. (..., 4, 4) -> same
 
     The yaw comes from the pelvis's left axis, which stays horizontal in bows and dips where a forward
-    axis would flip. A person lying exactly on the side keeps the yaw of the last frame that had one;
-    before any such frame, the forward axis decides.
+    axis would flip. Of a person lying exactly on the side the forward axis, then horizontal, decides. Each frame
+    is judged by itself, so that it does not matter which others are known.
     """
-    left = T_world_root[..., :3, 0]
-    yaw = torch.atan2(-left[..., 2], left[..., 0])
+    left, forward = T_world_root[..., :3, 0], T_world_root[..., :3, 2]
     upright = left[..., [0, 2]].norm(dim=-1) >= UPRIGHT
-    if not bool(upright.all()):
-        forward = T_world_root[..., :1, :, :3, 2]
-        yaw = torch.cat([torch.atan2(forward[..., 0], forward[..., 2]), yaw], dim=-2)
-        frame = torch.arange(1, yaw.shape[-2], device=yaw.device)[:, None]
-        last_upright = torch.where(upright, frame, 0).cummax(dim=-2).values
-        yaw = yaw.gather(-2, last_upright)
-    return from_planar(yaw, T_world_root[..., [0, 2], 3])
+    sine = torch.where(upright, -left[..., 2], forward[..., 0])
+    cosine = torch.where(upright, left[..., 0], forward[..., 2])
+    # No angle is taken: sines, unlike roots, may be rounded otherwise in another place of a batch.
+    length = (sine * sine + cosine * cosine).sqrt().clamp_min(1e-12)
+    return _on_ground(about_y_of(sine / length, cosine / length), T_world_root[..., [0, 2], 3])
 
 
 def canonical_steps(T_world_can: Tensor) -> Tensor:

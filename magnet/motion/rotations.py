@@ -46,8 +46,12 @@ def geodesic(a: Tensor, b: Tensor) -> Tensor:
 
 def about_y(yaw: Tensor) -> Tensor:
     """Rotation about the vertical axis. (...) radians -> (..., 3, 3)"""
-    cos, sin = yaw.cos(), yaw.sin()
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    return about_y_of(yaw.sin(), yaw.cos())
+
+
+def about_y_of(sin: Tensor, cos: Tensor) -> Tensor:
+    """`about_y` of the angle with this sine and cosine. (...), (...) -> (..., 3, 3)"""
+    zero, one = torch.zeros_like(sin), torch.ones_like(sin)
     rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 

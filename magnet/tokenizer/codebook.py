@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
+
+from magnet.precision import Float32
 
 KMEANS_ROUNDS = 10
 KMEANS_VECTORS = 8
@@ -27,7 +29,7 @@ class Quantised:
     counts: Tensor  # (levels, codes) how often each code was chosen, over all processes in training
 
 
-class Codebook(nn.Module):
+class Codebook(Float32):
     """Residual vector quantiser: each level holds codes for what the levels before it left over.
 
     Codes are buffers: no gradient moves them. In training mode they follow the vectors that chose them, by an

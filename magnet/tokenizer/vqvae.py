@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from magnet.precision import Float32, dtype_of
+
 STAGES = 2
 """Each stage halves the frame rate: 2 stages are the stride of 4 frames a token."""
 
@@ -105,7 +107,7 @@ class Decoder(nn.Module):
         return self.layers(x)
 
 
-class Standard(nn.Module):
+class Standard(Float32):
     """z-scores by stored statistics; until they are set, the identity.
 
     Args:
@@ -173,7 +175,8 @@ class VQVAE(nn.Module):
         shape = self.betas(betas)[:, None].expand(-1, pose.shape[1], -1)
         seen = torch.where(known[..., :1], self.pose(pose), 0.0)
         moved = torch.where(known[..., 1:], self.steps(steps), 0.0)
-        return self.encoder(torch.cat([seen, moved, shape], dim=-1)).float()
+        inputs = torch.cat([seen, moved, shape], dim=-1)
+        return self.encoder(inputs.to(dtype_of(self.encoder))).float()
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, known: Tensor | None = None) -> Tensor:
         """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
@@ -181,4 +184,5 @@ class VQVAE(nn.Module):
         moved = self.steps(steps)
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
-        return self.pose.restore(self.decoder(torch.cat([latent, moved.flatten(-2), shape], dim=-1)))
+        inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)
+        return self.pose.restore(self.decoder(inputs.to(dtype_of(self.decoder))))

@@ -4,11 +4,12 @@ import torch
 from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions, known_tokens, scrub, stretches
 from magnet.denoiser.seams import seam_weights
-from magnet.motion.frames import canonical_frame, pairwise, to_9d
+from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_transforms
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
+from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.testing import random_scene, tiny_denoiser, without_absent
 from magnet.tokenizer.features import features
@@ -170,6 +171,22 @@ def test_moving_the_world_moves_the_sample(model, scene):
     T[0, 3] = 4.0
     moved = run(model, scene.moved(T))
     assert torch.allclose(run(model, scene).moved(T).T_world_root, moved.T_world_root, atol=2e-3)
+
+
+def test_moving_the_world_moves_the_sample_before_a_keyframe_of_somebody_lying_on_the_side(model, scene):
+    """Where such a keyframe faces is told by itself: what lies before it is not known, and faces nowhere."""
+    key = slice(32, 36)
+    lying = from_planar(torch.tensor(1.0), torch.zeros(2))[:3, :3] @ torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[:, key, 0, :3, :3] = lying
+    scene = scene.replace(T_world_root=T_world_root)
+    move = from_planar(torch.tensor(1.2), torch.tensor([2.0, -3.0]))
+
+    def between(scene: Scene) -> Scene:
+        return run(model, scene, frames=32, task=Inbetweening(keys=(8,)))
+
+    here, there = between(scene).moved(move), between(scene.moved(move))
+    assert (here.T_world_root - there.T_world_root).abs().max() < 1e-4
 
 
 def test_tokens_fed_back_agree_with_the_world(model, scene):

@@ -194,15 +194,28 @@ def test_others_hang_off_the_anchor_alone(generator):
     assert not torch.allclose(first, T_world_can[:, 1:], atol=0.1)
 
 
-def test_a_person_lying_on_the_side_keeps_the_last_yaw():
-    lying = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, torch.pi / 2]))
-    upright = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.7, 0.0]))
-    rotations = torch.stack([upright, lying, lying, upright])[None, :, None]
-    T = rigid(rotations, torch.zeros(1, 4, 1, 3))
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("facing", [0.7, -2.5, 3.1])
+def test_falling_onto_the_side_does_not_turn_a_person_round(side, facing):
+    angle = side * torch.tensor([0.0, 0.5, 1.0, torch.pi / 2, torch.pi / 2, 0.2])
+    falling = roma.rotvec_to_rotmat(angle[:, None] * torch.tensor([0.0, 0.0, 1.0]))
+    turned = roma.rotvec_to_rotmat(torch.tensor([0.0, facing, 0.0]))
+    T = rigid((turned @ falling)[None, :, None], torch.zeros(1, 6, 1, 3))
     yaw, _ = to_planar(canonical_frame(T))
-    assert torch.allclose(yaw[0, :, 0], torch.tensor(0.7).expand(4), atol=1e-5)
-    first_lying = rigid(lying.expand(1, 2, 1, 3, 3), torch.zeros(1, 2, 1, 3))
-    assert canonical_frame(first_lying).isfinite().all()
+    assert torch.allclose(yaw[0, :, 0], torch.tensor(facing).expand(6), atol=1e-5)
+
+
+def test_a_frames_canonical_frame_is_its_own_whatever_the_others_are(scene: Scene):
+    rolled, lying, turned = roma.rotvec_to_rotmat(torch.tensor([[0.3, 0, 0], [0, 0, torch.pi / 2], [0, 1.0, 0]]))
+    T = scene.T_world_root.clone()
+    T[:, 3:6, 0, :3, :3] = turned @ lying @ rolled  # the left axis points straight up
+    whole = canonical_frame(T)
+    other = torch.eye(4).expand_as(T).clone()
+    other[:, 4:8] = T[:, 4:8]
+    for alone in (canonical_frame(other)[:, 4:8], canonical_frame(T[:, 4:8])):
+        assert torch.allclose(alone, whole[:, 4:8], atol=1e-6)
+    yaw, _ = to_planar(whole)
+    assert torch.allclose(yaw[:, 3:6, 0], torch.tensor(1.3), atol=1e-5)  # turned by 1, and rolled on by 0.3
 
 
 def test_bowing_past_the_horizontal_does_not_turn_a_person_round():

@@ -1,0 +1,28 @@
+"""Which numbers stay float32 when a model is made half or double precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+from torch import Tensor, nn
+
+
+class Float32(nn.Module):
+    """A module whose numbers are not weights of a network and so keep their type.
+
+    `model.bfloat16()`, `half()` and `double()` are for networks: statistics and codes that followed would be rounded,
+    and tokens would no longer be those that the model was trained on. Moving to a device works as ever.
+    """
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        def keep(tensor: Tensor) -> Tensor:
+            made = fn(tensor)
+            return made if made.dtype == tensor.dtype else tensor.to(made.device)
+
+        return super()._apply(keep, recurse)
+
+
+def dtype_of(network: nn.Module) -> Any:
+    """The type of a network's weights, in which it takes its input."""
+    return next(network.parameters()).dtype

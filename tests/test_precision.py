@@ -1,0 +1,73 @@
+"""Models of half and double precision: the networks change, statistics, codes and geometry do not."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+
+from magnet.body import load_body
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.module import Denoiser
+from magnet.motion.scene import Scene
+from magnet.precision import Float32
+from magnet.sampling.guidance import Guidance
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+
+FAR = {torch.float64: 1e-4, torch.float16: 0.05, torch.bfloat16: 0.5}
+"""Metres that a joint may lie from where float32 puts it; an untrained model's codes may flip where they round."""
+
+
+@functools.cache
+def model_of(dtype: torch.dtype) -> Denoiser:
+    return tiny_denoiser(3).to(dtype)
+
+
+@functools.cache
+def sampled(dtype: torch.dtype, task: str, guidance: Guidance | None = None) -> Scene:
+    context = 0 if task in ("generation", "partner_inpainting") else 16
+    scene = random_scene(1, 40, 2, torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(2)
+    sampler = SamplerOptions(steps=2, guidance=guidance or Guidance())
+    return model_of(dtype).generate(scene, registry.get(task)(), context, 16, options=sampler, generator=generator)
+
+
+@pytest.mark.parametrize("dtype", FAR, ids=str)
+@pytest.mark.parametrize("task", registry.names())
+def test_every_task_is_sampled_with_a_model_of_any_precision(task, dtype):
+    expected, got = sampled(torch.float32, task), sampled(dtype, task)
+    assert got.T_world_root.dtype == got.body_rot.dtype == torch.float32
+    joints = [load_body().joints(scene) for scene in (expected, got)]
+    assert (joints[0] - joints[1]).norm(dim=-1).max() < FAR[dtype]
+    assert got.given is not None
+    assert torch.equal(got.T_world_root[got.given], expected.T_world_root[got.given])
+
+
+@pytest.mark.parametrize("kind", ["history", "none"])
+def test_guidance_and_smoothing_take_a_double_model(kind):
+    guidance = Guidance(kind=kind, smooth=0.01)
+    expected, got = (sampled(dtype, "joint_future", guidance) for dtype in (torch.float32, torch.float64))
+    assert torch.allclose(got.T_world_root, expected.T_world_root, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", FAR, ids=str)
+def test_statistics_and_codes_keep_every_bit(dtype):
+    model, other = tiny_denoiser(2), tiny_denoiser(2).to(dtype)
+    kept = [name for name, module in model.named_modules() if isinstance(module, Float32)]
+    assert {name.split(".")[-1] for name in kept} == {"pose", "steps", "betas", "codebook", "statistics"}
+    for name in kept:
+        theirs = other.get_submodule(name).state_dict()
+        for key, value in model.get_submodule(name).state_dict().items():
+            assert theirs[key].dtype == value.dtype and torch.equal(theirs[key], value)
+    assert {parameter.dtype for parameter in other.parameters()} == {dtype}
+    assert torch.equal(other.float().statistics.mean, model.statistics.mean)
+
+
+def test_what_keeps_its_precision_moves_with_its_model():
+    model = tiny_denoiser(2).to("meta", torch.bfloat16)
+    assert {(buffer.device.type, buffer.dtype) for buffer in model.statistics.buffers()} == {
+        ("meta", torch.float32),
+        ("meta", torch.int64),
+    }
