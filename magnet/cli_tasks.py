@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
@@ -140,6 +140,7 @@ class Shown:
         stride: token steps finished before the window moves on.
         rolling: denoising steps between a token and the next; 0: the tokens of a stride go together. By default
             tasks that can roll do, as in sampling.
+        noise_sampling: `joint`: agents at a time step share their level; `independent`: each token has its own.
         moments: rows of the picture at most; denoising steps between them are left out.
     """
 
@@ -151,6 +152,7 @@ class Shown:
     window: int = 8
     stride: int = 4
     rolling: int | None = None
+    noise_sampling: Literal["joint", "independent"] = "joint"
     moments: int = 16
 
 
@@ -166,7 +168,7 @@ def show_task(arguments: list[str]) -> int:
     from magnet.cli import CommandError
     from magnet.export.schedule import draw_schedule
     from magnet.export.schedule_terminal import schedule_text
-    from magnet.sampling.schedule import Grid
+    from magnet.sampling.grid import Grid
 
     if not arguments or arguments[0].startswith("-"):
         if set(arguments) & {"-h", "--help"}:
@@ -180,7 +182,7 @@ def show_task(arguments: list[str]) -> int:
         raise CommandError(str(error)) from error
     task, shown = parse_shown(name, kind, rest)
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.rolling)
-    grid = Grid(*sizes)
+    grid = Grid(*sizes, noise_sampling=shown.noise_sampling)
     schedule = task.schedule(grid)
     formula = str(getattr(task, "formula", ""))
     if shown.out is not None:

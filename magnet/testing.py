@@ -92,8 +92,9 @@ TASK_GRIDS = (
     Grid(9, 3, 0, steps=1),
     Grid(20, 2, 4, steps=6, window=8, rolling=2),
     Grid(20, 2, 4, steps=6, window=8, rolling=None),
+    Grid(20, 2, 4, steps=9, window=8, rolling=1),
 )
-"""Long and short scenes of one to four agents, with a past and without, in strides and rolling."""
+"""Long and short scenes of one to four agents, with a past and without, in strides, rolling and in pyramids."""
 
 
 def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = False) -> list[Grid]:

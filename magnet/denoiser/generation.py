@@ -14,6 +14,7 @@ from magnet.denoiser.presets import preset_fields
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
+from magnet.sampling.grid import NoiseSampling
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule
@@ -49,6 +50,8 @@ class SamplerOptions:
         shift: over 1, more of the denoising steps at high noise levels, where what has yet to be decided is decided
             (ours); 1 spaces them evenly, as the paper does.
         guidance: motion history guidance (paper A.7), off by default.
+        noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
+            passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
     """
 
     steps: int = 30
@@ -62,6 +65,7 @@ class SamplerOptions:
     eta: float = 1.0
     shift: float = 3.0
     guidance: Guidance = field(default_factory=Guidance)
+    noise_sampling: NoiseSampling = "joint"
 
     def __post_init__(self) -> None:
         if self.placement not in get_args(Placement):
@@ -91,7 +95,7 @@ class SamplerOptions:
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o = options
-    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift)
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift, o.noise_sampling)
 
 
 def occupied(scene: Scene) -> int:

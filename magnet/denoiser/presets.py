@@ -20,6 +20,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "eta": 0.0,  # A.3: DDIM
         "shift": 1.0,  # A.3: even steps
         "guidance": {"kind": "none", "weight": 1.0, "literal": True, "smooth": 0.0, "context_level": 0},  # A.7: w = 1
+        "noise_sampling": "joint",  # A.6.2
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `paper` gives every field, so that it stays the

@@ -8,63 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.checks import require_number, require_whole
-from magnet.sampling.noise import LEVELS, ddim_levels
+from magnet.checks import require_whole
+from magnet.sampling.grid import Grid
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.plans import changing, initial_levels, levels_at, runs, token_levels, window_positions
 
-
-@dataclass(frozen=True)
-class Grid:
-    """What a task plans on: N token steps of P agents, of which the first `context` steps are recorded."""
-
-    tokens: int  # N
-    agents: int  # P
-    context: int  # recorded token steps at the start, 0 for generation from nothing
-    steps: int = 30  # denoising steps S, paper A.3
-    window: int = 16  # token steps W that the model sees at once
-    stride: int = 4  # token steps finished before the window moves on
-    rolling: int | None = 0  # steps between a token and the next; 0: a stride's go together; None: see `slope`
-    shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
-
-    def __post_init__(self) -> None:
-        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
-            require_whole(name, getattr(self, name), least)
-        if self.context > self.tokens:
-            raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
-        if self.stride > self.window:
-            raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
-        require_number("shift", self.shift, over=0)
-        if self.rolling is not None:
-            require_whole("rolling", self.rolling, 0)
-        if self.rolling and self.rolled >= self.window:
-            raise ValueError(
-                f"rolling={self.rolling} with {self.steps} denoising steps keeps {self.rolled} tokens half denoised, "
-                f"and the window holds {self.window}: give more steps between tokens, or fewer denoising steps"
-            )
-
-    @property
-    def slope(self) -> int:
-        """Denoising steps between a token and the next in plans that can roll; 0: they go in strides.
-
-        By default (`rolling` None) what keeps half of the window in the making, and half in sight behind it.
-        """
-        if self.rolling is not None:
-            return self.rolling
-        return -(-self.steps // (self.window // 2)) if self.window > 1 else 0
-
-    @property
-    def rolled(self) -> int:
-        """Token steps that are half denoised at a time when rolling."""
-        return -(-self.steps // self.slope)
-
-    def mask(self) -> Tensor:
-        """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""
-        return torch.zeros(self.tokens, self.agents, dtype=torch.bool)
-
-    def past(self) -> Tensor:
-        """What has been recorded: the first `context` steps of everybody. (N, P) bool"""
-        mask = self.mask()
-        mask[: self.context] = True
-        return mask
+__all__ = ["Grid", "MaskSchedule", "Stage", "initial_levels", "window_positions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +144,9 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
-            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. With a `grid.slope`
-                it moves on token by token.
+            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. Where it `rolls`, the
+                window moves on token by token; with a `grid.pyramid` the new tokens of each of its places follow
+                one another.
             positions: other places for the window, as `window_positions` gives them; these cannot roll.
 
         Raises:
@@ -204,11 +154,11 @@ class MaskSchedule:
         """
         if grid.rolling and positions is not None:
             raise ValueError("rolling goes forward in time, and this task looks ahead to keyframes: leave it out")
-        if grid.slope and positions is None:
+        if grid.rolls and positions is None:
             return MaskSchedule.roll(known, target, grid)
         stages = []
         level = initial_levels(known)
-        plan = ddim_levels(grid.steps, grid.shift)
+        plan, slope = token_levels(grid), 0 if positions is not None else grid.pyramid
         for start, first, last in positions or window_positions(target, grid):
             stop = min(start + grid.window, grid.tokens)
             active = target[start:stop].clone()
@@ -216,7 +166,9 @@ class MaskSchedule:
             active[last - start :] = False
             if not active.any():  # a stride in the middle that is known already
                 continue
-            rows = torch.where(active, plan[:, None, None], level[start:stop])
+            turn = torch.arange(grid.steps + slope * (last - first - 1) + 1)[:, None]
+            turn = turn - slope * (torch.arange(start, stop) - first)
+            rows = changing(torch.where(active, levels_at(plan, turn[..., None], start, stop), level[start:stop]))
             stages.append(Stage(start, rows.short()))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
@@ -224,6 +176,8 @@ class MaskSchedule:
     @staticmethod
     def roll(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
         """Denoise along a slope: each token `grid.slope` denoising steps behind the one before it in time.
+
+        The window has to hold all that is half denoised at a time (`Grid.rolls`), and one token more.
 
         A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
         finishes one more token step. As long as less than half of a window lies behind, there is too little to go on
@@ -234,12 +188,12 @@ class MaskSchedule:
             target: (N, P) bool, to be generated.
             grid: sizes; `grid.slope` is over 0.
         """
-        plan = ddim_levels(grid.steps, grid.shift)
+        plan = token_levels(grid)
         level, stages, done = initial_levels(known), [], 0
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
         if wanted and wanted[0] < grid.window // 2:
             done = min(grid.window, grid.tokens)
-            rows = torch.where(target[:done], plan[:, None, None], level[:done])
+            rows = changing(torch.where(target[:done], plan[:, :done], level[:done]))
             stages.append(Stage(0, rows.short()))
             level[:done] = rows[-1]
         rolling = target & (torch.arange(grid.tokens) >= done)[:, None]
@@ -252,9 +206,8 @@ class MaskSchedule:
             stop = min(start + grid.window, grid.tokens)
             behind = grid.slope * (torch.arange(start, stop) - first)
             turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
-            rows = torch.where(rolling[start:stop], plan[turn.clamp(0, grid.steps)][..., None], level[start:stop])
-            changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
-            rows = torch.cat([rows[:1], rows[1:][changes]])
+            now = levels_at(plan, turn[..., None], start, stop)
+            rows = changing(torch.where(rolling[start:stop], now, level[start:stop]))
             stages.append(Stage(start, rows.short()))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
@@ -290,20 +243,18 @@ class MaskSchedule:
             )
         require_whole("block", block, 1, grid.window)
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
-        plan = ddim_levels(grid.steps, grid.shift)
+        plan = token_levels(grid)
         turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)
-        plans = plan[turns.clamp(0, grid.steps)]
         level, stages = initial_levels(known), []
-        for first, last in _blocks(target, block):
+        for first, last in runs(target, block):
             past = grid.window - grid.stride
             start = max(0, min(first - past, grid.tokens - grid.window), last - grid.window)
             stop = min(start + grid.window, grid.tokens)
             now = slice(first - start, last - start)
             active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
             active[now] = target[first:last]
-            rows = torch.where(active, plans[:, None], level[start:stop])
-            changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
-            rows = torch.cat([rows[:1], rows[1:][changes]])
+            plans = levels_at(plan, turns[:, None], start, stop)
+            rows = changing(torch.where(active, plans, level[start:stop]))
             hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
             if unseen is not None:
                 hidden[:, now] = unseen[:, None]
@@ -313,43 +264,3 @@ class MaskSchedule:
             stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
-
-
-def _blocks(target: Tensor, block: int) -> Iterator[tuple[int, int]]:
-    """Time steps with targets, in runs of at most `block`."""
-    wanted = target.any(dim=1).tolist()
-    first = 0
-    while first < len(wanted):
-        if not wanted[first]:
-            first += 1
-            continue
-        last = first
-        while last < min(first + block, len(wanted)) and wanted[last]:
-            last += 1
-        yield first, last
-        first = last
-
-
-def initial_levels(known: Tensor) -> Tensor:
-    """Known tokens are clean, all others pure noise. (N, P) bool -> (N, P) int"""
-    return torch.where(known, 0, LEVELS)
-
-
-def window_positions(target: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
-    """Where the window stands: (start, first token step to denoise, one past the last), until all is done.
-
-    The first window is filled to its end; each later one keeps window - stride finished steps in view.
-    """
-    wanted = target.any(dim=1).nonzero()[:, 0].tolist()
-    if not wanted:
-        return
-    first, end = wanted[0], wanted[-1] + 1
-    # Leave room for at least one stride of new tokens behind the recorded ones.
-    start = max(0, min(first - (grid.window - grid.stride), grid.tokens - grid.window))
-    last = min(start + grid.window, end)
-    while True:
-        yield start, first, last
-        if last >= end:
-            return
-        first, last = last, min(last + grid.stride, end)
-        start = max(0, min(last - grid.window, grid.tokens - grid.window))

@@ -36,14 +36,20 @@ class PartnerInpainting:
     """The whole motion of some agents, given the whole motion of the others (paper 3.3).
 
     Args:
-        target: slots of the agents to generate; nothing of their motion is read.
+        target: slots of the agents to generate; nothing of their motion is read, unless `own_past`.
+        own_past: they are given their own past too, and what follows it is generated: P(A_t:L | A_0:t-1, B_0:L).
     """
 
     formula: ClassVar[str] = "P(A_0:L | B_0:L, ...)"
     target: tuple[int, ...] = (0,)
+    own_past: bool = False
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         unknown = chosen(grid, self.target).expand(grid.tokens, -1)
+        if self.own_past:
+            if grid.context == 0:
+                raise ValueError("partner_inpainting with own_past goes on from a past: give it context frames")
+            unknown = unknown & ~grid.past()
         return MaskSchedule.together(~unknown, unknown, grid)
 
 

@@ -148,11 +148,98 @@ def test_padded_plans_know_and_generate_nothing_in_free_slots_and_add_no_view():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"rolling": 1, "steps": 30}, "keeps 30 tokens half denoised"), ({"rolling": -1}, "rolling: got -1")],
+    [
+        ({"rolling": -1}, "rolling: got -1"),
+        ({"noise_sampling": "both"}, "noise_sampling: got 'both', expected joint or independent"),
+    ],
 )
-def test_a_slope_that_does_not_fit_the_window_is_refused(options, message):
+def test_options_that_mean_nothing_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         rolled(**options)
+
+
+# -- a pyramid inside the window ---------------------------------------------------------------
+
+
+def pyramid(**options) -> MaskSchedule:
+    """A slope so gentle that the window cannot roll along it."""
+    return rolled(**{"rolling": 1, "steps": 30, "window": 16, "tokens": 40, **options})
+
+
+@pytest.mark.parametrize("rolling", [1, 2])
+def test_a_slope_too_gentle_for_the_window_is_a_pyramid_in_each_of_its_places(rolling):
+    """Diffusion forcing's pyramid matrix: token n of the new ones is at step s - n * rolling, clamped to 0..S."""
+    plan = pyramid(rolling=rolling, window=12 if rolling == 1 else 15)
+    done = 4
+    for stage in plan.stages:
+        new = ((stage.levels[0] > 0).any(dim=1)).nonzero()[:, 0]
+        assert stage.start + int(new[0]) == done
+        done += len(new)
+        assert len(stage.levels) == 31 + rolling * (len(new) - 1)
+        for step, row in enumerate(stage.levels):
+            passed = [min(max(step - rolling * n, 0), 30) for n in range(len(new))]
+            assert row[new, 0].tolist() == row[new, 1].tolist() == [1000 * (30 - s) // 30 for s in passed]
+    assert done == 40 and plan.finished.all()
+
+
+def test_a_pyramids_window_moves_on_by_the_stride():
+    starts = [stage.start for stage in pyramid(stride=3).stages]
+    assert starts == [0, *range(3, 25, 3)]
+
+
+def test_a_window_rolls_as_soon_as_it_holds_all_that_is_half_denoised():
+    """15 tokens in the making fit into 16, 30 do not."""
+    rolls, strides = (pyramid(rolling=rolling, context=8) for rolling in (2, 1))
+    assert (len(rolls.stages), rolls.evaluations) == (32, 30 + 31 * 2)
+    assert (len(strides.stages), strides.evaluations) == (7, 30 + 7 + 6 * (30 + 3))
+
+
+def test_a_pyramid_over_what_is_known_in_between_generates_the_rest():
+    grid = Grid(24, 2, 4, steps=20, window=8, rolling=1)
+    known = grid.past()
+    known[10:16, 0] = True
+    plan = MaskSchedule.together(known, ~known, grid)
+    assert plan.finished.all() and torch.equal(plan.known, known)
+
+
+# -- levels that agents share, or draw of their own (paper A.6.2) ------------------------------
+
+
+def independent(**options) -> MaskSchedule:
+    return rolled(**{"rolling": 0, "steps": 20, "noise_sampling": "independent", **options})
+
+
+@pytest.mark.parametrize("rolling", [0, 2, 4])
+def test_jointly_agents_at_a_time_step_are_at_one_level_throughout(rolling):
+    for stage in rolled(rolling=rolling).stages:
+        assert torch.equal(stage.levels[..., 0], stage.levels[..., 1])
+
+
+@pytest.mark.parametrize("rolling", [0, 4])
+def test_independently_each_token_passes_levels_of_its_own(rolling):
+    plan = independent(rolling=rolling)
+    rows = torch.stack(list(plan.rows()))[:, 4:]
+    passed = [tuple(column.unique_consecutive().tolist()) for column in rows.flatten(1).T]
+    assert all(len(each) == 21 and each[0] == 1000 and each[-1] == 0 for each in passed)
+    assert len(set(passed)) == 8 * 2  # no two alike inside a window; the next window's are these again
+    assert plan.finished.all()
+
+
+def test_independent_levels_are_drawn_evenly():
+    """500 steps leave about every second level, so a token's median is near the middle."""
+    from magnet.sampling.plans import token_levels
+
+    levels = token_levels(Grid(16, 4, 0, steps=500, noise_sampling="independent"))
+    between = levels[1:-1].double() / 1000
+    assert (between.mean() - 0.5).abs() < 0.01
+    assert (between.std(dim=0) - 12**-0.5).abs().max() < 0.03
+
+
+def test_a_plan_draws_no_random_numbers():
+    torch.manual_seed(1)
+    first = independent()
+    torch.manual_seed(2)
+    assert all(torch.equal(a.levels, b.levels) for a, b in zip(first.stages, independent().stages, strict=True))
 
 
 @pytest.mark.parametrize("window", [2, 3, 8, 16])

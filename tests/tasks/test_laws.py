@@ -31,6 +31,23 @@ def test_every_task_obeys_the_laws(name: str):
     assert checked == [g for g in expected if g.context or name in FROM_NOTHING]
 
 
+@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("rolling", [0, 2])
+def test_every_task_obeys_the_laws_where_each_token_has_levels_of_its_own(name: str, rolling: int):
+    """Paper A.6.2. Levels are drawn by slot, so this is the one choice in which slots are not treated alike."""
+    if rolling and name in CANNOT_ROLL:
+        pytest.skip("refused, with a reason: see below")
+    context = 0 if name == "generation" else 4
+    grid = Grid(20, 3, context, steps=6, window=8, stride=3, rolling=rolling, noise_sampling="independent")
+    assert task_laws(registry.get(name)(), [grid]) == [grid]
+
+
+@pytest.mark.parametrize("target", [(0,), (0, 2)])
+def test_inpainting_with_the_targets_own_past_obeys_the_laws(target: tuple[int, ...]):
+    task = registry.get("partner_inpainting")(target=target, own_past=True)
+    assert all(grid.context and grid.agents > len(target) for grid in task_laws(task))
+
+
 @pytest.mark.parametrize("name", CANNOT_ROLL)
 def test_a_task_that_cannot_roll_says_why(name: str):
     with pytest.raises(ValueError, match="rolling"):
@@ -98,6 +115,7 @@ def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypat
     [
         ("partner_inpainting", {"target": (0,)}),
         ("partner_inpainting", {"target": (0, 2)}),
+        ("partner_inpainting", {"target": (0, 2), "own_past": True}),
         ("partner_prediction", {"target": (0,)}),
         ("partner_prediction", {"target": (0, 2)}),
         ("motion_control", {"target": (0,)}),

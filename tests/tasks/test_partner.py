@@ -15,6 +15,14 @@ def test_inpainting_knows_all_of_the_others_and_nothing_of_the_target():
     assert schedule.finished.all()
 
 
+def test_inpainting_with_its_own_past_knows_that_too():
+    schedule = PartnerInpainting((1,), own_past=True).schedule(GRID)
+    assert schedule.known[:, [0, 2]].all() and schedule.known[:8].all() and not schedule.known[8:, 1].any()
+    assert schedule.finished.all()
+    with pytest.raises(ValueError, match="own_past goes on from a past: give it context"):
+        PartnerInpainting((1,), own_past=True).schedule(Grid(12, 2, 0))
+
+
 def test_prediction_leaves_the_partners_future_unknown():
     schedule = PartnerPrediction((0, 2)).schedule(GRID)
     assert torch.equal(schedule.known, GRID.past())

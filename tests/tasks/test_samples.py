@@ -231,6 +231,35 @@ def test_new_noise_samples_the_same_futures_when_rolling_and_in_turns():
     check(AgenticAsync(), 2, eta=1.0)
 
 
+@pytest.mark.parametrize("people", [1, 2, 3])
+def test_a_pyramid_inside_the_window_samples_the_same_futures(people):
+    """Ten tokens would be half denoised at a time, of which the window holds five."""
+    check(JointFuture(), people, share=10)
+
+
+@pytest.mark.parametrize(
+    "task", [JointFuture(), PartnerInpainting((0,)), PartnerPrediction((0,))], ids=lambda task: type(task).__name__
+)
+def test_levels_of_ones_own_sample_the_same_distributions_in_the_end(task):
+    """Paper A.6.2: whichever way noise is taken away, a perfect model ends at the truth as the steps become finer."""
+    gaussian = Gaussian(TOKENS[2], 2)
+    values = gaussian.mean + torch.randn(10, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    off = []
+    for steps in (50, 500):
+        grid = Grid(TOKENS[2], 2, PAST, steps, window=5, stride=1, noise_sampling="independent")
+        schedule = task.schedule(grid)
+        mean, covariance = distribution(gaussian, schedule, values)
+        known, target = (m.flatten().nonzero()[:, 0] for m in (schedule.known, schedule.finished & ~schedule.known))
+        right = gaussian.given(target, known, values)
+        off.append(float(max((mean - right[0]).abs().max(), (covariance - right[1]).abs().max())))
+    assert off[1] < 0.02 < off[0]
+
+
+@pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
+def test_inpainting_with_the_targets_own_past_is_given_that_as_well(people, target):
+    check(PartnerInpainting(target, own_past=True), people)
+
+
 def test_rolling_prediction_still_integrates_the_partner_out():
     check(PartnerPrediction((0,)), 2, share=2)
 

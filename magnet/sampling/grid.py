@@ -1,0 +1,81 @@
+"""The sizes that a task plans on, and how its plan is to be sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from magnet.checks import require_number, require_whole
+
+NoiseSampling = Literal["joint", "independent"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What a task plans on: N token steps of P agents, of which the first `context` steps are recorded."""
+
+    tokens: int  # N
+    agents: int  # P
+    context: int  # recorded token steps at the start, 0 for generation from nothing
+    steps: int = 30  # denoising steps S, paper A.3
+    window: int = 16  # token steps W that the model sees at once
+    stride: int = 4  # token steps finished before the window moves on
+    rolling: int | None = 0  # steps between a token and the next; 0: a stride's go together; None: see `slope`
+    shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
+    noise_sampling: NoiseSampling = "joint"  # see `magnet.sampling.plans.token_levels`
+
+    def __post_init__(self) -> None:
+        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
+            require_whole(name, getattr(self, name), least)
+        if self.context > self.tokens:
+            raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
+        if self.stride > self.window:
+            raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
+        require_number("shift", self.shift, over=0)
+        if self.rolling is not None:
+            require_whole("rolling", self.rolling, 0)
+        if self.noise_sampling not in get_args(NoiseSampling):
+            choices = " or ".join(get_args(NoiseSampling))
+            raise ValueError(f"noise_sampling: got {self.noise_sampling!r}, expected {choices}")
+
+    @property
+    def slope(self) -> int:
+        """Denoising steps between a token and the next in plans that can roll; 0: they go in strides.
+
+        By default (`rolling` None) what keeps half of the window in the making, and half in sight behind it.
+        """
+        if self.rolling is not None:
+            return self.rolling
+        return -(-self.steps // (self.window // 2)) if self.window > 1 else 0
+
+    @property
+    def rolled(self) -> int:
+        """Token steps that are half denoised at a time when rolling."""
+        return -(-self.steps // self.slope)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the window moves on token by token: there is a slope, and it holds all that is half denoised."""
+        return self.slope > 0 and self.rolled < self.window
+
+    @property
+    def pyramid(self) -> int:
+        """Denoising steps between a token and the next inside a window that moves in strides; 0: they go together.
+
+        A slope too gentle for the window to roll along it. Each place of the window then has a whole pyramid to
+        itself: it begins with all of its new tokens at K and ends with all of them clean.
+        """
+        return 0 if self.rolls else self.slope
+
+    def mask(self) -> Tensor:
+        """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""
+        return torch.zeros(self.tokens, self.agents, dtype=torch.bool)
+
+    def past(self) -> Tensor:
+        """What has been recorded: the first `context` steps of everybody. (N, P) bool"""
+        mask = self.mask()
+        mask[: self.context] = True
+        return mask

@@ -1,0 +1,92 @@
+"""What plans of noise levels are made of: levels of each token, places of the window, runs of time steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from magnet.sampling.grid import Grid
+from magnet.sampling.noise import LEVELS, ddim_levels, shifted
+from magnet.seeding import derive
+
+
+def token_levels(grid: Grid) -> Tensor:
+    """The levels that each token passes, before and after its s-th own denoising step. -> (S + 1, W, P) int
+
+    Row n % W is that of token step n. Paper A.6.2 compares two ways and can be read in two: as a choice when training
+    (`noise_levels` of the denoiser), or, as here, when sampling, which fits that both of its rows are of one trained
+    model and that it is used "for all joint prediction experiments":
+
+    `joint`: the levels of `ddim_levels` for all; agents at a time step share their level throughout.
+    `independent`: each token of each agent passes levels of its own, drawn evenly from 1..K-1 (and then `shifted`)
+    between K and 0. They are drawn once and for all, the same for every scene: a plan draws no random numbers.
+    """
+    if grid.noise_sampling == "joint":
+        return ddim_levels(grid.steps, grid.shift)[:, None, None].expand(-1, grid.window, grid.agents)
+    ddim_levels(grid.steps, grid.shift)  # refuses steps that make no sense
+    drawn = torch.empty(grid.steps + 1, grid.window, grid.agents, dtype=torch.long)
+    for row in range(grid.window):
+        for agent in range(grid.agents):
+            generator = torch.Generator().manual_seed(derive("independent noise sampling", row, agent))
+            between = 1 + torch.randperm(LEVELS - 1, generator=generator)[: grid.steps - 1]
+            own = torch.cat([torch.tensor([0, LEVELS]), between]).sort(descending=True).values
+            drawn[:, row, agent] = shifted(own, grid.shift)
+    return drawn
+
+
+def levels_at(levels: Tensor, turn: Tensor, start: int, stop: int) -> Tensor:
+    """Levels of the token steps [start, stop), each after so many of its own denoising steps.
+
+    levels (S + 1, W, P) as of `token_levels`; turn (R, stop - start or 1, P or 1) int, clamped to 0..S
+    -> (R, stop - start, P)
+    """
+    own = levels[:, torch.arange(start, stop) % levels.shape[1]]
+    return own.gather(0, turn.clamp(0, len(levels) - 1).expand(-1, *own.shape[1:]))
+
+
+def changing(rows: Tensor) -> Tensor:
+    """Levels without the denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
+    changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
+    return torch.cat([rows[:1], rows[1:][changes]])
+
+
+def runs(target: Tensor, block: int) -> Iterator[tuple[int, int]]:
+    """Time steps with targets, in runs of at most `block`. target (N, P) bool -> (first, one past the last)"""
+    wanted = target.any(dim=1).tolist()
+    first = 0
+    while first < len(wanted):
+        if not wanted[first]:
+            first += 1
+            continue
+        last = first
+        while last < min(first + block, len(wanted)) and wanted[last]:
+            last += 1
+        yield first, last
+        first = last
+
+
+def initial_levels(known: Tensor) -> Tensor:
+    """Known tokens are clean, all others pure noise. (N, P) bool -> (N, P) int"""
+    return torch.where(known, 0, LEVELS)
+
+
+def window_positions(target: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
+    """Where the window stands: (start, first token step to denoise, one past the last), until all is done.
+
+    The first window is filled to its end; each later one keeps window - stride finished steps in view.
+    """
+    wanted = target.any(dim=1).nonzero()[:, 0].tolist()
+    if not wanted:
+        return
+    first, end = wanted[0], wanted[-1] + 1
+    # Leave room for at least one stride of new tokens behind the recorded ones.
+    start = max(0, min(first - (grid.window - grid.stride), grid.tokens - grid.window))
+    last = min(start + grid.window, end)
+    while True:
+        yield start, first, last
+        if last >= end:
+            return
+        first, last = last, min(last + grid.stride, end)
+        start = max(0, min(last - grid.window, grid.tokens - grid.window))
