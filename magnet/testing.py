@@ -252,11 +252,10 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
         if stage.hidden is None:
             continue
         window = slice(stage.start, stage.stop)
-        told = layout.spread(layout.group_levels(stage.levels[0]) < LEVELS)  # pure noise tells nothing
         for hidden in stage.hidden.unique(dim=0):
             secret = layout.spread(layout.group_levels(hidden.long()) > 0)  # (W, P, D)
             changed = before.clone()
-            changed[:, window] = torch.where(secret & told, 10 * other[:, window], before[:, window])
+            changed[:, window] = torch.where(secret, 10 * other[:, window], before[:, window])
 
             def lying(noisy: Tensor, levels: Tensor, present: Tensor, secret: Tensor = secret) -> Tensor:
                 said = mixing(noisy, levels, present)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -224,6 +225,11 @@ class MaskSchedule:
     ) -> MaskSchedule:
         """Denoise the targets a few time steps at a time, agents as they are told.
 
+        A block is one stage, or, where agents are delayed, as many as there are starts: a token that has not been
+        begun is pure noise and hidden from everybody, so that not even its noise can tell; once begun it is seen by
+        whoever is denoised beside it, however noisy. With nobody `unseen` this samples the joint distribution of the
+        block, whatever the delays: by the chain rule where an agent waits until the one before is done.
+
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated.
@@ -243,8 +249,13 @@ class MaskSchedule:
             )
         require_whole("block", block, 1, grid.window)
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
+<<<<<<< HEAD
         plan = token_levels(grid)
         turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)
+=======
+        plan = ddim_levels(grid.steps, grid.shift)
+        starts = [*delay.unique().tolist(), grid.steps + int(delay.max())]
+>>>>>>> f1eb7d2 (Turn-taking samples the joint distribution at every offset)
         level, stages = initial_levels(known), []
         for first, last in runs(target, block):
             past = grid.window - grid.stride
@@ -253,6 +264,7 @@ class MaskSchedule:
             now = slice(first - start, last - start)
             active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
             active[now] = target[first:last]
+<<<<<<< HEAD
             plans = levels_at(plan, turns[:, None], start, stop)
             rows = changing(torch.where(active, plans, level[start:stop]))
             hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
@@ -263,4 +275,22 @@ class MaskSchedule:
             hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
             stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
             level[start:stop] = rows[-1]
+=======
+            for begins, ends in pairwise(starts):
+                turns = torch.arange(begins, ends + 1)[:, None] - delay  # (rows, P)
+                rows = torch.where(active, plan[turns.clamp(0, grid.steps)][:, None], level[start:stop])
+                changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
+                if not changes.any():  # whoever starts here has nothing to generate in this block
+                    continue
+                rows = torch.cat([rows[:1], rows[1:][changes]])
+                hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
+                if unseen is not None:
+                    hidden[:, now] = unseen[:, None]
+                if not lookahead:
+                    hidden[:, last - start :] = True
+                hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
+                hidden |= active & (rows[-1] == LEVELS)
+                stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
+                level[start:stop] = rows[-1]
+>>>>>>> f1eb7d2 (Turn-taking samples the joint distribution at every offset)
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)

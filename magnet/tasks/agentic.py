@@ -1,4 +1,4 @@
-"""Tasks in which every agent generates its own motion, seeing of the others only what has happened."""
+"""Tasks in which every agent generates its own motion: at once and unseen by the others, or in turns."""
 
 from __future__ import annotations
 
@@ -36,6 +36,9 @@ class AgenticSync:
 class AgenticAsync:
     """Agents take turns: each starts `offset` of its denoising later than the one before, and sees it (paper 3.3).
 
+    Whoever has not started is hidden; from then on all who have see each other as noisy as they are. By the chain rule
+    every offset and order samples the same joint distribution of a turn's tokens.
+
     Args:
         offset: share of the denoising steps between two agents' starts; 1 waits until the one before is done,
             0 starts all together (paper Table 3: 0, 0.5 and 1).
@@ -57,6 +60,5 @@ class AgenticAsync:
             raise ValueError(f"order {self.order}: name each of the agents 0 to {grid.agents - 1} at most once")
         turns = [*self.order, *(p for p in range(grid.agents) if p not in self.order)]
         turn = torch.tensor([turns.index(p) for p in range(grid.agents)])
-        unseen = turn[:, None] < turn[None, :]
         delay = turn * round(self.offset * grid.steps)
-        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, unseen=unseen, delay=delay)
+        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, delay=delay)

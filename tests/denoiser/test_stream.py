@@ -298,8 +298,9 @@ def test_as_many_generators_as_scenes_are_needed(model, recording):
         ("joint_future", Guidance("partner"), 1, 5),
         ("joint_future", Guidance(smooth=0.01), 1, 1),
         ("agentic_sync", Guidance(), 3, 1),
-        ("agentic_async", Guidance(), 3, 1),
-        ("agentic_async", Guidance("history"), 3, 2),
+        ("agentic_sync", Guidance("history"), 3, 2),
+        ("agentic_async", Guidance(), 1, 1),  # nobody is hidden from one that another sees
+        ("agentic_async", Guidance("history"), 1, 2),
     ],
 )
 def test_calls_and_evaluations_are_counted(model, recording, name, guidance, views, branches):

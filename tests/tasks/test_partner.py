@@ -50,15 +50,33 @@ def test_agents_in_step_do_not_see_each_others_current_tokens():
             assert torch.equal(hidden, current & (torch.arange(3) != agent))
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 1.0])
 def test_turns_start_the_offset_apart(offset):
     grid = Grid(tokens=12, agents=3, context=8, steps=10)
-    for stage in AgenticAsync(offset, order=(2, 0)).schedule(grid).stages:
-        now = int((stage.levels[-1] == 0).all(dim=1).nonzero()[-1])
-        starts = [int((stage.levels[:, now, agent] < LEVELS).int().argmax()) for agent in (2, 0, 1)]
-        assert starts[1] - starts[0] == starts[2] - starts[1] == round(10 * offset)
-        assert not stage.hidden[1].any()
-        assert stage.hidden[2, now].tolist() == [True, True, False]
+    rows = torch.stack(list(AgenticAsync(offset, order=(2, 0)).schedule(grid).rows()))[:, 8:]
+    starts = (rows < LEVELS).int().argmax(dim=0)
+    for now in range(4):
+        second, third, first = starts[now].tolist()
+        assert second - first == third - second == round(10 * offset)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 1.0])
+def test_whoever_has_not_started_is_hidden_and_nobody_else(offset):
+    grid = Grid(tokens=12, agents=3, context=8, steps=10)
+    for stage in AgenticAsync(offset, order=(2, 0), block=2).schedule(grid).stages:
+        waiting = (stage.levels[-1] == LEVELS) & (stage.levels[0] == LEVELS)
+        waiting[int((stage.levels[-1] < LEVELS).any(dim=1).nonzero()[-1]) + 1 :] = False  # beyond the block
+        assert (stage.hidden is not None) == bool(waiting.any())
+        if stage.hidden is not None:
+            assert torch.equal(stage.hidden, waiting.expand_as(stage.hidden))
+        assert not stage.apart, "what is denoised beside each other is placed together"
+
+
+def test_at_the_full_offset_turns_are_stages():
+    grid = Grid(tokens=12, agents=3, context=8, steps=10)
+    stages = AgenticAsync(1.0, order=(2, 0)).schedule(grid).stages
+    who = [(stage.levels[0] != stage.levels[-1]).any(dim=0).nonzero()[:, 0].tolist() for stage in stages]
+    assert who == 4 * [[2], [0], [1]]
 
 
 def test_targets_must_exist_and_leave_somebody():
