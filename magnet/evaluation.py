@@ -15,7 +15,7 @@ from magnet.baselines import HoldPose, NearestNeighbour, RandomSample
 from magnet.body import Body
 from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions, planning_grid
-from magnet.metrics import FrechetDistance, all_metrics, frechet_distance, ground_truth_metrics
+from magnet.metrics import FrechetDistance, all_metrics, columns_of, frechet_distance, ground_truth_metrics
 from magnet.metrics.frechet import moments
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene, concatenate
@@ -214,9 +214,12 @@ class Evaluation:
         if all(float(half.count[1]) > 1 for half in self.halves):
             rows[HALVES] = {"fd": _distance(*self.halves)}
         if self.nothing_is_given:  # a scene of its own has no recording to be compared with
-            rows[MODEL] = {name: value for name, value in rows[MODEL].items() if not name.startswith("mpj")}
+            rows[MODEL] = {
+                name: value for name, value in rows[MODEL].items() if not name.startswith(("mpj", "hand_contact_"))
+            }
         seconds = {name: round(value, 2) for name, value in self.seconds.items()}
-        self.results = Results(rows=rows, meta=self.facts(model) | {"seconds": seconds})
+        columns = columns_of(*self.metrics.values())
+        self.results = Results(rows, self.facts(model) | {"seconds": seconds}, columns)
         return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}
 
     def facts(self, model: Denoiser) -> dict[str, Any]:

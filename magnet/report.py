@@ -9,14 +9,18 @@ import os
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import torch
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from magnet.metrics import Better, Column, all_metrics, column, columns_of
+from magnet.metrics.columns import part_notes
 
 LOW, HIGH = "_low", "_high"
 """Endings under which a row holds the ends of a metric's interval."""
@@ -26,62 +30,13 @@ REFERENCES = ("ground truth", "training windows", "test halves")
 
 RESULTS_FORMAT = 1
 
-Better = Literal["low", "high", "real", ""]
 ARROWS: dict[Better, str] = {"low": " ↓", "high": " ↑", "real": " →", "": ""}
 
 
-class Column(NamedTuple):
-    """How a metric is shown: title, unit, and whether low, high or near the recorded value is good."""
-
-    title: str
-    unit: str
-    better: Better
-    meaning: str
-
-
-COLUMNS: dict[str, Column] = {
-    "fd": Column("FD", "m²", "low", "distance between the distributions of generated and recorded poses"),
-    "fd_pair": Column("FD pair", "m²", "low", "the same of two people in one's frame"),
-    "div": Column("DIV", "m²", "high", "variance over the samples of a scene"),
-    "mi": Column("MI", "", "low", "error of the correlation between people"),
-    "fs": Column("FS", "m/s", "low", "speed of standing toes that slide"),
-    "fs_ratio": Column("FS ratio", "", "low", "share of toe steps that slide"),
-    "fs_contact": Column("contact", "", "real", "share of toe steps that stand"),
-    "ip_ratio": Column("IP", "", "low", "share of frames in which people run through each other"),
-    "ip_mean_total_depth": Column("IP depth", "m", "low", "summed depth of penetration, mean over all frames"),
-    "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
-    "mpjpe": Column("MPJPE", "m", "low", "distance to the recorded joints, mean over samples"),
-    "mpjpe_best": Column("MPJPE best", "m", "low", "distance to the recorded joints, best sample"),
-    "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities"),
-    "jitter": Column("jitter", "10 m/s³", "real", "mean third difference"),
-    "partner_distance": Column("distance", "m", "real", "median between two pelvises over the ground"),
-    "hands_held": Column("hands", "", "real", "share of frames with wrists of two people close"),
-}
-
-MAIN = (
-    "fd",
-    "div",
-    "mi",
-    "fs",
-    "ip_ratio",
-    "mpjpe@0.5s",
-    "mpjpe@1s",
-    "mpjpe@2s",
-    "mpjpe@5s",
-    "mpjpe",
-    "mpjve",
-    "jitter",
-)
-"""Metrics that a table shows when nothing else is asked for, where they were measured."""
-
-
-def column(metric: str) -> Column:
-    """How a metric is shown; an unknown one by its own name."""
-    base, at, horizon = metric.partition("@")
-    known = COLUMNS.get(base, Column(base, "", "", ""))
-    if not at:
-        return known
-    return known._replace(title=f"{known.title} {horizon}", meaning=f"{known.meaning}, up to {horizon}")
+@cache
+def own_columns() -> dict[str, Column]:
+    """What the metrics of this package say of themselves, for results that do not say it."""
+    return columns_of(all_metrics())
 
 
 @dataclass(frozen=True)
@@ -91,10 +46,12 @@ class Results:
     Args:
         rows: method -> metric -> value; `<metric>_low` and `<metric>_high` beside it are its interval.
         meta: how it came about, JSON-ready: command, commit, machine, date, seed, data, task, sampler, runtime.
+        columns: how metrics are shown, as `columns_of` the metrics says; those of this package need not be given.
     """
 
     rows: dict[str, dict[str, float]]
     meta: dict[str, Any] = field(default_factory=dict)
+    columns: dict[str, Column] = field(default_factory=dict)
 
     @property
     def metrics(self) -> list[str]:
@@ -102,6 +59,10 @@ class Results:
         names = dict.fromkeys(name for row in self.rows.values() for name in row)
         ends = {name + end for name in names for end in (LOW, HIGH)}
         return [name for name in names if name not in ends]
+
+    def column(self, metric: str) -> Column:
+        """How a metric is shown; one that nobody describes by its own name."""
+        return column(metric, own_columns() | self.columns)
 
     def value(self, method: str, metric: str) -> float:
         """NaN where it was not measured."""
@@ -115,7 +76,7 @@ class Results:
         """Methods whose shown value no other beats; recorded motion does not compete. Empty without a rival."""
         values = {m: self.value(m, metric) for m in self.rows if m not in REFERENCES}
         values = {m: v for m, v in values.items() if math.isfinite(v)}
-        better = column(metric).better
+        better = self.column(metric).better
         if len(values) < 2 or not better:
             return set()
         goal = 0.0
@@ -132,7 +93,8 @@ class Results:
     def save_json(self, path: str | Path) -> Path:
         """Everything, a value that is not a number as null."""
         rows = {m: {k: v if math.isfinite(v) else None for k, v in row.items()} for m, row in self.rows.items()}
-        content = {"format": RESULTS_FORMAT, "meta": self.meta, "rows": rows}
+        columns = {name: shown._asdict() for name, shown in self.columns.items()}
+        content = {"format": RESULTS_FORMAT, "meta": self.meta, "columns": columns, "rows": rows}
         return _write(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False, default=str) + "\n")
 
     @staticmethod
@@ -145,12 +107,13 @@ class Results:
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
             version, meta, rows = content["format"], content["meta"], content["rows"]
+            columns = {name: Column(**shown) for name, shown in content.get("columns", {}).items()}
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a results file ({error!r}); write one with Results.save_json") from error
         if version > RESULTS_FORMAT:
             raise ValueError(f"{path}: results format {version}, this version reads up to {RESULTS_FORMAT}")
         numbers = {m: {k: math.nan if v is None else float(v) for k, v in row.items()} for m, row in rows.items()}
-        return Results(numbers, meta)
+        return Results(numbers, meta, columns)
 
     def save_csv(self, path: str | Path) -> Path:
         """One line a number: method, metric, value, low, high; full precision, without meta."""
@@ -181,7 +144,7 @@ class Results:
     def to_markdown(self, metrics: Sequence[str] | None = None, intervals: bool = False) -> str:
         """The table in markdown, with its footnotes."""
         chosen = self._chosen(metrics)
-        lines = ["| method | " + " | ".join(_title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
+        lines = ["| method | " + " | ".join(self._title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
         best = {metric: self.best(metric) for metric in chosen}
         for method in self.rows:
             cells = []
@@ -191,7 +154,7 @@ class Results:
                 shown = f"**{shown}**" if method in best[metric] else shown
                 cells.append(f"{shown} [{three(span[0])}, {three(span[1])}]" if intervals and span else shown)
             lines.append(f"| {method} | " + " | ".join(cells) + " |")
-        return "\n".join(lines) + "\n\n" + "  \n".join(_footnotes(chosen)) + "\n"
+        return "\n".join(lines) + "\n\n" + "  \n".join(self._footnotes(chosen)) + "\n"
 
     def _chosen(self, metrics: Sequence[str] | None) -> list[str]:
         """Metrics to show: those asked for, else the main ones that were measured, else all."""
@@ -201,7 +164,24 @@ class Results:
             if unknown:
                 raise ValueError(f"no metric {', '.join(unknown)} in these results; they have {', '.join(measured)}")
             return list(metrics)
-        return [m for m in MAIN if m in measured] or measured
+        return [m for m in measured if self.column(m).main] or measured
+
+    def _title(self, metric: str) -> str:
+        shown = self.column(metric)
+        return shown.title + ARROWS[shown.better]
+
+    def _footnotes(self, metrics: list[str]) -> list[str]:
+        shown: dict[str, str] = {}
+        for metric in metrics:
+            whole = self.column(metric.partition("@")[0])
+            if whole.meaning:
+                shown[whole.title] = f"{whole.title}{f' ({whole.unit})' if whole.unit else ''}: {whole.meaning}."
+        arrows = {self.column(metric).better for metric in metrics}
+        words: dict[Better, str] = {"low": "lower", "high": "higher", "real": "nearer the ground truth"}
+        legend = "; ".join(
+            f"{ARROWS[better].strip()} {text} is better" for better, text in words.items() if better in arrows
+        )
+        return [*shown.values(), *part_notes(metrics), *([legend + "."] if legend else [])]
 
 
 def print_table(
@@ -234,7 +214,7 @@ def print_table(
     for part in parts:
         table = _table(results, part, best, intervals)
         console.print(table, width=_natural_width(table, console), crop=False)
-    for note in _footnotes(chosen):
+    for note in results._footnotes(chosen):
         console.print(Text(note, style="dim"))
 
 
@@ -242,8 +222,10 @@ def _table(results: Results, metrics: list[str], best: dict[str, set[str]], inte
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("method", no_wrap=True)
     for metric in metrics:
-        name = _title(metric).replace(" ", "\n", 1) if "@" in metric else _title(metric)
-        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+        title = results._title(metric)
+        table.add_column(
+            title.replace(" ", "\n", 1) if "@" in metric else title, justify="right", no_wrap=True, vertical="bottom"
+        )
     for method in results.rows:
         cells = [Text(method, style="italic" if method in REFERENCES else "")]
         for metric in metrics:
@@ -258,28 +240,6 @@ def _table(results: Results, metrics: list[str], best: dict[str, set[str]], inte
 
 def _natural_width(table: Table, console: Console) -> int:
     return table.__rich_measure__(console, console.options.update(max_width=10_000)).maximum
-
-
-def _title(metric: str) -> str:
-    shown = column(metric)
-    return shown.title + ARROWS[shown.better]
-
-
-def _footnotes(metrics: list[str]) -> list[str]:
-    shown: dict[str, str] = {}
-    for metric in metrics:
-        at = column(metric.partition("@")[0])
-        if at.meaning:
-            shown[at.title] = f"{at.title}{f' ({at.unit})' if at.unit else ''}: {at.meaning}."
-    arrows = {column(metric).better for metric in metrics}
-    words: dict[Better, str] = {"low": "lower", "high": "higher", "real": "nearer the ground truth"}
-    legend = "; ".join(
-        f"{ARROWS[better].strip()} {text} is better" for better, text in words.items() if better in arrows
-    )
-    horizons = [metric.partition("@")[2] for metric in metrics if "@" in metric]
-    if horizons:
-        shown["@"] = f"A time behind a name, such as {horizons[0]}: mean over frames up to then."
-    return [*shown.values(), *([legend + "."] if legend else [])]
 
 
 def three(value: float) -> str:

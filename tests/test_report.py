@@ -6,13 +6,15 @@ import io
 import json
 import math
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
 from rich.console import Console
+from torchmetrics import Metric, MetricCollection
 
-from magnet.metrics import all_metrics
-from magnet.report import COLUMNS, Results, column, machine, print_table, three
+from magnet.metrics import Column, all_metrics, columns_of
+from magnet.report import Results, machine, print_table, three
 
 
 @pytest.fixture
@@ -56,7 +58,7 @@ def test_the_best_is_marked_and_recordings_do_not_compete(results: Results) -> N
     assert results.best("jitter") == {"magnet"}, "nearest to the recorded value"
     assert results.best("fd halves") == set()
     assert Results({"magnet": {"fd": 1.0}}).best("fd") == set()
-    lines = results.to_markdown(intervals=True).splitlines()
+    lines = results.to_markdown(["fd", "div", "mpjpe", "jitter"], intervals=True).splitlines()
     assert lines[0] == "| method | FD ↓ | DIV ↑ | MPJPE ↓ | jitter → |"
     assert lines[2] == "| magnet | **0.283** | **2.91** | **0.205** [0.190, 0.223] | **9.10** |"
     assert "FD (m²)" in results.to_markdown() and "↓ lower is better" in results.to_markdown()
@@ -88,16 +90,79 @@ def test_bad_files_and_metrics_are_named(results: Results, tmp_path: Path) -> No
         results.to_markdown(["speed"])
 
 
-def test_main_metrics_of_the_project_are_known_to_the_table() -> None:
-    """A metric that is renamed would silently fall out of the table."""
-    metrics = all_metrics(30.0)
+@pytest.fixture(scope="module")
+def measured() -> dict[str, float]:
+    """Everything that the project measures of five seconds of two people."""
+    metrics = all_metrics(30.0, confidence=0.9)
     generator = torch.Generator().manual_seed(0)
     truth = torch.randn(3, 150, 2, 22, 3, generator=generator)
     generated = truth + 0.1 * torch.randn(2, 3, 150, 2, 22, 3, generator=generator)
     metrics.update(generated, truth, torch.ones(3, 2, dtype=torch.bool))
-    measured = {name.partition("@")[0] for name in metrics.compute()}
-    assert {name for name in COLUMNS if name != "fd halves"} <= measured
-    assert column("mpjpe@2s").title == "MPJPE 2s" and column("novel").title == "novel"
+    return {name: float(value) for name, value in metrics.compute().items()}
+
+
+def test_every_metric_of_the_project_says_how_it_is_shown(measured: dict[str, float]) -> None:
+    results = Results({"magnet": measured})
+    shown = {name: results.column(name) for name in results.metrics}
+    assert all(column.meaning for column in shown.values()), [name for name in shown if not shown[name].meaning]
+    assert len({column.title for column in shown.values()}) == len(shown), "two numbers under one title"
+    unmeasured = set(columns_of(all_metrics())) - set(shown)
+    assert unmeasured <= {"fd_velocity"}, "a metric describes a number that it does not have"
+
+
+def test_the_short_table_holds_the_papers_seven_and_what_shows_people_together(measured: dict[str, float]) -> None:
+    short = Results({"magnet": measured})._chosen(None)
+    assert {"fd", "div", "mi", "fs", "ip_ratio", "mpjpe", "mpjve"} <= set(short)
+    assert {"fd_pair", "facing", "behind", "hand_contact", "depth_p99"} <= set(short)
+    assert len(short) <= 14
+
+
+def test_parts_of_a_number_are_said_in_words(measured: dict[str, float]) -> None:
+    results = Results({"magnet": measured})
+    titles = {
+        "mpjpe@2s": ("MPJPE 2s", "up to 2 s"),
+        "fd_pair@second3": ("FD pair second 3", "within second 3"),
+        "turn_rate@agent1": ("turning agent 1", "of agent 1"),
+    }
+    for name, (title, meaning) in titles.items():
+        assert name in measured
+        assert results.column(name).title == title and results.column(name).meaning.endswith(meaning)
+    notes = results.to_markdown([*titles, "mpjpe@1s", "fd_pair@second1"])
+    assert "| FD pair second 3 ↓ |" in notes
+    for said in ("such as 2s: over the frames up to then", "such as second 3: over", "such as agent 1: of that slot"):
+        assert notes.count(said) == 1
+    assert results.column("novel") == Column("novel", "", "", "")
+
+
+class Bounce(Metric):
+    """Somebody else's metric, which knows nothing of this package but how numbers are described."""
+
+    columns: ClassVar[dict[str, Column]] = {"bounce": Column("bounce", "m", "high", "how high people jump", main=True)}
+
+    def update(self, *batch: object) -> None: ...
+
+    def compute(self) -> dict[str, torch.Tensor]:
+        return {"bounce": torch.tensor(0.25), "silent": torch.tensor(1.0)}
+
+
+def test_somebody_elses_metric_shows_itself(tmp_path: Path) -> None:
+    metrics = MetricCollection({"bounce": Bounce(), "DIV": all_metrics()["DIV"]}, compute_groups=False)
+    rows = {"ours": {"bounce": 0.25, "silent": 1.0, "div": 2.0}, "theirs": {"bounce": 0.5, "silent": 2.0, "div": 1.0}}
+    results = Results(rows, columns=columns_of(metrics))
+    assert results._chosen(None) == ["bounce", "div"] and results.best("bounce") == {"theirs"}
+    assert results.best("silent") == set()
+    text = results.to_markdown()
+    assert "| bounce ↑ |" in text and "bounce (m): how high people jump." in text
+    back = Results.load_json(results.save_json(tmp_path / "results.json"))
+    assert back.to_markdown() == text
+
+
+def test_results_from_before_metrics_described_themselves_are_read(results: Results, tmp_path: Path) -> None:
+    path = results.save_json(tmp_path / "results.json")
+    content = json.loads(path.read_text())
+    del content["columns"]
+    path.write_text(json.dumps(content))
+    assert Results.load_json(path).to_markdown() == results.to_markdown()
 
 
 def test_machine_facts_are_json_ready() -> None:

@@ -8,45 +8,68 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
+from magnet.metrics.bearing import PartnerBearing, TurnRate, bearing, turn_rate
+from magnet.metrics.body_depth import BodyDepth
+from magnet.metrics.columns import Better, Column, column, columns_of
 from magnet.metrics.diversity import Diversity, diversity
-from magnet.metrics.frechet import FrechetDistance, frechet_distance
+from magnet.metrics.floor import Floating, GroundPenetration, lowest_foot
+from magnet.metrics.frechet import FrechetBySecond, FrechetDistance, frechet_distance
 from magnet.metrics.futures import Futures
+from magnet.metrics.hand_contact import HandContact, hand_distance, hand_points
 from magnet.metrics.interaction import MotionInteraction, pearson
 from magnet.metrics.interval import bootstrap_interval
 from magnet.metrics.jitter import Jitter, jitter
-from magnet.metrics.partners import HandsHeld, PartnerDistance, hand_distance, partner_distance
+from magnet.metrics.partners import PartnerDistance, partner_distance
 from magnet.metrics.penetration import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.position_error import PositionError, joint_error
 from magnet.metrics.skating import FootSkating, toe_steps
+from magnet.metrics.standing import StandingToes
+from magnet.metrics.token_borders import TokenBorders
 from magnet.metrics.velocity_error import VelocityError, velocity_error
 
 __all__ = [
+    "Better",
+    "BodyDepth",
     "ClipMeans",
+    "Column",
     "Diversity",
+    "Floating",
     "FootSkating",
+    "FrechetBySecond",
     "FrechetDistance",
     "Futures",
-    "HandsHeld",
+    "GroundPenetration",
+    "HandContact",
     "Interpenetration",
     "Jitter",
     "MotionInteraction",
     "MotionMetric",
+    "PartnerBearing",
     "PartnerDistance",
     "PositionError",
+    "StandingToes",
+    "TokenBorders",
+    "TurnRate",
     "VelocityError",
     "all_metrics",
+    "bearing",
     "bootstrap_interval",
+    "column",
+    "columns_of",
     "diversity",
     "frechet_distance",
     "ground_truth_metrics",
     "hand_distance",
+    "hand_points",
     "jitter",
     "joint_error",
+    "lowest_foot",
     "partner_distance",
     "pearson",
     "penetration_depth",
     "segment_distance",
     "toe_steps",
+    "turn_rate",
     "velocity_error",
 ]
 
@@ -63,7 +86,9 @@ def all_metrics(fps: float = 30.0, scored: Tensor | None = None, confidence: flo
     return MetricCollection(
         {
             "FD": FrechetDistance(fps=fps, agents=scored),
-            "FD pair": FrechetDistance("pair", fps=fps, agents=scored),
+            "FD pair": FrechetBySecond("pair", fps=fps, agents=scored),
+            "FD own pose": FrechetDistance("canonical_joints", fps=fps, agents=scored),
+            "FD own velocity": FrechetDistance("own_velocity", fps=fps, agents=scored),
             "DIV": Diversity(**means),
             **_of_motion(fps, "generated", scored, confidence),
             "MPJPE": PositionError(fps, **means),
@@ -90,7 +115,14 @@ def _of_motion(fps: float, of: Of, scored: Tensor | None, confidence: float | No
         "MI": MotionInteraction(of=of, agents=scored),
         "FS": FootSkating(fps, **means),
         "IP": Interpenetration(**means),
-        "jitter": Jitter(fps, **means),
-        "hands": HandsHeld(**means),
+        "depth": BodyDepth(**means),
+        "bearing": PartnerBearing(**means),
+        "turning": TurnRate(fps, of=of, agents=scored),
+        "hands": HandContact(fps, **means),
         "distance": PartnerDistance(of=of, agents=scored),
+        "floating": Floating(**means),
+        "ground": GroundPenetration(**means),
+        "toes": StandingToes(fps, **means),
+        "jitter": Jitter(fps, **means),
+        "borders": TokenBorders(of=of, agents=scored),
     }

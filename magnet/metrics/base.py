@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import bootstrap_interval
 
@@ -33,8 +34,12 @@ class MotionMetric(Metric):
     full_state_update = False
     is_differentiable = False
 
+    columns: ClassVar[Mapping[str, Column]] = {}
+    """How its numbers are shown, by name; for `fd@second3` the entry of `fd` is read."""
+
     def __init__(self, of: Of = "generated", agents: Tensor | None = None) -> None:
         super().__init__()
+        self._empty: dict[str, Tensor] = {}  # states that are lists, as they are without a batch
         self.of = of
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
 
@@ -54,6 +59,38 @@ class MotionMetric(Metric):
 
     def add_sum(self, name: str, *shape: int) -> None:
         self.add_state(name, default=torch.zeros(*shape, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def add_list(self, name: str, empty: Tensor) -> None:
+        """A state of tensors to be joined end to end; `empty` is one of no length, with their shape and dtype."""
+        self.add_state(name, default=[], dist_reduce_fx="cat")
+        self._empty[name] = empty
+
+    def add_keyed(self, name: str, *shape: int) -> None:
+        """Sums under whole numbers that are not known beforehand: seconds, slots, pairs of slots."""
+        self.add_list(f"{name}_keys", torch.zeros(0, dtype=torch.int64))
+        self.add_list(name, torch.zeros(0, *shape, dtype=torch.float64))
+
+    def take(self, name: str, keys: Tensor, values: Tensor) -> None:
+        """Add to the sums of `add_keyed`. (N,) int, (N, *shape); a key may come twice."""
+        before, sums = self.keyed(name)
+        folded = _folded(torch.cat([before, keys]), torch.cat([sums, values.to(sums.dtype)]))
+        setattr(self, f"{name}_keys", [folded[0]])
+        setattr(self, name, [folded[1]])
+
+    def keyed(self, name: str) -> tuple[Tensor, Tensor]:
+        """Keys met, in order, and the sum under each. -> (K,) int, (K, *shape) float64"""
+        self._fill(f"{name}_keys", name)
+        return _folded(dim_zero_cat(getattr(self, f"{name}_keys")), dim_zero_cat(getattr(self, name)))
+
+    def sync(self, *args: object, **kwargs: object) -> None:
+        # torchmetrics would send a float32 vector for a process that saw no clip, which does not fit the others'.
+        self._fill(*self._empty)
+        super().sync(*args, **kwargs)  # type: ignore[arg-type]
+
+    def _fill(self, *names: str) -> None:
+        for name in names:
+            if isinstance(state := getattr(self, name), list) and not state:
+                state.append(self._empty[name].to(self.device))
 
 
 class ClipMeans(MotionMetric):
@@ -80,7 +117,7 @@ class ClipMeans(MotionMetric):
         self.confidence = confidence
         self.add_sum("total", len(self.names))
         self.add_sum("count", len(self.names))
-        self.add_state("clips", default=[], dist_reduce_fx="cat")
+        self.add_list("clips", torch.zeros(0, len(self.names), 2, dtype=torch.float64))
 
     @abstractmethod
     def measure(self, futures: Futures) -> Sequence[tuple[Tensor, Tensor]]:
@@ -93,12 +130,6 @@ class ClipMeans(MotionMetric):
         self.total += clips[..., 0].sum(dim=0)
         self.count += clips[..., 1].sum(dim=0)
 
-    def sync(self, *args: object, **kwargs: object) -> None:
-        # torchmetrics would send a float32 vector for a process that saw no clip, which does not fit the others'.
-        if isinstance(self.clips, list) and not self.clips:
-            self.clips.append(self.total.new_zeros(0, len(self.names), 2))
-        super().sync(*args, **kwargs)  # type: ignore[arg-type]
-
     def compute(self) -> dict[str, Tensor]:
         result = {}
         for k, name in enumerate(self.names):
@@ -110,6 +141,12 @@ class ClipMeans(MotionMetric):
                 low, high = bootstrap_interval(clips[:, 0], clips[:, 1], self.confidence)
                 result |= {f"{name}_low": low, f"{name}_high": high}
         return result
+
+
+def _folded(keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Each key once, with the sum of its values. (N,), (N, ...) -> (K,), (K, ...)"""
+    unique, place = keys.unique(return_inverse=True)
+    return unique, values.new_zeros(len(unique), *values.shape[1:]).index_add_(0, place, values)
 
 
 def clip_sums(values: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 
 
@@ -21,6 +25,9 @@ class Diversity(ClipMeans):
     """
 
     higher_is_better = True
+    columns: ClassVar[Mapping[str, Column]] = {
+        "div": Column("DIV", "m²", "high", "variance over the samples of a scene", main=True)
+    }
 
     def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
         super().__init__(["div"], of, agents, confidence)

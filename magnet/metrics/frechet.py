@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
-from magnet.motion.frames import from_planar, inverse, partners
+from magnet.metrics.own_frame import joint_canonical_frame, seen_from
+from magnet.motion.frames import partners
 
-Features = Literal["world_joints", "canonical_joints", "velocity", "pair"]
+Features = Literal["world_joints", "canonical_joints", "velocity", "own_velocity", "pair"]
 
 FEATURES = 63
 
@@ -39,54 +42,52 @@ def moments(count: Tensor, total: Tensor, outer: Tensor) -> tuple[Tensor, Tensor
     return mean, (outer - count * torch.outer(mean, mean)) / (count - 1)
 
 
-def joint_canonical_frame(joints: Tensor) -> Tensor:
-    """Frame on the ground under the pelvis, its x axis along the line through the hips. (..., 22, 3) -> (..., 4, 4)
-
-    Joints alone do not give the pelvis's rotation, so this is near `magnet.motion`'s frame, not equal to it.
-    """
-    left = joints[..., 1, :] - joints[..., 2, :]
-    return from_planar(torch.atan2(-left[..., 2], left[..., 0]), joints[..., 0, [0, 2]])
-
-
-def seen_from(T_world_self: Tensor, joints: Tensor) -> Tensor:
-    """World joints in another frame. (..., 4, 4), (..., J, 3) -> (..., J, 3)"""
-    T_self_world = inverse(T_world_self)
-    return joints @ T_self_world[..., :3, :3].transpose(-1, -2) + T_self_world[..., None, :3, 3]
-
-
 def pose_features(joints: Tensor, features: Features, fps: float = 30.0) -> Tensor:
     """What is compared, 63 numbers each. (..., T, P, 22, 3) -> (..., T, P, 63); see `FrechetDistance`.
 
-    `velocity` has T - 1 frames; `pair` has (..., T, P, P - 1, 63).
+    `velocity` and `own_velocity` have T - 1 frames; `pair` has (..., T, P, P - 1, 63).
     """
     if features == "world_joints":
         chosen = joints
     elif features == "velocity":
         chosen = joints.diff(dim=-4) * fps
+    elif features == "own_velocity":
+        R_world_self = joint_canonical_frame(joints[..., 1:, :, :, :])[..., :3, :3]
+        chosen = joints.diff(dim=-4) * fps @ R_world_self
     elif features == "canonical_joints":
         chosen = seen_from(joint_canonical_frame(joints), joints)
     elif features == "pair":
         partner = joints[..., partners(joints.shape[-3], joints.device), :, :]
         chosen = seen_from(joint_canonical_frame(joints)[..., None, :, :], partner)
     else:
-        raise ValueError(f"features={features!r}: expected world_joints, canonical_joints, velocity or pair")
+        raise ValueError(f"features={features!r}: expected {', '.join(get_args(Features))}")
     return without_pelvis(chosen).flatten(-2)
 
 
 class FrechetDistance(MotionMetric):
-    """`fd` in m^2 (`velocity`: (m/s)^2): all frames, agents, samples and clips pooled, no encoder, no z-score.
+    """`fd` in m^2 (velocities: (m/s)^2): all frames, agents, samples and clips pooled, no encoder, no z-score.
 
     The default reads world coordinates, as the paper does, so it depends on where scenes are placed: a
     shift of 1 m costs 21. Report it beside the value of real motion against real motion. With fewer than
     some hundred independent frames the covariance is poor and the distance too large.
 
     Args:
-        features: `world_joints`; `canonical_joints`, each body in its own frame; `velocity`;
-            `pair`, each partner's body in one's own frame. All but the first are named
-            `fd_<features>` and do not change when the world is moved, `velocity` when it is shifted.
+        features: `world_joints`; `canonical_joints`, each body in its own frame; `velocity`; `own_velocity`, turned
+            into the frame that one has behind the step; `pair`, each partner's body in one's own frame. All but the
+            first are named `fd_<features>` and do not change when the world is moved, `velocity` when it is shifted.
     """
 
     higher_is_better = False
+
+    columns: ClassVar[Mapping[str, Column]] = {
+        "fd": Column(
+            "FD", "m²", "low", "distance between the distributions of generated and recorded poses", main=True
+        ),
+        "fd_canonical_joints": Column("FD own pose", "m²", "low", "FD of each body in its own frame"),
+        "fd_velocity": Column("FD velocity", "m²/s²", "low", "FD of velocities in the world"),
+        "fd_own_velocity": Column("FD own velocity", "m²/s²", "low", "FD of velocities in one's own frame"),
+        "fd_pair": Column("FD pair", "m²", "low", "FD of the partner's body as seen from one's own frame", main=True),
+    }
 
     count: Tensor  # (2,) generated and truth
     sum: Tensor  # (2, 63)
@@ -113,15 +114,19 @@ class FrechetDistance(MotionMetric):
         counts = self._counts(futures)
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
             features = pose_features(joints, self.features, self.fps)
-            kept = features[counts]
-            self.count[which] += len(kept)
-            self.sum[which] += kept.sum(dim=0)
-            self.outer[which] += kept.T @ kept
+            self.pool(which, features, counts)
+
+    def pool(self, which: int, features: Tensor, counts: Tensor) -> None:
+        """Take one motion's features into the sums. (B, T, ..., 63), and which of them count: (B, T, ...) bool"""
+        kept = features[counts]
+        self.count[which] += len(kept)
+        self.sum[which] += kept.sum(dim=0)
+        self.outer[which] += kept.T @ kept
 
     def _counts(self, futures: Futures) -> Tensor:
         """Which features are pooled: (B, T, P), (B, T - 1, P) or (B, T, P, P - 1) bool"""
         if self.features != "pair":
-            return futures.spans(2 if self.features == "velocity" else 1)
+            return futures.spans(2 if "velocity" in self.features else 1)
         partner = partners(futures.present.shape[1], futures.present.device)
         both = futures.present[:, :, None] & futures.present[:, partner]
         return both[:, None] & (futures.scored[..., None] | futures.scored[..., partner])
@@ -131,3 +136,49 @@ class FrechetDistance(MotionMetric):
             return {}
         generated, truth = (moments(self.count[i], self.sum[i], self.outer[i]) for i in range(2))
         return {self.name: frechet_distance(*generated, *truth, jitter=self.jitter)}
+
+
+class FrechetBySecond(FrechetDistance):
+    """`fd_<features>` over all frames, and `fd_<features>@second1`, `@second2` and so on over one second each.
+
+    Both distributions are of that second alone, so a second is compared with the same second of the recording. A
+    step belongs to the second in which it ends. A second of few frames is as unsure as any FD of few frames.
+    """
+
+    seconds: list[Tensor]  # of (N, 2, 64, 64) by second: sums of products of (1, features), generated and truth
+
+    def __init__(
+        self,
+        features: Features = "pair",
+        fps: float = 30.0,
+        jitter: float = JITTER,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+    ) -> None:
+        super().__init__(features, fps, jitter, of, agents)
+        self.add_keyed("seconds", 2, FEATURES + 1, FEATURES + 1)
+
+    def pool(self, which: int, features: Tensor, counts: Tensor) -> None:
+        frame = torch.arange(features.shape[1]) + (1 if "velocity" in self.features else 0)
+        second = (frame / self.fps).long()
+        keys = second.unique()
+        sums = features.new_zeros(len(keys), 2, FEATURES + 1, FEATURES + 1)
+        for n, key in enumerate(keys):
+            inside = (second == key).to(features.device)
+            kept = features[:, inside][counts[:, inside]]
+            kept = torch.cat([torch.ones_like(kept[:, :1]), kept], dim=-1)
+            sums[n, which] = kept.T @ kept
+        self.take("seconds", keys.to(features.device), sums)
+        whole = sums[:, which].sum(dim=0)
+        self.count[which] += whole[0, 0]
+        self.sum[which] += whole[0, 1:]
+        self.outer[which] += whole[1:, 1:]
+
+    def compute(self) -> dict[str, Tensor]:
+        result = super().compute()
+        for second, sums in zip(*self.keyed("seconds"), strict=True):
+            if bool((sums[:, 0, 0] >= 2).all()):
+                made, truth = (moments(s[0, 0], s[0, 1:], s[1:, 1:]) for s in sums)
+                distance = frechet_distance(*made, *truth, jitter=self.jitter)
+                result[f"{self.name}@second{int(second) + 1}"] = distance
+        return result

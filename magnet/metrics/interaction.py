@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
-
-MAX_AGENTS = 8
 
 STILL = 1e-5
 """A coordinate whose deviation is under this share of its root mean square is constant."""
@@ -65,26 +65,31 @@ class MotionInteraction(MotionMetric):
 
     higher_is_better = False
 
-    sums: Tensor  # (2, Q, 63, 6) pooled: generated and truth
-    clip_totals: Tensor  # (2, Q, 2) per clip: sum of correlations, and how many
+    columns: ClassVar[Mapping[str, Column]] = {
+        "mi": Column("MI", "", "low", "error of the correlation between people", main=True),
+        "mi_generated": Column("MI made", "", "real", "correlation between people"),
+        "mi_truth": Column("MI real", "", "", "correlation between people in the recording"),
+        "mi_left_out": Column("MI still", "", "", "how many coordinates were constant and are not in MI"),
+    }
+
+    sums: list[Tensor]  # of (Q, 2, 63, 6) by pair of slots: generated and truth
+    clip_totals: list[Tensor]  # of (Q, 2, 2) by pair of slots: sum of correlations inside clips, and how many
     still: Tensor
 
     def __init__(self, per_clip: bool = False, of: Of = "generated", agents: Tensor | None = None) -> None:
         super().__init__(of, agents)
         self.per_clip = per_clip
-        pairs = MAX_AGENTS * (MAX_AGENTS - 1) // 2
         if per_clip:
-            self.add_sum("clip_totals", 2, pairs, 2)
+            self.add_keyed("clip_totals", 2, 2)
             self.add_sum("still", 1)
         else:
-            self.add_sum("sums", 2, pairs, 63, 6)
+            self.add_keyed("sums", 2, 63, 6)
 
     def add(self, futures: Futures) -> None:
         first, second, counts = futures.pairs()
-        if futures.truth.shape[2] > MAX_AGENTS:
-            raise ValueError(f"{futures.truth.shape[2]} agent slots; correlations are kept for up to {MAX_AGENTS}")
-        # Numbered so that two slots keep their place whatever the number of slots of a batch.
-        place = second * (second - 1) // 2 + first
+        # Numbered so that two slots keep their number whatever the number of slots of a batch.
+        pair = second * (second - 1) // 2 + first
+        taken = futures.truth.new_zeros(len(pair), 2, *((2,) if self.per_clip else (63, 6)))
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
             x, y = paired_coordinates(joints, first, second)
             sums = correlation_sums(x, y, counts[..., None], dim=1)  # (B, Q, 63, 6)
@@ -94,27 +99,30 @@ class MotionInteraction(MotionMetric):
                 moves = correlation.moves & some
                 value = torch.where(moves, correlation.value, 0.0)
                 totals = torch.stack([value.sum(dim=(0, 2)), moves.sum(dim=(0, 2)).double()], dim=-1)
-                self.clip_totals[which, place] += totals
+                taken[:, which] += totals
                 self.still += (~correlation.moves & some).sum()
             else:
-                self.sums[which, place] += sums.sum(dim=0)
+                taken[:, which] += sums.sum(dim=0)
+        self.take("clip_totals" if self.per_clip else "sums", pair, taken)
 
     def compute(self) -> dict[str, Tensor]:
         if self.per_clip:
-            total, count = self.clip_totals.unbind(-1)
-            both = (count > 0).all(dim=0)
-            values = (total / count.clamp(min=1))[:, both]
+            total, count = self.keyed("clip_totals")[1].unbind(-1)  # (Q, 2)
+            both = (count > 0).all(dim=1)
+            values = (total / count.clamp(min=1))[both]
             left_out = self.still[0].clone()
         else:
-            correlation = pearson(self.sums)  # (2, Q, 63)
-            seen = self.sums[0, :, 0, 0] > 0
-            moves = correlation.moves.all(dim=0)  # (Q, 63)
+            sums = self.keyed("sums")[1]
+            correlation = pearson(sums)  # (Q, 2, 63)
+            seen = sums[:, 0, 0, 0] > 0
+            moves = correlation.moves.all(dim=1)  # (Q, 63)
             both = moves.any(dim=-1)
-            values = torch.where(moves, correlation.value, 0.0).sum(dim=-1)[:, both] / moves[both].sum(dim=-1)
+            value = torch.where(moves[:, None], correlation.value, 0.0).sum(dim=-1)
+            values = value[both] / moves[both].sum(dim=-1, keepdim=True)
             left_out = (~moves[seen]).sum().double()
         if not bool(both.any()):
             return {"mi_left_out": left_out}
-        generated, truth = values.mean(dim=1)
+        generated, truth = values.mean(dim=0)
         return {
             "mi": (truth - generated).abs(),
             "mi_generated": generated,

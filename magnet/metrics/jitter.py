@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 
 
@@ -15,6 +19,8 @@ def jitter(joints: Tensor, fps: float = 30.0) -> Tensor:
 
 class Jitter(ClipMeans):
     """`jitter` in 10 m/s^3; to be read beside the ground truth's, which is not 0."""
+
+    columns: ClassVar[Mapping[str, Column]] = {"jitter": Column("jitter", "10 m/s³", "real", "mean third difference")}
 
     def __init__(
         self,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 
 FOREARMS = (7, 8)
@@ -51,10 +55,10 @@ def segment_distance(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     return torch.stack([inner, *ends]).amin(dim=0)
 
 
-def penetration_depth(joints: Tensor, partner: Tensor, touch: float = TOUCH) -> Tensor:
+def penetration_depth(joints: Tensor, partner: Tensor, touch: float = TOUCH, forearms: bool = False) -> Tensor:
     """How deep each capsule of one body is in each of another. (N, 22, 3) x 2 -> (N, 13, 13) metres
 
-    Forearm against forearm, and depths below `touch`, are 0.
+    Depths below `touch` are 0, and so is forearm against forearm unless asked for.
     """
     from magnet.body.capsules import capsule_segments
 
@@ -65,11 +69,12 @@ def penetration_depth(joints: Tensor, partner: Tensor, touch: float = TOUCH) -> 
     centres = torch.cdist((a + b) / 2, (c + d) / 2, compute_mode="donot_use_mm_for_euclid_dist")
     halves = ((b - a).norm(dim=-1)[:, :, None] + (d - c).norm(dim=-1)[:, None]) / 2
     near = centres - halves <= reach - touch + 1e-9
-    near[:, FOREARMS[0] : FOREARMS[1] + 1, FOREARMS[0] : FOREARMS[1] + 1] = False
+    if not forearms:
+        near[:, FOREARMS[0] : FOREARMS[1] + 1, FOREARMS[0] : FOREARMS[1] + 1] = False
     n, i, j = near.nonzero(as_tuple=True)
     found = reach[i, j] - segment_distance(a[n, i], b[n, i], c[n, j], d[n, j])
     depth = torch.zeros_like(centres)
-    depth[n, i, j] = torch.where(found >= touch, found, 0.0)
+    depth[n, i, j] = torch.where(found >= touch, found.clamp(min=0.0), 0.0)
     return depth
 
 
@@ -82,6 +87,11 @@ class Interpenetration(ClipMeans):
     """
 
     higher_is_better = False
+    columns: ClassVar[Mapping[str, Column]] = {
+        "ip_ratio": Column("IP", "", "low", "share of frames in which people run through each other", main=True),
+        "ip_mean_total_depth": Column("IP depth", "m", "low", "summed depth of penetration, mean over all frames"),
+        "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
+    }
 
     def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
         super().__init__(["ip_ratio", "ip_mean_total_depth", "ip_mean_max_depth"], of, agents, confidence)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
+
+MEANING = "distance to the recorded joints, mean over samples"
 
 
 def joint_error(generated: Tensor, truth: Tensor) -> Tensor:
@@ -24,6 +28,11 @@ class PositionError(ClipMeans):
     """
 
     higher_is_better = False
+    columns: ClassVar[Mapping[str, Column]] = {
+        "mpjpe": Column("MPJPE", "m", "low", MEANING, main=True),
+        "mpjpe@1s": Column("MPJPE 1s", "m", "low", f"{MEANING}, up to 1 s", main=True),
+        "mpjpe_best": Column("MPJPE best", "m", "low", "distance to the recorded joints, best sample"),
+    }
 
     def __init__(
         self,

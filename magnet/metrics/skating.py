@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 
 TOES = (10, 11)
@@ -41,6 +43,12 @@ class FootSkating(ClipMeans):
     """
 
     higher_is_better = False
+    columns: ClassVar[Mapping[str, Column]] = {
+        "fs": Column("FS", "m/s", "low", "speed of standing toes that slide", main=True),
+        "fs_ratio": Column("FS ratio", "", "low", "share of toe steps that slide"),
+        "fs_contact": Column("contact", "", "real", "share of toe steps that stand"),
+        "fs_contacts": Column("contacts", "", "", "number of toe steps that stand"),
+    }
 
     def __init__(
         self,

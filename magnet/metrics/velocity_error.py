@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from torch import Tensor
 
 from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.position_error import joint_error
 
@@ -23,6 +27,9 @@ class VelocityError(ClipMeans):
     """
 
     higher_is_better = False
+    columns: ClassVar[Mapping[str, Column]] = {
+        "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities", main=True)
+    }
 
     def __init__(
         self,
@@ -34,6 +41,8 @@ class VelocityError(ClipMeans):
     ) -> None:
         super().__init__(["mpjve"], of, agents, confidence)
         self.scale = fps if per_second else 1.0
+        if per_second:
+            self.columns = {name: shown._replace(unit="m/s") for name, shown in self.columns.items()}  # type: ignore[misc]
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         error = velocity_error(futures.generated, futures.truth) * self.scale

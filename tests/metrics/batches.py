@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from magnet.metrics import FrechetDistance, MotionInteraction, all_metrics
+from magnet.metrics import FrechetBySecond, FrechetDistance, MotionInteraction, all_metrics
 
 Batch = tuple[Tensor, Tensor, Tensor]
 
@@ -28,6 +29,22 @@ def draw_batch(scenes: int = 3, people: int = 3, samples: int = 4, frames: int =
         truth[::2, :, -1] = math.nan
         generated[:, ::2, :, -1] = math.nan
     return generated, truth, present
+
+
+def crowd(scenes: int = 3, people: int = 3, samples: int = 2, frames: int = 4) -> tuple[Tensor, Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(1)
+    generated = torch.randn(samples, scenes, frames, people, 22, 3, generator=draw, dtype=torch.float64) * 0.3
+    generated += torch.randn(samples, scenes, frames, people, 1, 3, generator=draw, dtype=torch.float64) * 0.4
+    present = torch.ones(scenes, people, dtype=torch.bool)
+    present[::3, 2:] = False
+    return generated, generated[0], present
+
+
+def gridded(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
+    """Distance of two segments, good to a tenth of a millimetre: the least over points along a-b."""
+    points = a + torch.linspace(0, 1, 501, dtype=a.dtype)[:, None] * (b - a)
+    along = ((points - c) @ (d - c) / ((d - c) @ (d - c))).clamp(0, 1)
+    return float((points - c - along[:, None] * (d - c)).norm(dim=-1).min())
 
 
 def result(metric: Metric, *batch: Tensor, agents: Tensor | None = None) -> dict[str, float]:
@@ -73,6 +90,7 @@ def every_metric() -> dict[str, Callable[[], Metric]]:
     makers: dict[str, Callable[[], Metric]] = {
         f"FD {f}": lambda f=f: FrechetDistance(f) for f in ("canonical_joints", "velocity")
     }
+    makers["FD of velocities by second"] = lambda: FrechetBySecond("velocity", fps=8.0)
     makers["MI per clip"] = lambda: MotionInteraction(per_clip=True)
     for name in all_metrics():
         makers[str(name)] = lambda name=name: all_metrics()[name]
@@ -80,3 +98,15 @@ def every_metric() -> dict[str, Callable[[], Metric]]:
 
 
 EVERY = pytest.mark.parametrize("make", every_metric().values(), ids=every_metric().keys())
+
+
+def pair_places(batch: Batch, choose: Choose) -> list[tuple[int, int, int, int]]:
+    """Scene, frame and two people, wherever a pair counts: both there, at least one of them scored."""
+    _, truth, present = batch
+    B, T, P = truth.shape[:3]
+    counts = scored(batch, choose)
+    return [
+        (b, t, p, q)
+        for b, t, (p, q) in itertools.product(range(B), range(T), itertools.combinations(range(P), 2))
+        if present[b, p] and present[b, q] and (counts[b][t][p] or counts[b][t][q])
+    ]

@@ -12,7 +12,7 @@ from magnet.body.capsules import CAPSULES
 from magnet.metrics import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.penetration import FOREARMS
 
-from .batches import WHO, Choose, scored
+from .batches import WHO, Choose, crowd, gridded, scored
 
 
 def brute_force(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
@@ -91,22 +91,6 @@ def test_segment_distance_in_single_precision_keeps_a_tenth_of_a_millimetre(kind
     got = segment_distance(*(x.float() for x in ends)).double()
     scale = max(float(x.abs().max()) for x in ends)
     torch.testing.assert_close(got, segment_distance(*ends), atol=1e-4 * max(1.0, scale / 100), rtol=0)
-
-
-def crowd(scenes: int = 3, people: int = 3, samples: int = 2, frames: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    draw = torch.Generator().manual_seed(1)
-    generated = torch.randn(samples, scenes, frames, people, 22, 3, generator=draw, dtype=torch.float64) * 0.3
-    generated += torch.randn(samples, scenes, frames, people, 1, 3, generator=draw, dtype=torch.float64) * 0.4
-    present = torch.ones(scenes, people, dtype=torch.bool)
-    present[::3, 2:] = False
-    return generated, generated[0], present
-
-
-def gridded(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
-    """As `brute_force`, quicker and good to a tenth of a millimetre: the least over points along a-b."""
-    points = a + torch.linspace(0, 1, 501, dtype=a.dtype)[:, None] * (b - a)
-    along = ((points - c) @ (d - c) / ((d - c) @ (d - c))).clamp(0, 1)
-    return float((points - c - along[:, None] * (d - c)).norm(dim=-1).min())
 
 
 @WHO

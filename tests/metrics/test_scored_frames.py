@@ -38,7 +38,9 @@ def test_what_was_given_makes_no_difference_but_to_its_neighbours(make: Callable
     garbage = torch.where(near(agents)[None, ..., None, None], generated, filler)
     assert float(torch.where(there, garbage - generated, 0.0).abs().max()) > 10
     expected = result(make(), generated, truth, present, agents=agents)
-    assert result(make(), garbage, truth, present, agents=agents) == expected
+    got = result(make(), garbage, truth, present, agents=agents)
+    # How long hands hold may depend on frames before and after: test_hand_contact.py.
+    assert {k: v for k, v in got.items() if "hold" not in k} == {k: v for k, v in expected.items() if "hold" not in k}
     assert any(value != 0 for value in expected.values())
 
 

@@ -1,0 +1,76 @@
+"""Whether feet are where the floor is: neither above it for long nor in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from torch import Tensor
+
+from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.columns import Column
+from magnet.metrics.futures import Futures
+
+FEET = (7, 8, 10, 11)
+"""Ankles and balls of the feet."""
+
+
+def lowest_foot(joints: Tensor) -> Tensor:
+    """Height over the floor y = 0 of the lowest joint of either foot. (..., 22, 3) -> (...) metres"""
+    return joints[..., FEET, 1].amin(dim=-1)
+
+
+class Floating(ClipMeans):
+    """`floating`: share of a person's frames with both feet over `above` metres; `floating_height`: how high then.
+
+    The height is that of the lowest joint of the feet, mean over the frames that float. Who jumps floats too, so both
+    are read beside the recording's. The ball of a standing foot lies 2 to 3 cm high.
+    """
+
+    columns: ClassVar[Mapping[str, Column]] = {
+        "floating": Column("floating", "", "real", "share of frames with both feet over 6 cm"),
+        "floating_height": Column("float height", "m", "real", "how high the lowest foot is where both are over 6 cm"),
+    }
+
+    def __init__(
+        self,
+        above: float = 0.06,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["floating", "floating_height"], of, agents, confidence)
+        self.above = above
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        height = lowest_foot(futures.generated)  # (S, B, T, P)
+        floats = height > self.above
+        return [clip_sums(floats.double(), futures.scored), clip_sums(height, floats & futures.scored)]
+
+
+class GroundPenetration(ClipMeans):
+    """`ground_penetration`: share of frames in which a joint of somebody's foot is over `below` metres under the floor.
+
+    `ground_penetration_depth` is how deep the deepest one is, mean over these frames.
+    """
+
+    higher_is_better = False
+    columns: ClassVar[Mapping[str, Column]] = {
+        "ground_penetration": Column("in the floor", "", "low", "share of frames with a foot over 2 cm in the floor"),
+        "ground_penetration_depth": Column("floor depth", "m", "low", "how deep a foot is in the floor where it is"),
+    }
+
+    def __init__(
+        self,
+        below: float = 0.02,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+    ) -> None:
+        super().__init__(["ground_penetration", "ground_penetration_depth"], of, agents, confidence)
+        self.below = below
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        depth = -lowest_foot(futures.generated)
+        under = depth > self.below
+        return [clip_sums(under.double(), futures.scored), clip_sums(depth, under & futures.scored)]

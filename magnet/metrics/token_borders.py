@@ -1,0 +1,72 @@
+"""Whether the joints between tokens show: motion made in tokens must not jerk where one ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.columns import Column
+from magnet.metrics.futures import Futures
+from magnet.motion.tokens import STRIDE
+
+ORDERS = {"border_acceleration": 2, "border_jerk": 3}
+
+
+def pelvis_difference(joints: Tensor, order: int) -> Tensor:
+    """Length of the pelvis's second or third difference. (..., T, P, 22, 3) -> (..., T - order, P) metres"""
+    return joints[..., 0, :].diff(n=order, dim=-3).norm(dim=-1)
+
+
+def at_borders(frames: int, order: int, stride: int = STRIDE) -> Tensor:
+    """Which differences have frames of two tokens; the first token begins at frame 0. -> (frames - order,) bool"""
+    first = torch.arange(max(frames - order, 0))
+    return first // stride != (first + order) // stride
+
+
+class TokenBorders(MotionMetric):
+    """`border_acceleration` and `border_jerk`: the pelvis's at token borders, divided by those inside tokens.
+
+    Mean length of the second and third difference over differences with frames of two tokens, and of one alone. The
+    future begins with a token. Recorded motion knows of no tokens and has about 1.
+
+    Args:
+        stride: frames in a token.
+    """
+
+    columns: ClassVar[Mapping[str, Column]] = {
+        "border_acceleration": Column(
+            "border acc.", "", "real", "pelvis's acceleration at token borders against inside"
+        ),
+        "border_jerk": Column("border jerk", "", "real", "pelvis's jerk at token borders against inside"),
+    }
+
+    sums: Tensor  # (2, 2, 2) acceleration and jerk, inside and at borders, total and count
+
+    def __init__(self, stride: int = STRIDE, of: Of = "generated", agents: Tensor | None = None) -> None:
+        super().__init__(of, agents)
+        if stride < 4:
+            raise ValueError(f"stride={stride}: a jerk spans 4 frames, so tokens of at least 4 have an inside")
+        self.stride = stride
+        self.add_sum("sums", 2, 2, 2)
+
+    def add(self, futures: Futures) -> None:
+        for n, order in enumerate(ORDERS.values()):
+            if futures.frames <= order:
+                continue
+            length = pelvis_difference(futures.generated, order)  # (S, B, T - order, P)
+            counts = futures.spans(order + 1)
+            border = at_borders(futures.frames, order, self.stride).to(counts.device)[:, None]
+            for where, there in enumerate((counts & ~border, counts & border)):
+                self.sums[n, where, 0] += torch.where(there, length, 0.0).sum()
+                self.sums[n, where, 1] += there.sum() * futures.samples
+
+    def compute(self) -> dict[str, Tensor]:
+        result = {}
+        for name, (inside, border) in zip(ORDERS, self.sums, strict=True):
+            if bool((self.sums[..., 1] > 0).all()) and inside[0] > 0:
+                result[name] = (border[0] / border[1]) / (inside[0] / inside[1])
+        return result
