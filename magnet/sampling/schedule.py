@@ -249,13 +249,8 @@ class MaskSchedule:
             )
         require_whole("block", block, 1, grid.window)
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
-<<<<<<< HEAD
         plan = token_levels(grid)
-        turns = torch.arange(grid.steps + int(delay.max()) + 1)[:, None] - delay  # (rows, P)
-=======
-        plan = ddim_levels(grid.steps, grid.shift)
         starts = [*delay.unique().tolist(), grid.steps + int(delay.max())]
->>>>>>> f1eb7d2 (Turn-taking samples the joint distribution at every offset)
         level, stages = initial_levels(known), []
         for first, last in runs(target, block):
             past = grid.window - grid.stride
@@ -264,25 +259,11 @@ class MaskSchedule:
             now = slice(first - start, last - start)
             active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
             active[now] = target[first:last]
-<<<<<<< HEAD
-            plans = levels_at(plan, turns[:, None], start, stop)
-            rows = changing(torch.where(active, plans, level[start:stop]))
-            hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
-            if unseen is not None:
-                hidden[:, now] = unseen[:, None]
-            if not lookahead:
-                hidden[:, last - start :] = True
-            hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
-            stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
-            level[start:stop] = rows[-1]
-=======
             for begins, ends in pairwise(starts):
                 turns = torch.arange(begins, ends + 1)[:, None] - delay  # (rows, P)
-                rows = torch.where(active, plan[turns.clamp(0, grid.steps)][:, None], level[start:stop])
-                changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
-                if not changes.any():  # whoever starts here has nothing to generate in this block
+                rows = changing(torch.where(active, levels_at(plan, turns[:, None], start, stop), level[start:stop]))
+                if len(rows) == 1:  # whoever starts here has nothing to generate in this block
                     continue
-                rows = torch.cat([rows[:1], rows[1:][changes]])
                 hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
                 if unseen is not None:
                     hidden[:, now] = unseen[:, None]
@@ -292,5 +273,4 @@ class MaskSchedule:
                 hidden |= active & (rows[-1] == LEVELS)
                 stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
                 level[start:stop] = rows[-1]
->>>>>>> f1eb7d2 (Turn-taking samples the joint distribution at every offset)
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
