@@ -35,8 +35,9 @@ class MotionDataModule(LightningDataModule):
         max_agents: slots P of every batch; smaller scenes leave slots empty (paper 4, 2 to 4 people).
         mirror: mirror every other training window, left and right exchanged (paper A.4.1).
         shuffle_agents: random order of slots, empty ones included, in every training window (paper A.4.1).
-        drop_agent: probability that a training scene of two or more loses one person (paper 4: agents are
-            randomly masked during training).
+        drop_agent: probability that a training scene of two or more loses somebody (paper 4: p agents are
+            randomly masked during training; it does not say how often).
+        drop_at_most: the most people that such a scene loses; how many is drawn evenly, and never everybody.
         compose: probability that a second, independent clip's people join a training scene where slots are
             free, which makes scenes of three and four (ours); has no effect with two slots.
         compose_apart: shortest and longest distance in metres between the two groups' centres, drawn evenly.
@@ -73,6 +74,7 @@ class MotionDataModule(LightningDataModule):
         mirror: bool = True,
         shuffle_agents: bool = True,
         drop_agent: float = 0.1,
+        drop_at_most: int = 1,
         compose: float = 0.25,
         compose_apart: tuple[float, float] = (1.6, 3.5),
         compose_clearance: float = 0.9,
@@ -102,6 +104,7 @@ class MotionDataModule(LightningDataModule):
             mirror=0.5 if mirror else 0.0,
             shuffle=shuffle_agents,
             drop=drop_agent,
+            drop_at_most=drop_at_most,
             compose=compose,
             apart=(compose_apart[0], compose_apart[1]),
         )

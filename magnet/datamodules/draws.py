@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.checks import require_whole
 from magnet.datamodules.windows import Draw, Ints, Store, all_starts, spaced_starts
 from magnet.seeding import derive
 
@@ -21,6 +23,7 @@ class Augmentation:
     mirror: float = 0.5
     shuffle: bool = True
     drop: float = 0.0
+    drop_at_most: int = 1
     compose: float = 0.0
     apart: tuple[float, float] = (1.6, 3.5)
 
@@ -28,6 +31,7 @@ class Augmentation:
         for name, share in {"mirror": self.mirror, "drop_agent": self.drop, "compose": self.compose}.items():
             if not 0 <= share <= 1:
                 raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
+        require_whole("drop_at_most", self.drop_at_most, 1)
 
 
 def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Floats:
@@ -122,8 +126,9 @@ class RandomDraws:
         members, groups = seat(people[a], joining, people[b], (u[:, 5] * people[b]).astype(np.int64), slots)
 
         total = people[a] + joining
-        drop = np.flatnonzero((u[:, 6] < augment.drop) & (total >= 2))
-        members[drop, (u[drop, 7] * total[drop]).astype(np.int64)] = -1
+        for scene in np.flatnonzero((u[:, 6] < augment.drop) & (total >= 2)):
+            share = u[scene, 6] / augment.drop  # uniform again, among the scenes that lose somebody
+            members[scene, dropped(int(total[scene]), augment.drop_at_most, share, u[scene, 7])] = -1
         if augment.shuffle:
             order = u[:, self.COLUMNS :].argsort(axis=1, kind="stable")
             members, groups = np.take_along_axis(members, order, 1), np.take_along_axis(groups, order, 1)
@@ -148,6 +153,17 @@ def seat(first: Ints, joining: Ints, second: Ints, turn: Ints, slots: int) -> tu
     later = slot - first[:, None]
     members = np.where(later < joining[:, None], (later + turn[:, None]) % second[:, None], -1)
     return np.where(later < 0, slot, members), (later >= 0).astype(np.int64)
+
+
+def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
+    """Who of so many people is masked: 1 to `at_most` of them, each number equally likely, but never everybody.
+
+    share, which: uniform numbers in [0, 1), for how many and for who.
+    """
+    limit = min(at_most, people - 1)
+    count = min(1 + int(share * limit), limit)
+    groups = list(itertools.combinations(range(people), count))
+    return list(groups[int(which * len(groups))])
 
 
 def without_empty_groups(draw: Draw) -> Draw:

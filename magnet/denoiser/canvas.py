@@ -154,7 +154,7 @@ class Canvas:
         layout, statistics = self.model.layout, self.model.statistics
         first, stop = int(rows[0]), int(rows[-1]) + 1
         latent, steps, relations = layout.unpack(statistics.restore(canvas[:, first:stop]))
-        if self.options.requantise:
+        if self.model.quantised if self.options.requantise is None else self.options.requantise:
             new = finished[first:stop].to(canvas.device)
             code = self.model.tokenizer.requantise(latent)
             self.health.add_snap(latent, code, new & self.given.present[:, None])

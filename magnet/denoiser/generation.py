@@ -42,7 +42,8 @@ class SamplerOptions:
             reference), `anchor`, or `fuse` (ours).
         trust: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
             (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
-        requantise: snap generated latents to the nearest code before decoding, as the reference does.
+        requantise: snap generated latents to the nearest code before they are decoded and built on, as the reference
+            does. None: if codes are what the model was trained to generate (`target` of the denoiser).
         paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
@@ -59,7 +60,7 @@ class SamplerOptions:
     rolling: int | None = None
     placement: Placement = "fuse"
     trust: float = 0.02
-    requantise: bool = True
+    requantise: bool | None = None
     paste: bool = True
     blend: int = 10
     eta: float = 1.0

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout, by_frame, relations_by_frame
+from magnet.sampling.noise import alpha_bar
+
+Weighting = Literal["uniform", "min_snr"]
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -16,14 +21,29 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 
-def token_losses(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor) -> dict[str, Tensor]:
+def snr_weights(levels: Tensor, most: float) -> Tensor:
+    """Weight of a predicted clean number by its noise level: min(SNR, `most`), SNR = a / (1 - a) of a = `alpha_bar`.
+
+    The min-SNR weighting for a network that predicts x0 (Hang et al. 2023, Efficient diffusion training via min-SNR
+    weighting strategy, Sec. 3.4, with `most` 5): what noise has drowned cannot be told, and at SNR 0 counts nothing.
+    levels (...) int -> (...)
+    """
+    signal = alpha_bar(levels)
+    return (signal / (1 - signal).clamp_min(1e-12)).clamp_max(most)
+
+
+def token_losses(
+    clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, weights: Tensor | None = None
+) -> dict[str, Tensor]:
     """Huber loss of each part of a token, each part averaged by itself (Eq. 9, 10).
 
     clean, truth (B, N, P, D) normalised; there (B, N, P, 1 + slots) bool, which groups speak of people
-    who are there in valid frames. 512 latent numbers against 36 P transforms: one common mean would
-    drown the transforms.
+    who are there in valid frames; weights (B, N, P, 1 + slots) of each group's error, None: all 1. 512 latent numbers
+    against 36 P transforms: one common mean would drown the transforms.
     """
     error = F.smooth_l1_loss(clean, truth, reduction="none")
+    if weights is not None:
+        error = error * layout.spread(weights)
     latent, steps, relations = layout.unpack(error)
     losses = {
         "latent": masked_mean(latent, there[..., :1]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import lightning as L
 import torch
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from magnet import weights
 from magnet.body import Body, load_body
+from magnet.checks import require_number
 from magnet.denoiser import stream as streaming
-from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
-from magnet.denoiser.levels import NoiseLevels, draw_levels
-from magnet.denoiser.losses import consistency_losses, token_losses
-from magnet.denoiser.own_past import with_own_past
+from magnet.denoiser.levels import NoiseLevels
+from magnet.denoiser.losses import Weighting
+from magnet.denoiser.objective import training_losses
 from magnet.denoiser.statistics import Statistics
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
@@ -25,9 +25,10 @@ from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.optim import adamw_cosine
 from magnet.precision import dtype_of
-from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.module import RawPose, Tokenizer
+
+Target = Literal["quantised", "continuous"]
 
 
 class Denoiser(L.LightningModule):
@@ -52,11 +53,18 @@ class Denoiser(L.LightningModule):
             Table A.5).
         agent_embedding: False takes the agents' identities away (ablation, paper Table A.5).
         relations: False takes pairwise transforms out of the tokens (ablation, paper Table 5).
+        causal_block: token steps of a block of attention: a token sees blocks up to its own, so that what is finished
+            is not changed by what is not (ours). 0: everything sees everything, as in the paper.
+        target: what of the pose is generated: `quantised`, the tokenizer's codes, as in the paper, or `continuous`,
+            its encoder's latents before they are snapped to codes (ours); sampling follows.
         relation_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
             `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
         noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
             `mixture` (ours: these and the patterns that sampling asks about).
         level_shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
+        weighting: how much a token's error counts by its noise: `uniform`, as in the paper, or `min_snr`; see
+            `magnet.denoiser.losses.snr_weights`.
+        snr_most: gamma of `min_snr`, the most that an error counts.
         own_past: share of the scenes with a past whose past is shown as the model would have made it (ours).
         latent_weight: lambda_0 of paper Eq. 10.
         step_weight: lambda_1 of paper Eq. 10.
@@ -92,9 +100,13 @@ class Denoiser(L.LightningModule):
         rope: Rope = "hidden",
         agent_embedding: bool = True,
         relations: bool = True,
+        causal_block: int = 0,
+        target: Target = "quantised",
         relation_noise: Literal["noisier_end", "token"] = "noisier_end",
         noise_levels: NoiseLevels = "per_token",
         level_shift: float = 1.0,
+        weighting: Weighting = "uniform",
+        snr_most: float = 5.0,
         own_past: float = 0.0,
         latent_weight: float = 1.0,
         step_weight: float = 1.0,
@@ -114,6 +126,10 @@ class Denoiser(L.LightningModule):
         seed: int = 1111,
     ) -> None:
         super().__init__()
+        for name, value, kind in (("target", target, Target), ("weighting", weighting, Weighting)):
+            if value not in get_args(kind):
+                raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(kind))}")
+        require_number("snr_most", snr_most, over=0)
         self.save_hyperparameters()
         self.window = window
         self.tokenizer: Tokenizer | RawPose
@@ -144,7 +160,13 @@ class Denoiser(L.LightningModule):
             slot_width=h.slot_width,
             rope=h.rope,
             agent_embedding=h.agent_embedding,
+            causal_block=h.causal_block,
         )
+
+    @property
+    def quantised(self) -> bool:
+        """Whether latents are codes, in training and so in sampling."""
+        return bool(self.hparams["target"] == "quantised")
 
     @property
     def built(self) -> bool:
@@ -200,12 +222,12 @@ class Denoiser(L.LightningModule):
     # -- what the model does -------------------------------------------------------------------
 
     def encode(self, scene: Scene) -> Tensor:
-        """Quantised latents of those present; frames that are not valid are not looked at. -> (B, N, P, C) float32
+        """Latents of those present, codes if `quantised`; invalid frames are not looked at. -> (B, N, P, C) float32
 
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         """
-        people = self.tokenizer.encode_scene(scene.people().held(STRIDE)).float()[:, 1:-1, 0]
+        people = self.tokenizer.encode_scene(scene.people().held(STRIDE), self.quantised).float()[:, 1:-1, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -294,33 +316,10 @@ class Denoiser(L.LightningModule):
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    def _losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
-        h: Any = self.hparams
-        with torch.no_grad():
-            tokens, there = self.tokenize(scene)
-            truth = self.statistics.normalise(tokens)
-            B, N, P, _ = truth.shape
-            levels = draw_levels(h.noise_levels, B, N, P, generator, h.level_shift)
-            noise = torch.randn(truth.shape, generator=generator, device=truth.device)
-            shown = truth
-            if self.training and h.own_past:
-                shown = with_own_past(self, truth, levels, scene.pad_agents(P), h.own_past, generator)
-            noisy = add_noise(shown, noise, self.layout.spread(self.layout.group_levels(levels)))
-        clean = self.denoise(noisy, levels, scene.pad_agents(P).present).float()
-        losses = token_losses(clean, truth, self.layout, there)
-        total = h.latent_weight * losses["latent"] + h.step_weight * losses["step"]
-        if self.layout.slots:
-            rotation, translation = consistency_losses(self.statistics.restore(clean), self.layout, there)
-            losses["consistency"] = rotation + translation
-            ramp = min(1.0, (self.global_step + 1) / max(h.consistency_warmup, 1)) if self.training else 1.0
-            total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
-        if any(h[f"{name}_weight"] for name in BODY_LOSSES):
-            bodies = decoded_losses(self, clean, tokens, levels, scene.pad_agents(P), there, self._require_body())
-            total = total + sum(h[f"{name}_weight"] * value for name, value in bodies.items())
-            losses |= bodies
-        return {"loss": total, **losses}
+    _losses = training_losses
 
-    def _require_body(self) -> Body:
+    def require_body(self) -> Body:
+        """The body whose joints decoded losses compare, on this model's device."""
         if not self._body:
             datamodule = getattr(self._trainer, "datamodule", None)
             # A copy, because this one moves to the model's device.

@@ -67,7 +67,8 @@ def with_own_past(
             present=scene.present[few],
         )
         T_world_can = torch.where(own[..., None, None], placed, T_world_can)
-        made = model.statistics.normalise(layout.pack(model.tokenizer.requantise(latent), *transforms(T_world_can)))
+        latent = model.tokenizer.requantise(latent) if model.quantised else latent
+        made = model.statistics.normalise(layout.pack(latent, *transforms(T_world_can)))
     moved = past[..., None]
     if layout.slots:  # a pairwise transform moves with either of its ends, where it is shown at all
         either = past[..., None] | past[..., partners(layout.agents, past.device)]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from magnet.checks import require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
 
@@ -35,6 +36,15 @@ def rotate(x: Tensor, time: Tensor, base: float = 10_000.0) -> Tensor:
     return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
 
 
+def block_causal(time: Tensor, size: int) -> Tensor:
+    """Whom each token sees where time comes in blocks of `size` steps: those of its own block and of earlier ones.
+
+    time (L,) int -> (L, L) bool, row: who looks, column: at whom
+    """
+    block = time // size
+    return block[:, None] >= block[None, :]
+
+
 class Block(nn.Module):
     """Post-norm transformer encoder block: self-attention over all tokens of a scene, then a GELU MLP."""
 
@@ -54,13 +64,13 @@ class Block(nn.Module):
         self.norm_mlp = nn.LayerNorm(width)
         self.drop = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, time: Tensor) -> Tensor:
-        """x (B, L, d), time (L,) -> (B, L, d)"""
+    def forward(self, x: Tensor, time: Tensor, sees: Tensor | None = None) -> Tensor:
+        """x (B, L, d), time (L,), sees (L, L) bool, whom each one sees; None: everybody -> (B, L, d)"""
         query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         if self.rope_heads:
             query, key = rotate(query, time), rotate(key, time)
         dropout = self.dropout if self.training else 0.0
-        looked = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)
+        looked = F.scaled_dot_product_attention(query, key, value, attn_mask=sees, dropout_p=dropout)
         x = self.norm_attention(x + self.drop(self.out(looked.transpose(1, 2).flatten(-2))))
         return self.norm_mlp(x + self.drop(self.mlp(x)))
 
@@ -81,6 +91,8 @@ class Transformer(nn.Module):
         rope: `hidden` rotates the embedded token once (paper Table A.2), `heads` rotates queries and keys
             (usual practice), `none` leaves time out (paper Table A.5).
         agent_embedding: False leaves the agent's identity out (paper Table A.5).
+        causal_block: token steps of a block; a token sees blocks up to its own, and all of that one, whoever's.
+            0: everything sees everything, as in the paper.
     """
 
     def __init__(
@@ -96,10 +108,13 @@ class Transformer(nn.Module):
         slot_width: int = 32,
         rope: Rope = "hidden",
         agent_embedding: bool = True,
+        causal_block: int = 0,
     ) -> None:
         super().__init__()
+        require_whole("causal_block", causal_block, 0)
         self.layout = layout
         self.rope = rope
+        self.causal_block = causal_block
         self.level_width = level_width
         self.slot_width = slot_width
         self.agent = nn.Parameter(torch.randn(layout.agents, agent_width) * 0.02) if agent_embedding else None
@@ -145,9 +160,10 @@ class Transformer(nn.Module):
             slots = slots_in_use[rows[:, 0], :size]
             y = x[rows, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
             time = torch.arange(x.shape[1], device=x.device).repeat_interleave(size)
+            sees = block_causal(time, self.causal_block) if self.causal_block else None
             if self.rope == "hidden":
                 y = y + rotate(y, time)
             for block in self.blocks:
-                y = block(y, time)
+                y = block(y, time, sees)
             finished[rows, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
         return finished

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import pose_features
+from magnet.motion.frames import canonical_frame, pose_features, posed
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, scene_steps
 from magnet.tokenizer.codebook import sum_over_processes
@@ -71,3 +71,19 @@ def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
     if not result or not all(mean.isfinite().all() for mean, _ in result.values()):
         raise ValueError("statistics: nobody is present in the scenes given, or they hold NaN; check the data")
     return result
+
+
+def put(pose: Tensor, scene: Scene) -> Scene:
+    """Decoded poses where everybody's canonical frames are in a scene. pose (B, T, P, 135)"""
+    with torch.autocast(pose.device.type, enabled=False):
+        return posed(pose, canonical_frame(scene.T_world_root), scene)
+
+
+def fold(x: Tensor) -> Tensor:
+    """Every agent a sequence of its own. (B, T, P, ...) -> (B P, T, ...)"""
+    return x.transpose(1, 2).flatten(0, 1)
+
+
+def unfold(x: Tensor, agents: int) -> Tensor:
+    """(B P, T, ...) -> (B, T, P, ...)"""
+    return x.unflatten(0, (-1, agents)).transpose(1, 2)

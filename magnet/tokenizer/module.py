@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
-from magnet.motion.frames import POSE_FEATURES, canonical_frame, posed
+from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
 from magnet.optim import adamw_cosine
@@ -21,7 +21,7 @@ from magnet.seeding import derive
 from magnet.tokenizer.augment import drift, exchange_limbs, turn_joints
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
 from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
-from magnet.tokenizer.features import Features, features, statistics, step_known
+from magnet.tokenizer.features import Features, features, fold, put, statistics, step_known, unfold
 from magnet.tokenizer.losses import masked_mean, matrices, proper, reconstruction_losses
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_level
@@ -119,7 +119,9 @@ class Tokenizer(L.LightningModule):
 
     # -- using it ------------------------------------------------------------------------------
 
-    def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
+    def encode(
+        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantise: bool = True
+    ) -> Tensor:
         """Quantised latents, summed over levels.
 
         Args:
@@ -127,11 +129,13 @@ class Tokenizer(L.LightningModule):
             betas: (B, P, 10).
             steps: (B, T, P, 9), the identity at the first frame.
             valid: (B, T) bool, frames that may be looked at; None: all.
+            quantise: False: the encoder's latents as they are.
 
         Returns:
             (B, N, P, C) float32.
         """
-        return self.codebook.nearest(self._embed(pose, betas, steps, valid))
+        embedded = self._embed(pose, betas, steps, valid)
+        return self.codebook.nearest(embedded) if quantise else embedded.float()
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
         """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
@@ -154,17 +158,17 @@ class Tokenizer(L.LightningModule):
         """The code nearest to each latent; with several levels, their sum. (..., C) -> same"""
         return self.codebook.nearest(latent)
 
-    def encode_scene(self, scene: Scene) -> Tensor:
-        """Quantised latents of a scene, cut to whole tokens; frames that are not valid are not looked at."""
+    def encode_scene(self, scene: Scene, quantise: bool = True) -> Tensor:
+        """Latents of a scene, cut to whole tokens; frames that are not valid are not looked at."""
         seen = features(scene)
-        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
+        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid, quantise)
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
         scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
         seen = features(scene)
         latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
-        return _put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
+        return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
 
     def _embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
         """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
@@ -175,15 +179,15 @@ class Tokenizer(L.LightningModule):
         if valid is not None:
             known = torch.stack([valid, step_known(valid)], dim=-1)
         known = known.repeat_interleave(P, dim=0)
-        vectors = self.vqvae.encode(_fold(pose), betas.flatten(0, 1), _fold(steps), known)
-        return _unfold(vectors, P)
+        vectors = self.vqvae.encode(fold(pose), betas.flatten(0, 1), fold(steps), known)
+        return unfold(vectors, P)
 
     def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
         P = latent.shape[2]
         known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
-        pose = self.vqvae.decode(_fold(latent), betas.flatten(0, 1), _fold(steps), known)
+        pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
         with torch.autocast(pose.device.type, enabled=False):
-            return proper(_unfold(pose, P))
+            return proper(unfold(pose, P))
 
     # -- statistics and start ------------------------------------------------------------------
 
@@ -311,7 +315,7 @@ class Tokenizer(L.LightningModule):
         canonical frame given, and with pelvis position and turn taken out."""
         body = self._require_body()
         scene = scene.cut(0, pose.shape[1])
-        decoded = _put(pose, scene)
+        decoded = put(pose, scene)
         world = body.joints(decoded) - body.joints(scene)
         still = torch.eye(4, device=pose.device)
         betas = scene.betas[:, None]
@@ -386,18 +390,3 @@ class Tokenizer(L.LightningModule):
 
 def _fields() -> list[str]:
     return list(inspect.signature(Tokenizer.__init__).parameters)[1:]
-
-
-def _put(pose: Tensor, scene: Scene) -> Scene:
-    with torch.autocast(pose.device.type, enabled=False):
-        return posed(pose, canonical_frame(scene.T_world_root), scene)
-
-
-def _fold(x: Tensor) -> Tensor:
-    """Every agent a sequence of its own. (B, T, P, ...) -> (B P, T, ...)"""
-    return x.transpose(1, 2).flatten(0, 1)
-
-
-def _unfold(x: Tensor, agents: int) -> Tensor:
-    """(B P, T, ...) -> (B, T, P, ...)"""
-    return x.unflatten(0, (-1, agents)).transpose(1, 2)

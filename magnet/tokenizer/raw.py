@@ -31,7 +31,9 @@ class RawPose(nn.Module):
         """z-scores from scenes; until then the latent is the plain pose."""
         self.pose.set(*statistics(scenes)["pose"])
 
-    def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
+    def encode(
+        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantise: bool = True
+    ) -> Tensor:
         """(B, T, P, 135) -> (B, N, P, 540); the rest is not read."""
         return by_token(self.pose(pose)).flatten(-2)
 
@@ -43,7 +45,7 @@ class RawPose(nn.Module):
         """There is no codebook: the same latent."""
         return latent
 
-    def encode_scene(self, scene: Scene) -> Tensor:
+    def encode_scene(self, scene: Scene, quantise: bool = True) -> Tensor:
         """-> (B, N, P, 540)"""
         seen = features(scene)
         return self.encode(seen.pose, seen.betas, seen.steps)

@@ -9,6 +9,7 @@ import torch
 
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules import Clip, Mixed
+from magnet.datamodules.draws import dropped
 from magnet.motion.scene import concatenate
 from magnet.testing import random_scene
 
@@ -143,6 +144,34 @@ def test_dropping_one_leaves_the_others_as_they_were() -> None:
     assert lost[trios].float().mean().item() == pytest.approx(0.4, abs=0.1)
     left = fewer.present
     assert torch.equal(fewer.T_world_root.transpose(1, 2)[left], whole.T_world_root.transpose(1, 2)[left])
+
+
+def test_several_people_can_be_dropped_each_number_and_everybody_equally_often() -> None:
+    """Paper 4: p agents are masked. Of four with at most three lost, each of the 4 + 6 + 4 choices; never all."""
+    options = {**PLAIN, "max_agents": 4, "window_frames": 4, "drop_agent": 0.6, "drop_at_most": 3}
+    options |= {"epoch_size": 4096, "batch_size": 512}
+    there = one_epoch(FakeData([random_clip("four", 64, 4)], **options)).present
+    lost = 4 - there.sum(dim=1)
+    shares = torch.bincount(lost, minlength=5).double() / len(lost)
+    torch.testing.assert_close(shares, torch.tensor([0.4, 0.2, 0.2, 0.2, 0.0]).double(), atol=0.03, rtol=0)
+    for count, choices in ((1, 4), (2, 6), (3, 4)):
+        groups, times = there[lost == count].unique(dim=0, return_counts=True)
+        assert len(groups) == choices
+        assert (times / times.sum() - 1 / choices).abs().max() < 0.05
+
+
+def test_dropping_one_at_most_is_dropping_one() -> None:
+    """The draws of a run that was begun before there could be several stay what they were."""
+    for people in (2, 3, 5):
+        for which in (0.0, 0.3, 0.6, 0.999):
+            assert dropped(people, 1, 0.7, which) == [int(which * people)]
+
+
+def test_everybody_is_never_dropped() -> None:
+    assert {len(dropped(2, 9, share, 0.5)) for share in (0.0, 0.5, 0.999, 1.0)} == {1}
+    assert {len(dropped(4, 2, share, 0.5)) for share in (0.0, 0.49, 0.5, 1.0)} == {1, 2}
+    with pytest.raises(ValueError, match="drop_at_most: got 0, expected at least 1"):
+        FakeData([], drop_at_most=0)
 
 
 def test_half_of_the_windows_are_mirror_images() -> None:

@@ -1,6 +1,9 @@
+import math
+
+import pytest
 import torch
 
-from magnet.denoiser.losses import consistency_losses, token_losses
+from magnet.denoiser.losses import consistency_losses, snr_weights, token_losses
 from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, pairwise, propagated
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
@@ -73,3 +76,28 @@ def test_steps_and_relations_have_finite_gradients_at_zero():
 def test_canonical_steps_are_what_the_first_frame_starts_from(scene: Scene):
     steps = canonical_steps(canonical_frame(scene.T_world_root))
     assert torch.equal(steps[:, 0], torch.eye(4).expand_as(steps[:, 0]))
+
+
+# -- min-SNR weights -----------------------------------------------------------------------------
+
+
+def test_min_snr_weights_are_the_signal_to_noise_ratio_and_no_more_than_asked_for():
+    """By the paper's cosine, written out: SNR(k) = a / (1 - a), a = cos^2 at k over that at 0."""
+    levels = torch.arange(0, 1001, 50)
+    for level, weight in zip(levels.tolist(), snr_weights(levels, 5.0).tolist(), strict=True):
+        share = (math.cos((level / 1000 + 0.008) / 1.008 * math.pi / 2) / math.cos(0.008 / 1.008 * math.pi / 2)) ** 2
+        assert weight == pytest.approx(5.0 if share > 5 / 6 else share / (1 - share), rel=1e-3, abs=1e-6)
+    assert snr_weights(torch.tensor(1000), 5.0) == 0
+    assert snr_weights(torch.tensor(0), 7.0) == 7
+
+
+def test_weights_count_each_group_of_a_token_by_its_own(scene: Scene):
+    truth, there = packed(scene), everybody(scene)
+    weights = torch.zeros(*there.shape)
+    weights[:, :, 0, 0], weights[:, :, 1, 2] = 3.0, 0.5
+    losses = token_losses(truth + 2.0, truth, LAYOUT, there, weights)  # Huber of 2 is 1.5
+    assert losses["latent"].item() == pytest.approx(1.5 * 3 / 3)
+    assert losses["step"].item() == pytest.approx(1.5 * 3 / 3)
+    assert losses["relation"].item() == pytest.approx(1.5 * 0.5 / 6)
+    ones = token_losses(truth + 2.0, truth, LAYOUT, there, torch.ones_like(weights))
+    assert ones == token_losses(truth + 2.0, truth, LAYOUT, there)

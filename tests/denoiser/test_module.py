@@ -147,6 +147,10 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
         {"noise_levels": "mixture"},
         {"relation_noise": "token"},
         {"rope": "heads"},
+        {"causal_block": 2},
+        {"target": "continuous"},
+        {"target": "continuous", "own_past": 1.0, "noise_levels": "mixture"},
+        {"weighting": "min_snr"},
     ],
     ids=str,
 )

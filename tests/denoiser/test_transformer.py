@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from magnet.denoiser.transformer import Transformer, rotate
+from magnet.denoiser.transformer import Transformer, block_causal, rotate
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
 
@@ -72,7 +72,8 @@ def test_leaving_absent_agents_out_equals_masking_them(generator):
             y = block(y, time)
         return y.unflatten(1, (6, 4))
 
-    def masked(query, key, value, dropout_p=0.0):
+    def masked(query, key, value, attn_mask=None, dropout_p=0.0):
+        assert attn_mask is None
         return original(query, key, value, attn_mask=mask)
 
     packed = model(noisy, levels, present)
@@ -116,3 +117,56 @@ def test_one_person_alone_is_a_scene(generator):
 def test_heads_must_divide_the_width():
     with pytest.raises(ValueError, match="width 30 must be a multiple"):
         build(width=30, heads=4)
+
+
+# -- attention in causal blocks ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rope", ["hidden", "heads", "none"])
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_a_later_token_changes_no_earlier_block_and_everything_from_its_own_on(generator, size, rope):
+    model = build(causal_block=size, rope=rope)
+    noisy, levels = batch(generator)
+    present = torch.tensor([[True, True, False, True], [True, True, True, True]])
+    plain = model(noisy, levels, present)
+    for step in range(6):
+        other_noisy, other_levels = noisy.clone(), levels.clone()
+        other_noisy[:, step, 1] += 1.0
+        other_levels[:, step, 1] = (levels[:, step, 1] + 500) % LEVELS
+        changed = model(other_noisy, other_levels, present)
+        first = step // size * size
+        assert torch.equal(changed[:, :first], plain[:, :first])
+        for scene in range(2):
+            moved = (changed[scene] != plain[scene]).any(dim=-1)
+            assert moved[first:, present[scene]].all(), (
+                "a block sees all of itself, whoever's tokens, and what is before"
+            )
+
+
+def test_blocks_that_hold_everything_are_full_attention(generator):
+    noisy, levels = batch(generator)
+    present = torch.ones(2, 4, dtype=torch.bool)
+    full = build()(noisy, levels, present)
+    assert torch.allclose(build(causal_block=6)(noisy, levels, present), full, atol=1e-6)
+    assert not torch.allclose(build(causal_block=3)(noisy, levels, present), full, atol=1e-3)
+
+
+def test_a_block_is_what_the_model_says_of_the_clip_that_ends_with_it(generator):
+    """The plain reference: cut off everything behind a block, and what is left is answered alike."""
+    model = build(causal_block=2)
+    noisy, levels = batch(generator)
+    present = torch.ones(2, 4, dtype=torch.bool)
+    whole = model(noisy, levels, present)
+    for stop in (2, 4, 6):
+        prefix = model(noisy[:, :stop], levels[:, :stop], present)
+        assert torch.allclose(prefix, whole[:, :stop], atol=1e-6)
+
+
+def test_whom_a_token_sees_written_out():
+    sees = block_causal(torch.tensor([0, 0, 1, 1, 2, 2]), 2)
+    assert sees.int().tolist() == [[1, 1, 1, 1, 0, 0]] * 4 + [[1, 1, 1, 1, 1, 1]] * 2
+
+
+def test_a_block_of_a_negative_size_is_refused():
+    with pytest.raises(ValueError, match="causal_block: got -1, expected at least 0"):
+        build(causal_block=-1)

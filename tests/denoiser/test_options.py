@@ -1,0 +1,128 @@
+"""Options of the denoiser that the paper does not have: block-causal attention, continuous latents, min-SNR weights."""
+
+import pytest
+import torch
+
+from magnet.denoiser.canvas import Health
+from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.losses import snr_weights
+from magnet.denoiser.module import Denoiser
+from magnet.denoiser.own_past import with_own_past
+from magnet.motion.scene import Scene
+from magnet.tasks import registry
+from magnet.tasks.joint import JointFuture
+from magnet.testing import random_scene, tiny_denoiser
+
+FAST = SamplerOptions(steps=2, stride=2)
+OPTIONS = [{"causal_block": 2}, {"causal_block": 3}, {"target": "continuous"}]
+
+
+@pytest.fixture(scope="module", params=OPTIONS, ids=str)
+def model(request) -> Denoiser:
+    return tiny_denoiser(max_agents=3, window=8, **request.param)
+
+
+@pytest.fixture(scope="module")
+def continuous() -> Denoiser:
+    return tiny_denoiser(max_agents=3, window=8, target="continuous")
+
+
+def generate(
+    model: Denoiser, scene: Scene, task=None, options: SamplerOptions = FAST, context: int = 16, **more
+) -> Scene:
+    generator = torch.Generator().manual_seed(0)
+    return model.generate(scene, task or JointFuture(), context, 40 - context, 1, options, generator, **more)
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_every_task_runs_with_every_option(model: Denoiser, scene: Scene, name: str):
+    made = generate(model, scene, registry.get(name)(), context=0 if name == "generation" else 16)
+    assert made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
+    assert torch.equal(made.T_world_root[made.given], scene.cut(0, 40).T_world_root[made.given])
+
+
+def test_options_come_back_with_a_checkpoint(model: Denoiser, tmp_path):
+    from tests.denoiser.test_module import save
+
+    loaded = Denoiser.load(save(model, tmp_path / "model.ckpt"))
+    assert loaded.transformer.causal_block == model.hparams["causal_block"]
+    assert loaded.quantised == model.quantised
+
+
+def test_checkpoints_of_before_are_as_they_were(tmp_path):
+    """Fields that a checkpoint does not know have the values that reproduce it."""
+    from tests.denoiser.test_module import save
+
+    path = save(tiny_denoiser(), tmp_path / "old.ckpt")
+    checkpoint = torch.load(path, weights_only=True)
+    for name in ("causal_block", "target", "weighting", "snr_most"):
+        del checkpoint["hyper_parameters"][name]
+    torch.save(checkpoint, path)
+    old = Denoiser.load(path)
+    assert (old.transformer.causal_block, old.quantised, old.hparams["weighting"]) == (0, True, "uniform")
+    assert Denoiser.load("duet").transformer.causal_block == 0
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ({"target": "both"}, "target: got 'both', expected quantised or continuous"),
+        ({"weighting": "max"}, "weighting: got 'max', expected uniform or min_snr"),
+        ({"snr_most": 0.0}, "snr_most: got 0, expected a number, over 0|snr_most: got 0, expected over 0"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(field, message):
+    with pytest.raises(ValueError, match=message):
+        Denoiser(**field)
+
+
+# -- quantised or not ----------------------------------------------------------------------------
+
+
+def test_a_continuous_target_is_what_the_encoder_says_before_the_codebook(continuous: Denoiser, scene: Scene):
+    quantised = tiny_denoiser(max_agents=3, window=8)
+    plain, codes = continuous.encode(scene), quantised.encode(scene)
+    assert not torch.equal(plain, codes)
+    assert torch.equal(continuous.tokenizer.requantise(plain), codes)
+
+
+def snaps(model: Denoiser, scene: Scene, **options) -> int:
+    health = Health()
+    generate(model, scene, options=SamplerOptions(steps=2, stride=2, **options), health=health)
+    return health.snaps
+
+
+def test_sampling_snaps_to_codes_where_codes_were_learnt_and_else_when_asked(continuous: Denoiser, scene: Scene):
+    quantised = tiny_denoiser(max_agents=3, window=8)
+    generated = 2 * 6 * 3  # scenes, tokens, people
+    assert snaps(quantised, scene) == generated and snaps(quantised, scene, requantise=False) == 0
+    assert snaps(continuous, scene) == 0 and snaps(continuous, scene, requantise=True) == generated
+
+
+def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
+    scene = random_scene(4, 32, 3, torch.Generator().manual_seed(0))
+    levels = torch.full((4, 8, 3), 700)
+    levels[:, :4] = 0
+    truth = continuous.statistics.normalise(continuous.tokenize(scene)[0])
+    made = with_own_past(continuous, truth, levels, scene, 1.0, torch.Generator().manual_seed(1))
+    latent = continuous.layout.unpack(continuous.statistics.restore(made))[0][:, :4]
+    assert (continuous.tokenizer.requantise(latent) - latent).abs().amax(dim=-1).min() > 1e-3
+
+
+# -- min-SNR -------------------------------------------------------------------------------------
+
+
+def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, monkeypatch):
+    """All at one level: the token losses are the plain ones times that level's weight."""
+    from magnet.denoiser import objective
+
+    plain, weighted = tiny_denoiser(), tiny_denoiser(weighting="min_snr", snr_most=3.0)
+    scene = scene.cut(0, 32)
+    for level in (0, 300, 600, 900, 1000):
+        at = torch.full((2, 8, 3), level)
+        monkeypatch.setattr(objective, "draw_levels", lambda *_, at=at: at)
+        a, b = (model._losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
+        weight = snr_weights(torch.tensor(level), 3.0)
+        for name in ("latent", "step", "relation"):
+            assert torch.allclose(b[name], weight * a[name], rtol=1e-5)
+        assert torch.equal(a["consistency"], b["consistency"])
