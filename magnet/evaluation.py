@@ -49,7 +49,7 @@ class Evaluation:
 
     Args:
         task: what is sampled.
-        samples: scenes drawn for each test scene (paper 4; metrics.md B.0).
+        samples: scenes drawn for each test scene (paper 4: 10).
         options: how they are sampled.
         baselines: also measure nearest neighbour, random sample and held pose, aligned with the context and as found.
         seed: all noise follows from it. A sample's is its own, whatever else is in the batch, so that scores do not

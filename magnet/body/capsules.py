@@ -1,4 +1,4 @@
-"""Thirteen capsules that stand for a body where people might run through each other (metrics.md B.5)."""
+"""Thirteen capsules that stand for a body where people might run through each other (docs/metrics.md)."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""DIV: how far samples of one scene lie apart (metrics.md B.2)."""
+"""DIV: how far samples of one scene lie apart (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FD: distance between the distributions of generated and real poses (metrics.md B.1)."""
+"""FD: distance between the distributions of generated and real poses (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MI: whether agents move with each other as recorded ones do (metrics.md B.3)."""
+"""MI: whether agents move with each other as recorded ones do (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""IP: how much bodies run through each other, as capsules (metrics.md B.5)."""
+"""IP: how much bodies run through each other, as capsules (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MPJPE: mean distance between predicted and true joints (metrics.md B.6)."""
+"""MPJPE: mean distance between predicted and true joints (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FS: how fast feet slide while they stand (metrics.md B.4)."""
+"""FS: how fast feet slide while they stand (docs/metrics.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MPJVE: mean distance between predicted and true joint velocities (metrics.md B.6)."""
+"""MPJVE: mean distance between predicted and true joint velocities (docs/metrics.md)."""
 
 from __future__ import annotations
 
