@@ -30,6 +30,9 @@ REFERENCES = ("ground truth", "training windows", "test halves")
 
 RESULTS_FORMAT = 1
 
+FIRST = ("fd", "div", "mi", "fs", "ip_ratio", "mpjpe@1s", "mpjpe", "mpjve", "fd_pair")
+"""Columns that a short table begins with, in the order of the paper's tables; others follow as they were measured."""
+
 ARROWS: dict[Better, str] = {"low": " ↓", "high": " ↑", "real": " →", "": ""}
 
 
@@ -164,7 +167,8 @@ class Results:
             if unknown:
                 raise ValueError(f"no metric {', '.join(unknown)} in these results; they have {', '.join(measured)}")
             return list(metrics)
-        return [m for m in measured if self.column(m).main] or measured
+        main = [m for m in measured if self.column(m).main]
+        return [m for m in FIRST if m in main] + [m for m in main if m not in FIRST] or measured
 
     def _title(self, metric: str) -> str:
         shown = self.column(metric)

@@ -115,6 +115,8 @@ def test_the_short_table_holds_the_papers_seven_and_what_shows_people_together(m
     assert {"fd", "div", "mi", "fs", "ip_ratio", "mpjpe", "mpjve"} <= set(short)
     assert {"fd_pair", "facing", "behind", "hand_contact", "depth_p99"} <= set(short)
     assert len(short) <= 14
+    papers = ["fd", "div", "mi", "fs", "ip_ratio", "mpjpe", "mpjve"]
+    assert [name for name in short if name in papers] == papers, "in the paper's order"
 
 
 def test_parts_of_a_number_are_said_in_words(measured: dict[str, float]) -> None:
@@ -149,7 +151,7 @@ def test_somebody_elses_metric_shows_itself(tmp_path: Path) -> None:
     metrics = MetricCollection({"bounce": Bounce(), "DIV": all_metrics()["DIV"]}, compute_groups=False)
     rows = {"ours": {"bounce": 0.25, "silent": 1.0, "div": 2.0}, "theirs": {"bounce": 0.5, "silent": 2.0, "div": 1.0}}
     results = Results(rows, columns=columns_of(metrics))
-    assert results._chosen(None) == ["bounce", "div"] and results.best("bounce") == {"theirs"}
+    assert results._chosen(None) == ["div", "bounce"] and results.best("bounce") == {"theirs"}
     assert results.best("silent") == set()
     text = results.to_markdown()
     assert "| bounce ↑ |" in text and "bounce (m): how high people jump." in text
