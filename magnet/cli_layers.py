@@ -27,7 +27,7 @@ class Layer:
     def word(self) -> str:
         """What stands behind `--config` for it: the file, or its options where they are not the file's text."""
         expanded = with_presets(self.options)
-        if expanded == self.options and Path(self.path).is_file() and EXTENDS not in read_yaml(self.path):
+        if Path(self.path).is_file() and read_yaml(self.path) == expanded:
             return self.path
         return json.dumps(expanded)
 

@@ -7,11 +7,9 @@ import difflib
 import inspect
 import re
 import sys
-from itertools import pairwise
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, ClassVar, NoReturn
 
-import yaml
 from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli import wrong_value
@@ -43,6 +41,7 @@ class Parser(LightningArgumentParser):
         self.command = ""
         self.arguments: list[str] = []
         self.classes: dict[str, dict[str, type]] = {}
+        self.chosen: Mapping[str, str] = {}
 
     def format_help(self, *args: Any, **kwargs: Any) -> str:
         """Every option: first what a run has in all cases, then the fields of each class."""
@@ -124,24 +123,11 @@ class Parser(LightningArgumentParser):
     def _flags(self) -> list[str]:
         flags = [flag for action in self._actions for flag in action.option_strings]
         for key, classes in self.classes.items():
-            chosen = self._chosen(key)
+            chosen = self.chosen.get(key)
             for name, kind in classes.items():
-                if chosen in (None, name):
+                if chosen is None or chosen.rpartition(".")[2] == name:
                     flags.extend(f"--{option}" for option in _options(key, kind))
         return flags
-
-    def _chosen(self, key: str) -> str | None:
-        """The class that the command line or a configuration file names for `model`, `data` or `task`."""
-        chosen = None
-        for flag, value in pairwise([*self.arguments, ""]):
-            name, _, joined = flag.partition("=")
-            value = joined or value
-            if name == f"--{key}":
-                chosen = value
-            elif name == "--config" and not value.startswith("{") and Path(value).is_file():  # JSON: a checkpoint's
-                part = (yaml.safe_load(Path(value).read_text()) or {}).get(key)
-                chosen = part.get("class_path", chosen) if isinstance(part, dict) else chosen
-        return chosen and chosen.rpartition(".")[2]
 
 
 def _closest(name: str, known: list[str]) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import logging
 import os
+import sys
 import warnings
 from pathlib import Path
 from typing import Any, Literal
@@ -16,8 +17,9 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from magnet import cli_layers, cli_output, cli_record, cli_stored, weights
+from magnet import cli_classes, cli_layers, cli_output, cli_record, cli_stored, weights
 from magnet.cli import CommandError
+from magnet.cli_layers import Layer
 from magnet.cli_parser import Parser
 from magnet.cli_stored import Arguments
 from magnet.cli_tasks import NamedTask, alias_path, aliases, task_of
@@ -70,7 +72,7 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     quiet()
     given = Arguments.split(arguments)
     if any(flag in ("-h", "--help") for flag in given.flags):
-        MagnetCLI(command, ["--help"], None, Path())
+        MagnetCLI(command, ["--help"], None, Path(), {})
         return 0
     named_classes()
     words = task_words(command, given)
@@ -83,10 +85,13 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         stored = cli_stored.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
         layer = cli_stored.defaults(stored, given, command == "fit", path_of(DATA), keep_data)
-    files = [word for option in given.layers for word in ("--config", option.word())]
     folder = cli_record.run_folder(RUNS / name, out)
     preset, words = sampler_words(command, words)
-    MagnetCLI(command, [*cli_stored.as_argument(layer), *files, *preset, *words], checkpoint, folder)
+    settled = cli_classes.settle([Layer("", layer), *given.layers, Layer("", preset)], words)
+    for note in settled.notes:
+        print(f"magnet: {note}", file=sys.stderr)
+    layers = [word for each in settled.layers if each.options for word in ("--config", each.word())]
+    MagnetCLI(command, [*layers, *words], checkpoint, folder, settled.classes)
     return 0
 
 
@@ -153,17 +158,16 @@ def task_words(command: str, given: Arguments) -> list[str]:
     return ["--task", path, *rest]
 
 
-def sampler_words(command: str, flags: list[str]) -> tuple[list[str], list[str]]:
-    """A preset that `--sampler NAME` asks for, as options before all flags; and the other flags, which beat it.
+def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
 
     Raises:
         CommandError: no such preset.
     """
     name = Arguments(flags).flag("sampler")
     if command not in SAMPLING or name is None or not cli_layers.is_preset(name):
-        return [], flags
-    options = {"sampler": cli_layers.sampler_preset(name)}
-    return cli_stored.as_argument(options), Arguments(flags).without("sampler")
+        return {}, flags
+    return {"sampler": cli_layers.sampler_preset(name)}, Arguments(flags).without("sampler")
 
 
 class MagnetCLI(LightningCLI):
@@ -174,10 +178,14 @@ class MagnetCLI(LightningCLI):
         arguments: what follows it; the checkpoint's own options are already in front.
         checkpoint: to start from.
         folder: of this run.
+        classes: those that the layers and flags name under `model`, `data` and `task`.
     """
 
-    def __init__(self, command: str, arguments: list[str], checkpoint: Path | None, folder: Path) -> None:
+    def __init__(
+        self, command: str, arguments: list[str], checkpoint: Path | None, folder: Path, classes: dict[str, str]
+    ) -> None:
         self.command, self.arguments, self.checkpoint, self.folder = command, arguments, checkpoint, folder
+        self.classes = classes
         self.evaluation: Evaluation | None = None
         self.predicted: list[Any] = []
         self.models, self.data = named_classes()
@@ -206,8 +214,8 @@ class MagnetCLI(LightningCLI):
         """What this project adds to the Trainer's options."""
         assert isinstance(parser, Parser)
         Parser.root, parser.command, parser.arguments = parser, self.command, self.arguments
-        parser.classes = {"model": self.models, "data": self.data}
-        parser.set_defaults({"data": {"class_path": path_of(DATA)}})
+        parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.classes
+        self._default_class(parser, "data", path_of(DATA))
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
         parser.add_argument(
             "--wandb",
@@ -218,12 +226,11 @@ class MagnetCLI(LightningCLI):
         if self.command == "fit":
             parser.link_arguments("data.init_args.max_agents", "model.init_args.max_agents")
             parser.link_arguments("data.init_args.window_frames", "model.init_args.window", cli_stored.tokens)
-        else:
-            parser.set_defaults({"model": {"class_path": path_of(MODELS)}})
+        self._default_class(parser, "model", None if self.command == "fit" else path_of(MODELS))
         if self.command in SAMPLING:
             parser.classes["task"] = self.tasks
             parser.add_subclass_arguments(NamedTask, "task", required=False, instantiate=False)
-            parser.set_defaults({"task": {"class_path": alias_path(DEFAULT_TASK)}})
+            self._default_class(parser, "task", alias_path(DEFAULT_TASK))
             parser.add_class_arguments(SamplerOptions, "sampler")
             parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
             parser.add_class_arguments(Evaluation, skip={"task", "options"}, instantiate=False)
@@ -241,6 +248,16 @@ class MagnetCLI(LightningCLI):
                 default=False,
                 help='open the first scenes in the browser; needs pip install "magnet-motion[view]"',
             )
+
+    def _default_class(self, parser: Parser, key: str, otherwise: str | None) -> None:
+        """Make the class that wins the default, so that no other class's defaults come first."""
+        path = cli_classes.known_path(parser.classes[key], self.classes.get(key, otherwise or ""))
+        try:
+            there = cli_stored.class_named(path) is not None
+        except ImportError:
+            there = False
+        if there or otherwise:  # of a class that is not there the parser says so
+            parser.set_defaults({key: {"class_path": path if there else otherwise}})
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         self.config = parser.parse_args(args)

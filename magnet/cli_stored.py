@@ -8,7 +8,6 @@ keeps go in front of the user's arguments, where whatever comes later wins.
 from __future__ import annotations
 
 import importlib
-import json
 import pickle
 import sys
 import textwrap
@@ -19,7 +18,8 @@ from typing import Any
 
 from magnet import weights
 from magnet.cli import CommandError
-from magnet.cli_layers import Layer, read_layers, read_yaml
+from magnet.cli_classes import class_in_flags, one_class, same_class, spec_of
+from magnet.cli_layers import Layer, read_layers
 from magnet.motion.tokens import STRIDE
 
 Spec = dict[str, Any]
@@ -52,6 +52,7 @@ class Arguments:
                 found.files.append(value if equals else next(rest, ""))
             else:
                 found.flags.append(argument)
+        found.flags = one_class(found.flags)
         found.layers = [layer for file in found.files for layer in read_layers(file)]
         return found
 
@@ -84,10 +85,8 @@ class Arguments:
 
     def class_of(self, key: str) -> str | None:
         """The class that the user asks for under `model`, `data` or `task`."""
-        value = self.flag(f"{key}.class_path") or self.value(key)
-        if isinstance(value, str) and value.endswith((".yaml", ".yml")) and Path(value).is_file():
-            value = read_yaml(value)
-        return value.get("class_path") if isinstance(value, dict) else value
+        named = (spec_of(config.get(key)).get("class_path") for config in reversed(self.configs))
+        return class_in_flags(self.flags, key) or next((name for name in named if name), None)
 
     def without(self, key: str) -> list[str]:
         """The flags, less one and its value."""
@@ -220,13 +219,6 @@ def refuse_linked(given: Arguments) -> None:
             raise CommandError(f"model.{target} follows from the data when a model is trained: set --data.{source}")
 
 
-def same_class(one: str, other: str) -> bool:
-    """Whether two names, short or dotted, mean one class."""
-    if "." in one and "." in other:
-        return one == other
-    return one.rsplit(".", 1)[-1] == other.rsplit(".", 1)[-1]
-
-
 def class_named(path: str) -> type | None:
     """The class of a dotted path, or of the short name of one that is imported."""
     module, _, name = path.rpartition(".")
@@ -285,8 +277,3 @@ def known_options(spec: Spec, key: str) -> Spec:
     if gone:
         print(f"magnet: the checkpoint's {key} options {', '.join(gone)} no longer exist", file=sys.stderr)
     return {"class_path": spec["class_path"], "init_args": {k: v for k, v in options.items() if k in known}}
-
-
-def as_argument(layer: dict[str, Any]) -> list[str]:
-    """Options as a configuration that the parser reads first."""
-    return ["--config", json.dumps(layer)] if layer else []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from magnet import cli
 from magnet.datamodules import catalogue, cmu
@@ -18,7 +20,7 @@ from magnet.datamodules.recording import Reader
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
 SMALL = {
-    "max_agents": "7", "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
+    "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
     "context_frames": "8", "horizon_frames": "8", "test_limit": "2",
 }  # fmt: skip
 FRAMES = {"remocap": 40}
@@ -93,7 +95,7 @@ def test_a_mixed_model_is_tested_on_scenes_of_each_size(tmp_path, monkeypatch, c
     ]
     assert sum(held) == mixed["splits"]["test"]["takes"]
     people = 2 + next(k for k, takes in enumerate(held) if takes)
-    data = ("--data", "magnet.datamodules.embody3d.Embody3D", "--data.path", f"of{people}")
+    data = ("--data", "Embody3D", "--data.path", f"of{people}")
     magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", *data, "--out", "each", *CPU)
     assert json.loads(Path("each/results.json").read_text())
 
@@ -107,7 +109,12 @@ def prepare_fit_and_test(name, body, options, capsys):
     manifest = json.loads(Path("store/manifest.json").read_text())
     assert manifest["skipped"] == [] and all(manifest["splits"][split]["clips"] for split in ("train", "val", "test"))
     body_model = ("--data.body_model", body[1]) if body else ()
-    fit_and_test("--data", catalogue.find(name).data.replace(":", "."), "--data.path", "store", *body_model)
+    kind = catalogue.find(name).load_data()
+    fit_and_test("--data", kind.__name__, "--data.path", "store", *body_model)  # the documented command
+    largest = max(int(people) for split in manifest["splits"].values() for people in split["clips by people"])
+    options = yaml.safe_load(Path("run/config.yaml").read_text())["data"]["init_args"]
+    assert largest <= options["max_agents"] == inspect.signature(kind).parameters["max_agents"].default
+    assert not options["device_resident"]
     return manifest
 
 
