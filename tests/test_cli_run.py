@@ -14,7 +14,6 @@ from magnet import cli, cli_run
 from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
-CONFIGS = sorted(Path(__file__).parents[1].joinpath("configs").rglob("*.yaml"))
 
 
 @pytest.fixture
@@ -190,11 +189,3 @@ def test_results_are_written_as_json_and_csv(trained: Path, toy: Path) -> None:
     go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--out", "tested")
     assert set(json.loads((toy / "tested" / "results.json").read_text())) == {"test/loss"}
     assert (toy / "tested" / "results.csv").read_text().startswith("metric,value\ntest/loss,")
-
-
-@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_every_configuration_of_the_repository_parses(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["fit", "--config", str(config), "--print_config"]) == 0
-    options = yaml.safe_load(capsys.readouterr().out)
-    assert options["model"]["class_path"].startswith("magnet.")
-    assert options["data"]["class_path"].startswith("magnet.")

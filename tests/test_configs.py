@@ -1,0 +1,239 @@
+"""Every configuration of the repository: what it says is what would run; the paper's runs and tables are all there."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from magnet import cli
+from magnet.cli_layers import read_layers
+from magnet.datamodules import catalogue
+from magnet.denoiser.presets import PRESETS
+
+ROOT = Path(__file__).parents[1] / "configs"
+PAPER = ROOT / "paper"
+FILES = sorted(ROOT.rglob("*.yaml"))
+SETS = {"duobox": "DuoBox", "dd100": "DD100", "remocap": "ReMoCap", "interx": "InterX", "embody3d": "Embody3D"}
+
+ROWS: dict[str, dict[str, dict[str, Any] | None]] = {
+    "Table 5": {
+        "table5_without_vq_vae": {"model.init_args.tokenizer": "raw"},
+        "table5_without_pairwise": {"model.init_args.relations": False},
+    },
+    "Table A.5": {
+        "tableA5_without_agent_pe": {"model.init_args.agent_embedding": False},
+        "tableA5_without_time_pe": {"model.init_args.rope": "none"},
+        "tableA5_without_both_pe": {"model.init_args.agent_embedding": False, "model.init_args.rope": "none"},
+    },
+    "Table A.6": {
+        "tableA6_independent": {"sampler.noise_sampling": "independent"},
+        "tableA6_joint": {},
+    },
+    "not a table": {"eq7_one_level_a_token": {"model.init_args.relation_noise": "token"}},
+}
+"""Rows beside the full model, which is duobox_denoiser.yaml in all tables, and all that they change."""
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def said(path: Path) -> dict[str, Any]:
+    """What a file and those it extends say, merged by hand."""
+    options = yaml.safe_load(path.read_text())
+    below: dict[str, Any] = {}
+    names = options.pop("extends", [])
+    for name in [names] if isinstance(names, str) else names:
+        below = over(below, said(path.parent / name))
+    return over(below, options)
+
+
+def over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    both = copy.deepcopy(below)
+    for key, value in above.items():
+        if key == "sampler" and isinstance(value, str):
+            value = PRESETS[value]
+        both[key] = over(both.get(key) or {}, value) if isinstance(value, dict) else value
+    return both
+
+
+def leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from leaves(part, f"{place}.{key}" if place else key)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for number, part in enumerate(value):
+            yield from leaves(part, f"{place}[{number}]")
+    else:
+        yield place, value
+
+
+def is_sampling(options: dict[str, Any]) -> bool:
+    return "sampler" in options
+
+
+def is_part(options: dict[str, Any]) -> bool:
+    """Whether a file is only there to be extended."""
+    return not is_sampling(options) and not ("model" in options and "data" in options)
+
+
+@pytest.fixture
+def resolved(capsys: pytest.CaptureFixture[str]):
+    """What would run, by every field of it, with a file as the only argument."""
+
+    def run(path: Path) -> dict[str, Any]:
+        command = "test" if is_sampling(said(path)) else "fit"
+        assert cli.main([command, "--config", str(path), "--print_config"]) == 0
+        return dict(leaves(yaml.safe_load(capsys.readouterr().out)))
+
+    return run
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if not is_part(said(p))], ids=relative)
+def test_what_a_configuration_says_is_what_would_run(path: Path, resolved) -> None:
+    run = resolved(path)
+    for place, value in leaves(said(path)):
+        if place.endswith("class_path"):
+            assert run[place].rpartition(".")[2] == value.rpartition(".")[2], place
+        else:
+            assert run[place] == (float(value) if isinstance(run[place], float) else value), place
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if is_part(said(p))], ids=relative)
+def test_a_part_belongs_to_a_run(path: Path) -> None:
+    users = [other for other in FILES if path in [(ROOT / layer.path).resolve() for layer in layers(other)[:-1]]]
+    assert users
+
+
+@functools.cache
+def layers(path: Path) -> list[Any]:
+    return read_layers(str(path))
+
+
+@pytest.mark.parametrize("path", sorted(PAPER.rglob("*.yaml")), ids=relative)
+def test_a_configuration_of_the_paper_says_what_it_needs_and_costs(path: Path) -> None:
+    head = " ".join(line.lstrip("# ") for line in path.read_text().splitlines() if line.startswith("#"))
+    assert "Needs" in head and ("cost" in head.lower() or path.parent.name == "data")
+    assert "Table" in head or not path.stem.startswith("table")
+
+
+# -- the paper's runs ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -> None:
+    """Paper 3, 4, A.3, A.4 and Table A.2; 64 frames are the released code's."""
+    tokenizer, denoiser = (resolved(PAPER / f"{name}_{what}.yaml") for what in ("tokenizer", "denoiser"))
+    assert (tokenizer["trainer.max_steps"], denoiser["trainer.max_steps"]) == (100_000, 300_000)
+    for run in (tokenizer, denoiser):
+        assert run["data.class_path"].endswith(SETS[name])
+        assert (run["data.init_args.batch_size"], run["data.init_args.window_frames"]) == (256, 64)
+        assert run["data.init_args.mirror"] and run["data.init_args.shuffle_agents"]
+        assert run["data.init_args.compose"] == 0
+        assert (run["model.init_args.learning_rate"], run["model.init_args.weight_decay"]) == (2e-4, 1e-4)
+        people = 4 if name == "embody3d" else 2
+        assert run["data.init_args.max_agents"] == people
+        masked = (run["data.init_args.drop_agent"] > 0, run["data.init_args.drop_at_most"])
+        assert masked == ((True, 2) if people == 4 else (False, 1))
+    sizes = {"latent": 512, "hidden": 512, "codes": 1024, "levels": 1}
+    assert {key: tokenizer[f"model.init_args.{key}"] for key in sizes} == sizes
+    sizes = {"width": 512, "layers": 6, "heads": 8, "mlp_ratio": 4, "level_width": 256, "agent_width": 256}
+    assert {key: denoiser[f"model.init_args.{key}"] for key in sizes} == sizes
+    paper = {"rope": "hidden", "agent_embedding": True, "relations": True, "noise_levels": "per_token"}
+    assert {key: denoiser[f"model.init_args.{key}"] for key in paper} == paper
+    assert denoiser["model.init_args.tokenizer"] == f"runs/{name}_tokenizer/latest/checkpoints/best.ckpt"
+
+
+@pytest.mark.parametrize(("table", "row"), [(table, row) for table, rows in ROWS.items() for row in rows])
+def test_a_row_of_a_table_changes_only_what_it_is_about(table: str, row: str, resolved) -> None:
+    path = PAPER / "ablations" / f"{row}.yaml"
+    base = PAPER / ("sampling.yaml" if table == "Table A.6" else "duobox_denoiser.yaml")
+    changed, full = resolved(path), resolved(base)
+    differences = {place: value for place, value in changed.items() if value != full.get(place)}
+    assert differences == ROWS[table][row]
+    assert table in path.read_text() or table == "not a table"
+
+
+def test_every_ablation_is_a_row_that_is_told() -> None:
+    there = {path.stem for path in (PAPER / "ablations").glob("*.yaml")}
+    assert there == {row for rows in ROWS.values() for row in rows}
+
+
+# -- and they run --------------------------------------------------------------------------------
+
+CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+TINY = {
+    "Tokenizer": {"latent": 8, "hidden": 8, "codes": 8, "depth": 1},
+    "Denoiser": {"width": 16, "layers": 1, "heads": 2, "mlp_ratio": 1, "level_width": 8, "agent_width": 8},
+}
+SMALL = {"batch_size": 2, "epoch_size": 4, "window_frames": 16, "val_batch_size": 2}
+FAKES = {"remocap": ("--frames", "40", "--takes", "4"), "duobox": ("--frames", "150", "--takes", "1")}
+
+
+@functools.cache
+def prepared(name: str, folder: Path) -> tuple[str, ...]:
+    """Flags for a made-up download of a data set, prepared."""
+    download, store = folder / f"{name}_download", folder / name
+    words = FAKES.get(name, ("--frames", "80", "--takes", "4"))
+    assert cli.main(["data", "fake", name, str(download), *words]) == 0
+    fitted = catalogue.find(name).load_reader().family == "positions"
+    body = ("--min_frames", "8") if fitted else ("--body", str(download / "body.npz"))
+    prepare = ("--root", str(download), "--out", str(store), "--workers", "1", *body)
+    assert cli.main(["data", "prepare", name, *prepare]) == 0
+    return ("--data.path", str(store), "--data.body_model", "open" if fitted else body[1])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("stores")
+
+
+def two_steps(path: Path, data: tuple[str, ...], out: Path, *more: str) -> Path:
+    """Two steps of a configuration at tiny sizes, and its checkpoint."""
+    kind = said(path)["model"]["class_path"]
+    sizes = {f"model.{key}": value for key, value in TINY[kind].items()}
+    sizes |= {f"data.{key}": value for key, value in SMALL.items()}
+    flags = [word for key, value in sizes.items() for word in (f"--{key}", str(value))]
+    steps = ("--trainer.max_steps", "2", "--trainer.limit_val_batches", "1", "--out", str(out))
+    assert cli.main(["fit", "--config", str(path), *flags, *data, *steps, *more, *CPU]) == 0
+    return out / "checkpoints" / "last.ckpt"
+
+
+def tokenizer_of(name: str, folder: Path) -> str:
+    out = folder / f"{name}_tokenizer"
+    if not out.exists():
+        two_steps(PAPER / f"{name}_tokenizer.yaml", prepared(name, folder), out)
+    return str(out / "checkpoints" / "last.ckpt")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETS)
+def test_a_data_sets_tokenizer_and_denoiser_train(name: str, folder: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    tokenizer = ("--model.tokenizer", tokenizer_of(name, folder))
+    assert two_steps(PAPER / f"{name}_denoiser.yaml", prepared(name, folder), tmp_path / "run", *tokenizer).exists()
+
+
+@pytest.mark.slow
+def test_every_ablation_trains_and_both_ways_of_sampling_sample(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    """One test, because all share a store and a tokenizer."""
+    monkeypatch.chdir(tmp_path)
+    data, tokenizer = prepared("duobox", folder), tokenizer_of("duobox", folder)
+    for row in sorted((PAPER / "ablations").glob("*.yaml")):
+        if is_sampling(said(row)):
+            continue
+        raw = "tokenizer" in yaml.safe_load(row.read_text())["model"]["init_args"]
+        more = () if raw else ("--model.tokenizer", tokenizer)
+        checkpoint = two_steps(row, data, tmp_path / row.stem, *more)
+    short = ("--data.context_frames", "8", "--data.horizon_frames", "8", "--data.test_limit", "2")
+    quick = ("--sampler.steps", "3", "--samples", "1", "--baselines", "false", "--ckpt_path", str(checkpoint))
+    for row in sorted((PAPER / "ablations").glob("tableA6_*.yaml")):
+        out = tmp_path / f"tested_{row.stem}"
+        assert cli.main(["test", "--config", str(row), *quick, *short, "--out", str(out), *CPU]) == 0
+        assert (out / "results.json").exists()
