@@ -18,6 +18,7 @@ from magnet.denoiser import stream as streaming
 from magnet.denoiser.levels import NoiseLevels
 from magnet.denoiser.losses import Weighting
 from magnet.denoiser.objective import training_losses
+from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.statistics import Statistics
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation import Evaluation
@@ -59,6 +60,8 @@ class Denoiser(L.LightningModule):
             its encoder's latents before they are snapped to codes (ours); sampling follows.
         relation_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
             `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
+        pairwise_posterior: replaces predicted pairwise transforms by their posterior, given what is shown of them and
+            the predicted steps (ours), see `PairwisePosterior`.
         noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
             `mixture` (ours: these and the patterns that sampling asks about).
         level_shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
@@ -103,6 +106,7 @@ class Denoiser(L.LightningModule):
         causal_block: int = 0,
         target: Target = "quantised",
         relation_noise: Literal["noisier_end", "token"] = "noisier_end",
+        pairwise_posterior: bool = False,
         noise_levels: NoiseLevels = "per_token",
         level_shift: float = 1.0,
         weighting: Weighting = "uniform",
@@ -162,6 +166,7 @@ class Denoiser(L.LightningModule):
             agent_embedding=h.agent_embedding,
             causal_block=h.causal_block,
         )
+        self.posterior = PairwisePosterior(self.layout) if h.pairwise_posterior and self.layout.slots else None
 
     @property
     def quantised(self) -> bool:
@@ -200,6 +205,9 @@ class Denoiser(L.LightningModule):
         if not self.built or stored != given:
             self.build(RawPose() if stored is None else Tokenizer(**stored))
             self.to(self.device)
+        if self.posterior is not None:  # a checkpoint from before it was switched on has none
+            for name, value in self.posterior.state_dict().items():
+                checkpoint["state_dict"].setdefault(f"posterior.{name}", value)
 
     @classmethod
     def load(cls, name_or_path: str | Path | None = None) -> Denoiser:
@@ -238,7 +246,11 @@ class Denoiser(L.LightningModule):
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        return self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present)
+        clean = self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present)
+        if self.posterior is None:
+            return clean
+        with torch.autocast(noisy.device.type, enabled=False):  # half precision would blur the transforms
+            return self.posterior(clean.float(), noisy.float(), levels, present, self.statistics)
 
     def _without_lead(self, tokens: Tensor) -> Tensor:
         lead = slice(self.layout.latent, self.layout.latent + 9)
@@ -329,7 +341,9 @@ class Denoiser(L.LightningModule):
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()
         h: Any = self.hparams
-        return adamw_cosine(self, self.transformer.parameters(), h.learning_rate, h.weight_decay, h.warmup_steps)
+        parts = [self.transformer] if self.posterior is None else [self.transformer, self.posterior]
+        trained = [parameter for part in parts for parameter in part.parameters()]
+        return adamw_cosine(self, trained, h.learning_rate, h.weight_decay, h.warmup_steps)
 
     # -- testing and predicting ----------------------------------------------------------------
 

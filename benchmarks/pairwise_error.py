@@ -1,0 +1,81 @@
+"""How well a denoiser gives pairwise transforms back at each noise level, on recorded test takes.
+
+    MAGNET_CMU=... python benchmarks/pairwise_error.py --ckpt_path duet
+
+Every token of a window is shown at one level; in the last row eight tokens are clean, four are at level 800 and are
+measured, and four are unknown. One line a level: what is shown, what the network returns, and what its posterior is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from magnet.datamodules.cmu import CMU
+from magnet.denoiser.module import Denoiser
+from magnet.denoiser.pairwise_posterior import PairwisePosterior, planar_of
+from magnet.motion.scene import concatenate
+from magnet.motion.tokens import STRIDE
+from magnet.report import machine
+from magnet.sampling.noise import LEVELS, add_noise
+
+SHOWN = (5, 20, 50, 100, 300, 500)
+
+
+def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
+    """Levels of a window (N,), and which tokens are measured, by name."""
+    block = torch.full((window,), LEVELS)
+    block[: window // 2], block[window // 2 : 3 * window // 4] = 0, 800
+    even = {str(level): (torch.full((window,), level), slice(None)) for level in SHOWN}
+    return {**even, "block at 800": (block, slice(window // 2, 3 * window // 4))}
+
+
+def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float]:
+    """Mean errors of pairwise transforms: centimetres, degrees. (B, N, P, D) x 2"""
+    pairs = [planar_of(model.layout.unpack(model.statistics.restore(x[:, part]))[2]) for x in (tokens, truth)]
+    there = model.layout.group_present(present)[:, None, :, 1:, None].expand(pairs[0][0].shape)
+    turned = pairs[0][0] - pairs[1][0]
+    turned = torch.atan2(turned.sin(), turned.cos()).abs()[there]
+    moved = (pairs[0][1] - pairs[1][1]).norm(dim=-1)[there]
+    return 100 * float(moved.mean()), float(turned.mean().rad2deg())
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--ckpt_path", default="duet")
+    parser.add_argument("--takes", type=int, nargs="+", default=[5, 10, 15])
+    parser.add_argument("--out", type=Path, help="JSON to write")
+    options = parser.parse_args()
+    model = Denoiser.load(options.ckpt_path)
+    frames = model.window * STRIDE
+    data = CMU(singles=False, test_takes=options.takes, test_stride=frames, horizon_frames=frames - 32, batch_size=16)
+    data.prepare_data()
+    data.setup("test")
+    scenes = concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)
+    truth = model.statistics.normalise(model.tokenize(scenes)[0])
+    posterior = model.posterior or PairwisePosterior(model.layout)
+    model.posterior = None
+    generator = torch.Generator().manual_seed(0)
+    rows = {}
+    for name, (plan, part) in plans(model.window).items():
+        levels = plan[None, :, None].expand(truth.shape[:3])
+        noise = torch.randn(truth.shape, generator=generator)
+        noisy = add_noise(truth, noise, model.layout.spread(model.layout.group_levels(levels)))
+        alone = model.denoise(noisy, levels, scenes.present)
+        fused = posterior(alone, noisy, levels, scenes.present, model.statistics)
+        each = {"shown": noisy, "network": alone, "posterior": fused}
+        rows[name] = {how: errors(model, tokens, truth, scenes.present, part) for how, tokens in each.items()}
+        told = " | ".join(f"{how} {cm:.1f} cm {degrees:.1f} deg" for how, (cm, degrees) in rows[name].items())
+        print(f"level {name}: {told}")
+    if options.out:
+        facts = {"scenes": scenes.scenes, "checkpoint": options.ckpt_path, "takes": options.takes, **machine()}
+        options.out.write_text(json.dumps({"rows": rows, "meta": facts}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

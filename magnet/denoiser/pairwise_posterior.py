@@ -1,0 +1,172 @@
+"""The most likely pairwise transforms, given what is shown of them, the predicted steps and the network's own guess."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from magnet.denoiser.statistics import Statistics
+from magnet.motion.frames import partners, turn
+from magnet.motion.pose_graph import Planar, solve_pose_graph
+from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, relations_by_frame, relations_by_token
+from magnet.sampling.noise import LEVELS, alpha_bar
+
+KNOTS = 11
+"""Noise levels at which a learnt deviation is stored; between them it is interpolated."""
+
+SHARPEST = 2e-3
+"""Standard deviation in metres, and in radians, of what is shown clean: tokens hold numbers of finite precision."""
+
+
+class PairwisePosterior(nn.Module):
+    """Replaces the pairwise transforms that a network predicts by their posterior mean in closed form.
+
+    A network returns a pairwise transform worse than it was shown it, while its steps are good to millimetres. So what
+    is shown (noisy, with the variance that its level tells) is carried along the predicted steps to every other frame,
+    and fused by precision with the network's own prediction as one more observation.
+
+    Args:
+        layout: what a token holds; with pairwise transforms.
+
+    Its parameters, learnt or measured, are logarithms of standard deviations at `KNOTS` levels from 0 to K: of the
+    network's own pairwise transforms (metres, radians), and of the predicted steps, a frame.
+    """
+
+    def __init__(self, layout: TokenLayout) -> None:
+        super().__init__()
+        self.layout = layout
+        # Fitted to the shipped model on training takes. Its own pairwise transforms are off by 4 to 15 cm, but alike in
+        # neighbouring frames: as observations that count as independent they are worth far less than that.
+        ramp = torch.linspace(0, 1, KNOTS)
+        self.log_pair_ground = nn.Parameter((0.25 + 0.1 * ramp).log())
+        self.log_pair_yaw = nn.Parameter(torch.full((KNOTS,), 0.5).log())
+        self.log_step_ground = nn.Parameter(torch.full((KNOTS,), 0.006).log())
+        self.log_step_yaw = nn.Parameter(torch.full((KNOTS,), 0.015).log())
+
+    def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, statistics: Statistics) -> Tensor:
+        """The same prediction with better pairwise transforms.
+
+        Args:
+            clean: (B, N, P, D) what the network predicts, normalised.
+            noisy: (B, N, P, D) what it was shown.
+            levels: (B, N, P) int.
+            present: (B, P) bool; pairs with somebody absent stay as they are.
+            statistics: how tokens are normalised.
+
+        Returns:
+            (B, N, P, D). Everything but pairwise transforms is `clean`'s.
+        """
+        layout = self.layout
+        group_levels = layout.group_levels(levels)
+        latent, steps, predicted = layout.unpack(statistics.restore(clean))
+        shown = shown_clean(noisy, group_levels, layout, statistics)
+        _, shown_steps, shown_pairs = layout.unpack(shown)
+        known = (levels == 0)[..., None, None]
+        steps = torch.where(known, shown_steps, steps)
+        fused = self._fused(steps, predicted, shown_pairs, group_levels, present, statistics)
+        packed = statistics.normalise(layout.pack(latent, steps, fused.to(clean.dtype)))
+        pairs = layout.group_present(present)
+        pairs = torch.cat([torch.zeros_like(pairs[..., :1]), pairs[..., 1:]], dim=-1)[:, None]
+        return torch.where(layout.spread(pairs), packed, clean)
+
+    def _fused(
+        self,
+        steps: Tensor,
+        predicted: Tensor,
+        shown: Tensor,
+        group_levels: Tensor,
+        present: Tensor,
+        statistics: Statistics,
+    ) -> Tensor:
+        """Posterior means in 9-D, as tokens hold them. -> (B, N, P, P - 1, 4, 9)"""
+        step = planar_of(by_frame(steps))
+        own = group_levels[..., 0].repeat_interleave(STRIDE, dim=1)  # (B, T, P)
+        pair_levels = group_levels[..., 1:].repeat_interleave(STRIDE, dim=1)  # (B, T, P, P - 1)
+        there = self.layout.group_present(present)[:, None, :, 1:]
+        steps_known = own == 0
+        step_ground = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_ground, own)))
+        step_yaw = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_yaw, own)))
+        # Where the window stands in the world is arbitrary: the first frame's steps tie nobody to anything.
+        first = torch.zeros_like(step_yaw[:, :1])
+        step_yaw, step_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (step_yaw, step_ground))
+        guess = planar_of(relations_by_frame(predicted))
+        seen = planar_of(relations_by_frame(shown))
+        ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, statistics)
+        weights = {
+            "yaw": (precision(self._at(self.log_pair_yaw, pair_levels)) * there, precision(yaw_noise) * there),
+            "ground": (precision(self._at(self.log_pair_ground, pair_levels)) * there, precision(ground_noise) * there),
+        }
+        turned = torch.atan2((seen[0] - guess[0]).sin(), (seen[0] - guess[0]).cos())
+        total_yaw = weights["yaw"][0] + weights["yaw"][1]
+        yaw = guess[0] + turned * weights["yaw"][1] / total_yaw.clamp_min(1e-9)
+        total = weights["ground"][0] + weights["ground"][1]
+        share = (weights["ground"][1] / total.clamp_min(1e-9))[..., None]
+        ground = guess[1] + share * (seen[1] - guess[1])
+        start = heading_at_start(yaw, step[0], total_yaw, present.int().argmax(dim=1))
+        zero = torch.zeros_like(start)[..., None].expand(*start.shape, 2)
+        solved_yaw, solved = solve_pose_graph(
+            Planar(*step, step_yaw, step_ground), Planar(yaw, ground, total_yaw, total), start, zero
+        )
+        partner = partners(self.layout.agents, steps.device)
+        apart = solved_yaw[:, :, partner] - solved_yaw[..., None]
+        away = turn(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
+        return relations_by_token(nine_of(apart, away))
+
+    def _at(self, knots: Tensor, levels: Tensor) -> Tensor:
+        """A learnt deviation at some levels. levels (...) int -> (...)"""
+        place = levels.float() * ((KNOTS - 1) / LEVELS)
+        low = place.long().clamp(max=KNOTS - 2)
+        return torch.lerp(knots[low], knots[low + 1], place - low).exp()
+
+
+def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, statistics: Statistics) -> Tensor:
+    """What noisy tokens say of the clean ones without knowing anything else, in real units; at level K nothing."""
+    scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)
+    return statistics.restore(noisy / layout.spread(scale))
+
+
+def shown_deviation(pair_levels: Tensor, layout: TokenLayout, statistics: Statistics) -> tuple[Tensor, Tensor]:
+    """Standard deviation of what is shown of pairwise transforms. (...) int -> metres (...), radians (...)
+
+    A heading is read off four of the nine numbers (`planar_of`): about a turn, their noise of standard deviation s in
+    each leaves s / sqrt(2) radians.
+    """
+    alpha = alpha_bar(pair_levels)
+    noise = ((1 - alpha) / alpha.clamp_min(1e-6)).sqrt()
+    first = layout.latent + 9 * STRIDE
+    std = statistics.std[first : first + 9]
+    cosine, sine = std[[0]].square().mean(), std[[2]].square().mean()
+    turning = noise * ((cosine + sine) / 2).sqrt()
+    moving = noise * std[[6, 8]].square().mean().sqrt()
+    return moving.clamp_min(SHARPEST), (turning * (1 + turning.square()).sqrt()).clamp_min(SHARPEST)
+
+
+def precision(deviation: Tensor) -> Tensor:
+    return deviation.double().square().reciprocal()
+
+
+def planar_of(nine: Tensor) -> tuple[Tensor, Tensor]:
+    """Heading and ground position of a transform in 9-D that is about planar. (..., 9) -> (...), (..., 2)"""
+    return torch.atan2(-nine[..., 2], nine[..., 0]), nine[..., [6, 8]]
+
+
+def nine_of(yaw: Tensor, ground: Tensor) -> Tensor:
+    """Inverse of `planar_of`: a transform over the ground in 9-D. (...), (..., 2) -> (..., 9)"""
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    return torch.stack([yaw.cos(), zero, -yaw.sin(), zero, one, zero, ground[..., 0], zero, ground[..., 1]], dim=-1)
+
+
+def heading_at_start(yaw: Tensor, step_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
+    """Headings at the start that fit pairwise headings roughly, so that what is left is far from a half turn.
+
+    yaw, weight (B, T, P, P - 1), step_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
+    anchor
+    """
+    B, _, P, _ = yaw.shape
+    scene, partner = torch.arange(B, device=yaw.device), partners(P, yaw.device)[anchor]  # (B, P - 1)
+    along = step_yaw.cumsum(dim=1)
+    others = along.gather(2, partner[:, None].expand(-1, along.shape[1], -1))
+    offset = yaw[scene, :, anchor] - others + along[scene, :, anchor][..., None]  # (B, T, P - 1)
+    w = weight[scene, :, anchor]
+    mean = torch.atan2((w * offset.sin()).sum(dim=1), (w * offset.cos()).sum(dim=1))
+    return torch.zeros(B, P, dtype=mean.dtype, device=yaw.device).scatter(1, partner, mean)
