@@ -25,7 +25,7 @@ from magnet.metrics.columns import part_notes
 LOW, HIGH = "_low", "_high"
 """Endings under which a row holds the ends of a metric's interval."""
 
-REFERENCES = ("ground truth", "training windows", "test halves")
+REFERENCES = ("ground truth", "training set")
 """Rows of recorded motion: something to compare with, not something that can be best."""
 
 RESULTS_FORMAT = 1

@@ -6,7 +6,7 @@ import torch
 
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation import HALVES, MODEL, TRAINING, TRUTH, Evaluation, aligned
+from magnet.evaluation import MODEL, TRAINING, TRUTH, Evaluation, aligned
 from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.scene import Scene, concatenate
 from magnet.sampling.schedule import Grid
@@ -25,7 +25,7 @@ def data(clips: list | None = None, **options) -> FakeData:
 
 def prepared(**options) -> tuple[Denoiser, Evaluation, L.Trainer]:
     model = tiny_denoiser(max_agents=3)
-    evaluation = Evaluation(samples=3, options=FAST, baseline_stride=10, **options)
+    evaluation = Evaluation(**{"samples": 3, "options": FAST, "baseline_stride": 10, **options})
     model.configure_test(evaluation)
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
     return model, evaluation, trainer
@@ -45,12 +45,17 @@ def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluation]:
 
 def test_every_method_is_measured_on_the_same_scenes():
     results = run(data()).results
-    methods = {MODEL, "NN", "RS", "held pose", "NN, not aligned", "RS, not aligned", TRUTH, TRAINING, HALVES}
-    assert set(results.rows) == methods
-    for method in methods - {TRUTH, TRAINING, HALVES}:
+    answering = {MODEL, "NN", "RS", "zero velocity", "ridge regression", "NN, not aligned", "RS, not aligned"}
+    assert set(results.rows) == answering | {TRUTH, TRAINING}
+    for method in answering:
         assert {"fd", "mi", "fs", "ip_ratio", "mpjpe", "mpjve", "mpjpe@0.5s"} <= set(results.rows[method])
+    assert {"fd", "fd_pair", "fs", "ip_ratio"} <= set(results.rows[TRAINING])
+    assert not {name for name in results.rows[TRAINING] if name.startswith(("mpj", "div"))}
     assert results.rows[MODEL]["div"] > 0
-    assert results.rows["NN"]["div"] == results.rows["held pose"]["div"] == 0
+    for method in ("NN", "zero velocity", "ridge regression"):
+        assert results.rows[method]["div"] == 0
+    assert {method for method, row in results.rows.items() if "nearest_training" in row} == {MODEL, TRUTH}
+    assert results.rows["ridge regression"]["mpjpe"] < results.rows["zero velocity"]["mpjpe"]
     assert results.meta["test scenes"] == 9
 
 
@@ -90,7 +95,7 @@ def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
         evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
         evaluation.start(model, datamodule)
         batch = next(iter(datamodule.test_dataloader()))
-        seen.append(evaluation.methods[MODEL](batch, 2, evaluation._generators(model, batch.scenes)))
+        seen.append(evaluation.sample(model, batch, 2, evaluation._generators(model, batch.scenes)))
     plain, replaced = seen
     assert torch.equal(plain.body_rot, replaced.body_rot)
     assert torch.equal(plain.T_world_root, replaced.T_world_root)
@@ -106,7 +111,7 @@ def test_every_task_gives_a_table(name):
 def test_baselines_are_asked_only_where_their_past_is_given():
     from magnet.tasks.partner import PartnerInpainting
 
-    assert set(run(data(), task=PartnerInpainting()).results.rows) == {MODEL, TRUTH, TRAINING, HALVES}
+    assert set(run(data(), task=PartnerInpainting()).results.rows) == {MODEL, TRUTH, TRAINING}
 
 
 def test_scores_follow_the_seed():
@@ -152,7 +157,7 @@ def test_no_past_is_no_past_that_baselines_could_continue(name: str):
     datamodule = data()
     datamodule.context_frames = 0
     results = run(datamodule, task=registry.get(name)()).results
-    assert set(results.rows) == {MODEL, TRUTH, TRAINING, HALVES}
+    assert set(results.rows) == {MODEL, TRUTH, TRAINING}
     assert math.isfinite(results.rows[MODEL]["fd"])
 
 
@@ -163,7 +168,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     assert (seen.now, seen.past_is_given) == (0, False)
     batch = next(iter(datamodule.test_dataloader()))
     model = tiny_denoiser(max_agents=3)
-    made = seen.methods[MODEL](batch, 3, seen._generators(model, batch.scenes))
+    made = seen.sample(model, batch, 3, seen._generators(model, batch.scenes))
     yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
     there = made.present[..., None]
     middle = torch.where(there, ground, 0).sum(dim=1) / there.sum(dim=1)
@@ -171,10 +176,13 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     assert yaw[:, 0].abs().max() < 1e-5
 
 
-def test_composed_scenes_have_baselines_of_their_size():
+def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
+    monkeypatch.setattr("magnet.evaluation.BASELINE_COMPOSED", 30)
     clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]
     results = run(data(clips, composed_test=2)).results
     assert math.isfinite(results.rows["NN"]["mpjpe"])
+    assert math.isfinite(results.rows["ridge regression"]["mpjpe"])
+    assert math.isfinite(results.rows[MODEL]["nearest_training"])
 
 
 def test_aligned_scenes_share_one_world(scene):

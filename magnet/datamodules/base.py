@@ -268,6 +268,19 @@ class MotionDataModule(LightningDataModule):
         Raises:
             ValueError: no clip is long enough.
         """
+        return self.store("train").gather(self._train_draw(frames, stride, composed), frames, self.compose_clearance)
+
+    def train_windows(self, frames: int, stride: int = 30, composed: int = 0, chunk: int = 64) -> Iterator[Scene]:
+        """The same as `train_scenes`, in batches of at most `chunk` scenes.
+
+        Raises:
+            ValueError: no clip is long enough.
+        """
+        store, draw = self.store("train"), self._train_draw(frames, stride, composed)
+        for first in range(0, len(draw), chunk):
+            yield store.gather(draw[first : first + chunk], frames, self.compose_clearance)
+
+    def _train_draw(self, frames: int, stride: int, composed: int) -> Draw:
         store = self.store("train")
         draw = fixed_draws(store, frames, stride)
         if not len(draw):
@@ -277,7 +290,7 @@ class MotionDataModule(LightningDataModule):
             )
         if composed:
             draw = Draw.concatenate([draw, composed_draws(store, draw, composed, self.augmentation.apart, self.seed)])
-        return store.gather(draw, frames, self.compose_clearance)
+        return draw
 
     # -- Lightning -----------------------------------------------------------------------------
 

@@ -17,8 +17,9 @@ from magnet.metrics.frechet import FrechetBySecond, FrechetDistance, frechet_dis
 from magnet.metrics.futures import Futures
 from magnet.metrics.hand_contact import HandContact, hand_distance, hand_points
 from magnet.metrics.interaction import MotionInteraction, pearson
-from magnet.metrics.interval import bootstrap_interval
+from magnet.metrics.interval import bootstrap_interval, independent_units
 from magnet.metrics.jitter import Jitter, jitter
+from magnet.metrics.memorisation import NearestTraining
 from magnet.metrics.partners import PartnerDistance, partner_distance
 from magnet.metrics.penetration import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.position_error import PositionError, joint_error
@@ -44,6 +45,7 @@ __all__ = [
     "Jitter",
     "MotionInteraction",
     "MotionMetric",
+    "NearestTraining",
     "PartnerBearing",
     "PartnerDistance",
     "PositionError",
@@ -61,6 +63,7 @@ __all__ = [
     "ground_truth_metrics",
     "hand_distance",
     "hand_points",
+    "independent_units",
     "jitter",
     "joint_error",
     "lowest_foot",

@@ -43,11 +43,21 @@ class MotionMetric(Metric):
         self.of = of
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
 
-    def update(self, generated: Tensor, truth: Tensor, present: Tensor, agents: Tensor | None = None) -> None:
-        """(S, B, T, P, 22, 3), (B, T, P, 22, 3), (B, P) bool, and bool: what was generated; see `Futures.of`."""
+    def update(
+        self,
+        generated: Tensor,
+        truth: Tensor,
+        present: Tensor,
+        agents: Tensor | None = None,
+        units: Tensor | None = None,
+    ) -> None:
+        """(S, B, T, P, 22, 3), (B, T, P, 22, 3), (B, P) bool, and bool: what was generated; see `Futures.of`.
+
+        `units` (B,) int says which clips are not independent of each other, see `bootstrap_interval`.
+        """
         if self.of == "truth":
             generated = truth[None]
-        self.add(Futures.of(generated, truth, present, self.agents if agents is None else agents))
+        self.add(Futures.of(generated, truth, present, self.agents if agents is None else agents, units))
 
     @abstractmethod
     def add(self, futures: Futures) -> None:
@@ -98,12 +108,14 @@ class ClipMeans(MotionMetric):
 
     Args:
         names: what is measured.
-        confidence: such as 0.95: adds `<name>_low` and `<name>_high`, by resampling clips.
+        confidence: such as 0.95: adds `<name>_low` and `<name>_high`, by resampling independent units of clips;
+            nothing where there is only one.
     """
 
     total: Tensor  # (K,)
     count: Tensor  # (K,)
     clips: list[Tensor]  # of (B, K, 2): total and count of each clip
+    units: list[Tensor]  # of (B,) int: which of them are not independent; -1: of nobody else
 
     def __init__(
         self,
@@ -118,6 +130,7 @@ class ClipMeans(MotionMetric):
         self.add_sum("total", len(self.names))
         self.add_sum("count", len(self.names))
         self.add_list("clips", torch.zeros(0, len(self.names), 2, dtype=torch.float64))
+        self.add_list("units", torch.zeros(0, dtype=torch.int64))
 
     @abstractmethod
     def measure(self, futures: Futures) -> Sequence[tuple[Tensor, Tensor]]:
@@ -127,6 +140,8 @@ class ClipMeans(MotionMetric):
         shares = [torch.stack(torch.broadcast_tensors(*pair), dim=-1) for pair in self.measure(futures)]
         clips = torch.stack(shares, dim=1).double()
         self.clips.append(clips)
+        alone = torch.full((len(clips),), -1, device=clips.device)
+        self.units.append(alone if futures.units is None else futures.units.to(alone))
         self.total += clips[..., 0].sum(dim=0)
         self.count += clips[..., 1].sum(dim=0)
 
@@ -137,9 +152,10 @@ class ClipMeans(MotionMetric):
                 continue
             result[name] = self.total[k] / self.count[k]
             if self.confidence is not None:
-                clips = dim_zero_cat(self.clips)[:, k]
-                low, high = bootstrap_interval(clips[:, 0], clips[:, 1], self.confidence)
-                result |= {f"{name}_low": low, f"{name}_high": high}
+                clips, units = dim_zero_cat(self.clips)[:, k], dim_zero_cat(self.units)
+                interval = bootstrap_interval(clips[:, 0], clips[:, 1], self.confidence, units=units)
+                if interval is not None:
+                    result |= {f"{name}_low": interval[0], f"{name}_high": interval[1]}
         return result
 
 

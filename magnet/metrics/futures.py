@@ -18,9 +18,16 @@ class Futures:
     truth: Tensor  # (B, T, P, 22, 3)
     present: Tensor  # (B, P) bool
     scored: Tensor  # (B, T, P) bool: present, and this frame of this agent was generated
+    units: Tensor | None = None  # (B,) int: clips that are not independent have the same; negative: its own
 
     @staticmethod
-    def of(generated: Tensor, truth: Tensor, present: Tensor, agents: Tensor | None = None) -> Futures:
+    def of(
+        generated: Tensor,
+        truth: Tensor,
+        present: Tensor,
+        agents: Tensor | None = None,
+        units: Tensor | None = None,
+    ) -> Futures:
         """Checks what came and cuts both to the shorter one.
 
         Args:
@@ -30,6 +37,7 @@ class Futures:
             agents: bool, what was generated and is scored: (P,), (B, P), (T, P) or (B, T, P), where in the last
                 form B and T may be 1; None: everything of everybody present. What is not scored was given, so
                 `generated` is expected to repeat it there.
+            units: (B,) int, which clips intervals take as one; None: each is its own.
 
         Raises:
             ValueError: shapes do not fit, B = T leave open what two axes of `agents` are, or a joint of a present
@@ -48,6 +56,8 @@ class Futures:
             )
         if present.shape != (B, P) or present.dtype != torch.bool:
             raise ValueError(f"present: got {tuple(present.shape)} {present.dtype}, expected {(B, P)} bool")
+        if units is not None and (units.shape != (B,) or units.is_floating_point()):
+            raise ValueError(f"units: got {tuple(units.shape)} {units.dtype}, expected {(B,)} int")
         lengths = (generated.shape[2], truth.shape[1])
         frames = min(lengths)
         there = present[:, None, :, None, None]
@@ -56,6 +66,7 @@ class Futures:
             truth=torch.where(there, truth[:, :frames].double(), 0.0),
             present=present,
             scored=present[:, None] & _by_frame(agents, B, lengths, P).to(present.device),
+            units=units,
         )
         _demand_finite("generated", cut.generated.isfinite().all(dim=0))
         _demand_finite("truth", cut.truth.isfinite())

@@ -1,7 +1,58 @@
-"""Confidence intervals over clips: clips are independent of each other, frames are not."""
+"""Confidence intervals over clips: frames of a clip hang together, and so do clips that overlap."""
 
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Unit = Literal["auto", "take", "scene"]
+"""What an interval takes as independent; see `independent_units`."""
+
+ENOUGH_TAKES = 5
+"""From so many recordings on, intervals are over recordings."""
+
+
+AT_ONCE = 1_000_000
+"""Units that are drawn at once, to bound memory."""
+
+
+def independent_units(
+    recordings: NDArray[np.int64], starts: NDArray[np.int64], frames: int, by: Unit = "auto"
+) -> NDArray[np.int64]:
+    """Which test scenes to resample together, because they are not independent of each other.
+
+    Args:
+        recordings: (C,) the recording of each scene.
+        starts: (C,) its first frame there.
+        frames: length of a scene.
+        by: `take`: all scenes of a recording are one unit. `scene`: a recording is cut into runs of scenes, so that
+            the first scenes of two runs do not overlap: there are no more units than scenes that do not overlap,
+            however densely scenes are taken. `auto`: `take` where there are `ENOUGH_TAKES` recordings, else `scene`,
+            which takes no account of what sets one recording apart from another, so it is rather too narrow.
+
+    Returns:
+        (C,) number of each scene's unit.
+
+    Raises:
+        ValueError: `by` is something else.
+    """
+    if by not in get_args(Unit):
+        raise ValueError(f"interval: got {by!r}, expected {', '.join(get_args(Unit))}")
+    takes = np.unique(recordings)
+    if by == "take" or (by == "auto" and len(takes) >= ENOUGH_TAKES):
+        return np.searchsorted(takes, recordings).astype(np.int64)
+    units, unit = np.zeros(len(recordings), dtype=np.int64), -1
+    for take in takes:
+        until = None
+        for scene in np.flatnonzero(recordings == take)[np.argsort(starts[recordings == take], kind="stable")]:
+            if until is None or starts[scene] >= until:
+                unit, until = unit + 1, starts[scene] + frames
+            units[scene] = unit
+    return units
 
 
 def bootstrap_interval(
@@ -10,34 +61,43 @@ def bootstrap_interval(
     level: float = 0.95,
     resamples: int = 1000,
     generator: torch.Generator | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Where the mean would lie for other clips of the same kind: percentile bootstrap.
+    units: Tensor | None = None,
+) -> tuple[Tensor, Tensor] | None:
+    """Where the mean would lie for other clips of the same kind: percentile bootstrap over independent units.
+
+    With fewer than some ten units it is too narrow.
 
     Args:
         totals: (C,) one value a clip, or its sum.
         counts: (C,) what each sum is over; None: plain values.
-        generator: None draws the same resamples every time. Clips are sorted first, so their order,
+        level: share of resamples inside.
+        resamples: how many.
+        generator: None draws the same resamples every time. Units are sorted first, so their order,
             which depends on the number of processes, makes no difference.
+        units: (C,) int, the unit that each clip is resampled with; a negative one, and None: a clip is its own.
 
     Returns:
-        Lower and upper end; both NaN-free. One clip gives an interval without width.
-
-    Raises:
-        ValueError: no clip has anything to count.
+        Lower and upper end; None with fewer than two units, which say nothing of others.
     """
     counts = torch.ones_like(totals) if counts is None else counts
-    some = counts > 0
-    if not bool(some.any()):
-        raise ValueError("no clip has a value; an interval needs at least one")
-    rows = torch.stack([totals[some], counts[some]], dim=-1).double().cpu()
+    rows = torch.stack([totals, counts], dim=-1).double().cpu()
+    if units is not None:
+        units = units.cpu()
+        own = torch.arange(len(units)) + int(units.max().clamp_min(-1)) + 1 if len(units) else units
+        _, place = torch.where(units < 0, own, units).unique(return_inverse=True)
+        rows = torch.zeros(int(place.max()) + 1 if len(place) else 0, 2, dtype=rows.dtype).index_add_(0, place, rows)
+    rows = rows[rows[:, 1] > 0]
+    if len(rows) < 2:
+        return None
     rows = rows[rows[:, 1].argsort(stable=True)]
     rows = rows[rows[:, 0].argsort(stable=True)]
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     means = []
-    for _ in range(resamples):
-        drawn = rows[torch.randint(len(rows), (len(rows),), generator=generator)].sum(dim=0)
-        means.append(drawn[0] / drawn[1])
+    for several in torch.arange(resamples).split(max(1, AT_ONCE // len(rows))):
+        drawn = torch.randint(len(rows), (len(several), len(rows)), generator=generator)
+        means.append(rows[drawn].sum(dim=1))
+    total, count = torch.cat(means).unbind(-1)
     tail = (1 - level) / 2
-    ends = torch.quantile(torch.stack(means), torch.tensor([tail, 1 - tail], dtype=torch.float64))
+    ends = torch.quantile(total / count, torch.tensor([tail, 1 - tail], dtype=torch.float64))
     return ends[0].to(totals.device), ends[1].to(totals.device)

@@ -23,7 +23,8 @@ def joint_error(generated: Tensor, truth: Tensor) -> Tensor:
 class PositionError(ClipMeans):
     """`mpjpe` in metres: mean over samples, frames, agents and 21 joints; not best of S.
 
-    Also `mpjpe_best`, each scene's best sample, and `mpjpe@<t>s` and `mpjpe_best@<t>s`, the same over frames up to t
+    Also `mpjpe_best`, each scene's best sample; `mpjpe_mean`, that of the samples' mean, which does not count their
+    spread and so compares with a method that makes one prediction; and `<name>@<t>s`, the same over frames up to t
     seconds, measured only on clips at least that long.
     """
 
@@ -32,6 +33,8 @@ class PositionError(ClipMeans):
         "mpjpe": Column("MPJPE", "m", "low", MEANING, main=True),
         "mpjpe@1s": Column("MPJPE 1s", "m", "low", f"{MEANING}, up to 1 s", main=True),
         "mpjpe_best": Column("MPJPE best", "m", "low", "distance to the recorded joints, best sample"),
+        "mpjpe_mean": Column("MPJPE mean", "m", "low", "distance of the samples' mean to the recorded joints"),
+        "mpjpe_mean@1s": Column("mean 1s", "m", "low", "MPJPE 1s of the samples' mean pose instead", main=True),
     }
 
     def __init__(
@@ -43,16 +46,19 @@ class PositionError(ClipMeans):
         confidence: float | None = None,
     ) -> None:
         horizons = ["", *(f"@{s:g}s" for s in seconds)]
-        names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best")]
+        names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best", "mpjpe_mean")]
         super().__init__(names, of, agents, confidence)
         self.until = tuple(round(s * fps) for s in seconds)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         error = joint_error(futures.generated, futures.truth)  # (S, B, T, P)
         by_frame = torch.where(futures.scored, error, 0.0).sum(dim=-1)  # (S, B, T)
+        of_mean = joint_error(futures.generated.mean(dim=0), futures.truth)  # (B, T, P)
+        of_mean = torch.where(futures.scored, of_mean, 0.0).sum(dim=-1)  # (B, T)
         people, samples, shares = futures.scored.sum(dim=-1), futures.samples, []  # people (B, T)
         for until in (futures.frames, *self.until):
             upto = until if 0 < until <= futures.frames else 0
             by_sample, count = by_frame[:, :, :upto].sum(dim=-1), people[:, :upto].sum(dim=-1)  # (S, B), (B,)
             shares += [(by_sample.sum(dim=0), count * samples), (by_sample.min(dim=0).values, count)]
+            shares += [(of_mean[:, :upto].sum(dim=-1), count)]
         return shares

@@ -48,6 +48,12 @@ def test_position_errors_equal_a_plain_loop(choose: Choose) -> None:
     for name, until in (("mpjpe@0.5s", 15), ("mpjpe@1s", 30)):
         upto = [d for (_, _, _, t, _), d in distances.items() if t < until]
         assert got[name] == pytest.approx(np.mean(upto), abs=1e-12)
+    for name, until in (("mpjpe_mean", 40), ("mpjpe_mean@0.5s", 15), ("mpjpe_mean@1s", 30)):
+        places = {(b, t, p, j) for b, p, _, t, j in distances if t < until}
+        middle = [
+            math.dist(sum(generated[s, b, t, p, j] for s in range(4)) / 4, truth[b, t, p, j]) for b, t, p, j in places
+        ]
+        assert got[name] == pytest.approx(np.mean(middle), abs=1e-12)
     assert "mpjpe@2s" not in got  # 40 frames are not 2 s
     for name, until in (("mpjpe_best", 40), ("mpjpe_best@0.5s", 15), ("mpjpe_best@1s", 30)):
         best, weight = 0.0, 0

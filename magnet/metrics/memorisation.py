@@ -1,0 +1,88 @@
+"""Memorisation: how near a future comes to what training has shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from magnet.baselines.retrieval import assignments
+from magnet.baselines.windows import Windows
+from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.columns import Column
+from magnet.metrics.futures import Futures, without_pelvis
+
+EVERY = 3
+"""Futures are compared at every third frame."""
+
+CHUNK = 32
+"""Windows compared together, to bound memory."""
+
+
+class NearestTraining(ClipMeans):
+    """`nearest_training` in metres: from each sample's future to the nearest training window, mean over samples.
+
+    A distance is the mean over scored frames, agents and 21 joints, with both futures in the same world: origin
+    between the people and facing as the first of them at the last context frame. What is measured is expected there
+    (`magnet.evaluation.shared_world`); windows are put there once for each order of their people (`assignments`).
+    Only windows with as many people count; a scene that has none is not measured.
+
+    Samples much nearer than recordings that training has not seen (the ground truth's row) repeat the training set.
+
+    Args:
+        windows: of the training set, as long as the scenes that are measured.
+    """
+
+    higher_is_better = None
+
+    columns: ClassVar[Mapping[str, Column]] = {
+        "nearest_training": Column("nearest", "m", "real", "distance to the nearest training window", main=True)
+    }
+
+    def __init__(
+        self, windows: Windows, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None
+    ) -> None:
+        super().__init__(["nearest_training"], of, agents, confidence)
+        self.windows = windows
+        self._placed: dict[int, Tensor] = {}
+
+    def measure(self, futures: Futures) -> Sequence[tuple[Tensor, Tensor]]:
+        scored = futures.scored[:, ::EVERY]
+        total = scored.new_zeros(len(scored), dtype=torch.float64)
+        count = torch.zeros_like(total)
+        for b, there in enumerate(futures.present):
+            people = int(there.sum())
+            if not bool(scored[b].any()) or not len(self.windows.of_people(people)):
+                continue
+            made = without_pelvis(futures.generated[:, b, ::EVERY, there])
+            nearest = nearest_distance(made, self._windows(people), scored[b][:, there])
+            total[b], count[b] = nearest.double().sum(), len(nearest)
+        return [(total, count)]
+
+    def _windows(self, people: int) -> Tensor:
+        """Futures of windows with so many people in the world that all share, in every order. (M, T, n, 21, 3)"""
+        if people not in self._placed:
+            windows = self.windows
+            chosen = windows.of_people(people)
+            frames = torch.arange(windows.context, windows.joints.shape[1], EVERY, device=chosen.device)
+            orders = assignments(people, chosen.device)
+            placed = [windows.shared(chosen, people, frames, order) for order in orders]
+            self._placed[people] = without_pelvis(torch.cat(placed)).transpose(1, 2)
+        return self._placed[people]
+
+
+def nearest_distance(futures: Tensor, windows: Tensor, scored: Tensor) -> Tensor:
+    """Mean distance of joints to the nearest window. (S, T, n, J, 3), (M, T', n, J, 3), (T, n) bool -> (S,) metres
+
+    Over the frames that both have; infinite where that leaves none that is scored.
+    """
+    frames = min(futures.shape[1], windows.shape[1])
+    scored = scored[:frames]
+    made = futures[:, :frames][:, scored].to(windows)  # (S, k, J, 3)
+    least = made.new_full((len(made),), torch.inf)
+    for part in windows[:, :frames].split(CHUNK):
+        away = (made[:, None] - part[:, scored]).norm(dim=-1).mean(dim=(-1, -2))  # (S, m)
+        least = torch.minimum(least, away.nan_to_num(torch.inf).amin(dim=1))
+    return least
