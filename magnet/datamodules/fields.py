@@ -125,10 +125,10 @@ def side_by_side(
         DataError: unequal lengths.
     """
     lengths, said = {someone.name: someone.frames for someone in people}, list(notes)
-    frames = min(lengths.values()) if cut else one_length(where, lengths)
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
-        said.append(f"unequal numbers of frames ({listed}), cut to the shortest")
+    if not cut:
+        one_length(where, lengths)
+    frames, why = shortest(lengths)
+    said += why
     said += [f"{someone.name}: {note}" for someone in people for note in someone.notes]
     known = any(someone.gender for someone in people)
     return Recording(
@@ -141,6 +141,15 @@ def side_by_side(
         notes=tuple(said),
         genders=tuple(someone.gender or "neutral" for someone in people) if known else (),
     )
+
+
+def shortest(lengths: Mapping[str, int]) -> tuple[int, list[str]]:
+    """Frames that everybody has, and a note where somebody has more."""
+    frames = min(lengths.values())
+    if frames == max(lengths.values()):
+        return frames, []
+    listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
+    return frames, [f"unequal numbers of frames ({listed}), cut to the shortest"]
 
 
 # -- folders -----------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, OR_YOURS, one_length, open_npz, require
-from magnet.datamodules.fields import first_folder, listing, mapping, person, side_by_side
+from magnet.datamodules.arrays import AGAIN, OR_YOURS, open_npz, require
+from magnet.datamodules.fields import first_folder, listing, mapping, person, shortest, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.remocap_track import FPS, MAP, file_like, track
@@ -31,7 +31,8 @@ class ReMoCapReader(Reader):
     README and code of its authors spell the files differently; motion_worldpos*.csv, motion_rotation*.csv and any
     sequence folder with a number in its name are taken. Joints are found by the csv's own headings (Hips.X), or else
     in the order of the BVH file. Positions are fitted by the common steps; rotations only prove that joints and units
-    are what they are taken for: some Euler order must lead from motion_offsets.pkl to the positions within 1 cm.
+    are what they are taken for: some Euler order must lead from motion_offsets.pkl to the positions within 1 cm. Two
+    people's files of unequal length are cut to the shorter, as the authors' process_LindyHop.py does, with a note.
 
     Args:
         root: the folder LindyHop or one above; or one of ready fits.
@@ -123,14 +124,15 @@ class ReMoCapReader(Reader):
         positions, rates, notes = zip(*tracks, strict=True)
         if abs(rates[0] - rates[1]) > 0.01 * rates[0]:
             raise DataError(f"{folder}: people were recorded at {rates[0]:g} and {rates[1]:g} fps; {AGAIN}")
-        one_length(folder, {one: len(places) for one, places in zip(PEOPLE, positions, strict=True)})
+        frames, cut = shortest({one: len(places) for one, places in zip(PEOPLE, positions, strict=True)})
+        said = [f"{one}: {note}" for one, found in zip(PEOPLE, notes, strict=True) for note in found]
         return Recording(
             fps=rates[0],
             up="+y",
-            positions=np.stack(positions, axis=1),
+            positions=np.stack([places[:frames] for places in positions], axis=1),
             joints=tuple(MAP),
             persons=PEOPLE,
-            notes=tuple(f"{one}: {note}" for one, said in zip(PEOPLE, notes, strict=True) for note in said),
+            notes=(*cut, *said),
         )
 
     def _fit(self, path: Path) -> Recording:

@@ -246,6 +246,21 @@ def test_a_missing_partner_is_refused_when_read_and_only_then(copy: Path) -> Non
         read(copy)
 
 
+@pytest.mark.parametrize("person", ["0", "1"])
+def test_two_people_of_unequal_length_are_cut_to_the_shorter(copy: Path, person: str) -> None:
+    """As the authors' process_LindyHop.py does; files of one person still have to agree."""
+    whole = read(copy)
+    folder = (copy / PERSON).with_name(person)
+    for file in ("motion.bvh", "motion_worldpos.csv", "motion_rotations.csv"):
+        shortened(folder / file, 3)
+    edited(folder / "motion.bvh", f"Frames: {TOTAL}", f"Frames: {TOTAL - 3}")
+    found = read(copy)
+    assert np.array_equal(found.positions, whole.positions[:-3])  # type: ignore[arg-type, index]
+    lengths = {"0": TOTAL, "1": TOTAL} | {person: TOTAL - 3}
+    listed = ", ".join(f"{one} {length}" for one, length in lengths.items())
+    assert f"unequal numbers of frames ({listed}), cut to the shortest" in found.notes
+
+
 def test_a_number_twice_is_refused(copy: Path) -> None:
     shutil.copytree(copy / "ReMoCap/LindyHop/train/3", copy / "ReMoCap/LindyHop/test/seq_03")
     with pytest.raises(DataError, match="has the number of"):
