@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magnet.api import Model, Motion, load, read
-    from magnet.body import load_body
+    from magnet.body import load_body, on_floor
     from magnet.denoiser.module import Denoiser
     from magnet.motion.scene import Scene
     from magnet.tasks.registry import register_task
@@ -24,6 +24,7 @@ __all__ = [
     "__version__",
     "load",
     "load_body",
+    "on_floor",
     "read",
     "register_task",
 ]
@@ -37,6 +38,7 @@ _EXPORTS = {
     "Tokenizer": "magnet.tokenizer.module",
     "load": "magnet.api",
     "load_body": "magnet.body",
+    "on_floor": "magnet.body",
     "read": "magnet.api",
     "register_task": "magnet.tasks.registry",
 }

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from magnet.body import Body, load_body
+from magnet.body import Body, load_body, on_floor
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
@@ -103,6 +103,10 @@ class Motion(Scene):
     def vertices(self) -> Tensor:
         """World vertices of everybody. -> (B, T, P, V, 3) metres"""
         return self._body().vertices(self)
+
+    def on_floor(self) -> Motion:
+        """The same motion with whoever stands lowest on y = 0, where models have their floor; each scene by itself."""
+        return Motion.of(on_floor(self.plain(), self._body()), self.model, self.notes)
 
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write the format of the path's suffix: .npz .bvh .glb .csv .html .mp4 .gif .webp .png.

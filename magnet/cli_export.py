@@ -24,6 +24,7 @@ for example:
   magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
   magnet export duet.npz duet.bvh --unit cm
   magnet export duet.npz leader.glb --person 0
+  magnet export upstairs.npz duet.npz --on-floor
 """
 
 
@@ -43,6 +44,9 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
+    options.add_argument(
+        "--on-floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
+    )
     options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
     options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
     pictures = options.add_argument_group("pictures, films and pages")
@@ -64,7 +68,9 @@ def parser() -> argparse.ArgumentParser:
     bvh.add_argument("--in-unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
     bvh.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
     bvh.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
-    bvh.add_argument("--keep-floor", action="store_true", help="leave people at the height they were recorded at")
+    bvh.add_argument(
+        "--keep-floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
+    )
     bvh.add_argument(
         "--joint", action="append", default=[], metavar="OURS=THEIRS", help="left_hip=Thigh_L, where names say nothing"
     )
@@ -79,6 +85,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         ValueError: files that cannot be read or written; says what to do.
     """
     options = parser().parse_args(list(arguments))
+    from magnet.body import on_floor
     from magnet.cli import CommandError
     from magnet.export import formats
 
@@ -100,6 +107,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     for note in got.notes:
         print(note)
     scene = got.scene
+    if options.on_floor:
+        if options.keep_floor:
+            raise CommandError("--on-floor moves people, --keep-floor leaves them: choose one")
+        scene = on_floor(scene, got.body)
     if options.scene is not None:
         if not 0 <= options.scene < scene.scenes:
             raise CommandError(f"--scene {options.scene}: the file has scenes 0 to {scene.scenes - 1}")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
 
 from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.inputs import check_given, check_request
 from magnet.denoiser.module import Denoiser
 from magnet.motion.scene import Scene, joined, require_rate
 from magnet.motion.tokens import STRIDE
@@ -29,8 +31,8 @@ class Partner:
         generator: source of randomness, on the model's device.
 
     Raises:
-        ValueError: another frame rate than the model's, less than a token of past, no such agent, or nobody left to
-            be answered.
+        ValueError: another frame rate or floor than the model's, motion that is not finite, less than a token of
+            past, no such agent, or nobody left to be answered.
     """
 
     def __init__(
@@ -42,11 +44,13 @@ class Partner:
         generator: torch.Generator | None = None,
     ) -> None:
         require_rate(past, "past")
+        check_request(denoiser, past, 0, 0, 1)
         if past.frames < STRIDE:
             raise ValueError(f"past: got {past.frames} frames, expected at least {STRIDE}, of everybody")
         self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents))
         self.options, self.generator = options or SamplerOptions(), generator
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
+        check_given(past, torch.ones(past.frames // STRIDE, past.agents, dtype=torch.bool), self.options.any_floor)
         self.most = max(denoiser.window - ANSWERED, 1) * STRIDE
         self.past = past.replace(valid=None, given=None)
         self._forget()
@@ -59,7 +63,7 @@ class Partner:
                 of those who answer nothing is read.
 
         Raises:
-            ValueError: not a whole number of tokens, or other scenes, people or frame rate.
+            ValueError: not a whole number of tokens, motion that is not finite, or other scenes, people or frame rate.
         """
         require_rate(frames, "frames")
         if not frames.frames or frames.frames % STRIDE:
@@ -69,9 +73,9 @@ class Partner:
         if frames.present.shape != self.past.present.shape or not torch.equal(frames.present, self.past.present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
         so_far = joined([self.past, frames.replace(valid=None, given=None)])
-        whole = self.denoiser.generate(
-            so_far, self.task, self.past.frames, frames.frames, 1, self.options, self.generator
-        )
+        # Where the floor is was seen in the past: an answer must not fail because somebody jumps or is carried.
+        options = dataclasses.replace(self.options, any_floor=True)
+        whole = self.denoiser.generate(so_far, self.task, self.past.frames, frames.frames, 1, options, self.generator)
         whole = whole.order(torch.arange(frames.agents)).to(str(frames.device))
         self.past = whole.replace(given=None)
         self._forget()

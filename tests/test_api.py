@@ -151,6 +151,15 @@ def test_files_of_any_kind_are_read_at_the_models_rate(model: Model, duet: Scene
     assert model.continue_(motion, frames=8, seed=1).frames == 32
 
 
+def test_a_motion_is_put_on_the_floor_with_its_own_body(duet: Scene):
+    T_world_root = duet.T_world_root.clone()
+    T_world_root[..., 1, 3] += 2.0
+    high = Motion.of(duet.replace(T_world_root=T_world_root), load_body(), ["read"])
+    low = high.on_floor()
+    assert isinstance(low, Motion) and low.model is high.model and low.notes == ("read",)
+    assert torch.allclose(low.T_world_root, magnet.on_floor(duet).T_world_root, atol=1e-5)
+
+
 def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
     with pytest.raises(ValueError, match="people: got 4, the model takes 1 to 3"):
         model.generate(people=4)

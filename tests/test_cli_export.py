@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from magnet import cli
-from magnet.body import JOINT_NAMES, PARENTS, load_body
+from magnet.body import JOINT_NAMES, PARENTS, load_body, on_floor
 from magnet.export import save_bvh
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene
@@ -140,3 +140,17 @@ def test_help_names_every_suffix_without_importing_torch():
     from magnet.export.formats import WRITTEN
 
     assert all(suffix in done.stdout for suffix in WRITTEN)
+
+
+def test_people_are_put_on_the_floor_where_one_asks_for_it(tmp_path: Path, capsys):
+    scene = random_scene(2, 20, 2, torch.Generator().manual_seed(0))
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[1, :, :, 1, 3] += 3.0
+    high = scene.replace(T_world_root=T_world_root).save(tmp_path / "high.npz")
+    out = tmp_path / "low.npz"
+    assert cli.main(["export", str(high), str(out), "--on-floor"]) == 0
+    assert "everybody stands" in capsys.readouterr().out
+    assert torch.equal(Scene.load(out).T_world_root, on_floor(Scene.load(high)).T_world_root)
+    assert Scene.load(out).T_world_root[..., 1, 3].max() < 1.5
+    assert cli.main(["export", str(high), str(out), "--on-floor", "--keep-floor"]) == 2
+    assert "choose one" in capsys.readouterr().err

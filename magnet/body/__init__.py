@@ -1,7 +1,8 @@
-"""Body models: shape, joints, vertices and capsules of a person; the mirror image of a scene."""
+"""Body models: shape, joints, vertices and capsules of a person; scenes mirrored, and put on the floor."""
 
 from magnet.body.base import JOINT_NAMES, MIRROR, PARENTS, Body, load_body
 from magnet.body.capsules import CAPSULES, Capsule, capsule_segments
+from magnet.body.floor import on_floor
 from magnet.body.mirror import mirror_scene
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "capsule_segments",
     "load_body",
     "mirror_scene",
+    "on_floor",
 ]

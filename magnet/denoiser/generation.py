@@ -50,6 +50,7 @@ class SamplerOptions:
             `shift` and `trust` chosen on validation scenes (docs/results.md).
         shift: over 1, more of the denoising steps at high noise levels, where what has yet to be decided is decided
             (ours); 1 spaces them evenly, as the paper does.
+        any_floor: take people who all stand far from y = 0, where models have their floor, as they are.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
             passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
@@ -65,6 +66,7 @@ class SamplerOptions:
     blend: int = 10
     eta: float = 1.0
     shift: float = 3.0
+    any_floor: bool = False
     guidance: Guidance = field(default_factory=Guidance)
     noise_sampling: NoiseSampling = "joint"
 

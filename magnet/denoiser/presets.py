@@ -19,6 +19,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM
         "shift": 1.0,  # A.3: even steps
+        "any_floor": False,  # recordings stand on the floor
         "guidance": {"kind": "none", "weight": 1.0, "literal": True, "smooth": 0.0, "context_level": 0},  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2
     },

@@ -21,6 +21,8 @@ from magnet.denoiser.generation import (
     scrub,
     task_sight,
 )
+from magnet.denoiser.inputs import check_given, check_request
+from magnet.denoiser.transformer import without_dropout
 from magnet.motion.scene import Scene, joined
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
@@ -125,16 +127,10 @@ class Stream:
         health: Health | None,
         piece: int,
     ) -> None:
-        model.require_tokenizer()
+        check_request(model, scene, context, frames, samples)
         layout = model.layout
-        if context % STRIDE:
-            raise ValueError(
-                f"context of {context} frames is not a multiple of {STRIDE}: cut the scene to whole tokens"
-            )
-        if scene.agents > layout.agents:
-            raise ValueError(f"the scene has {scene.agents} agents, the model was built for {layout.agents}")
         self.model, self.options, self.piece = model, options or SamplerOptions(), piece
-        self.scene = scene.replace(given=None).to(model.device).pad_agents(layout.agents)
+        self.scene = scene.replace(given=None).single().to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.health = samples, progress, health or Health()
         self.frames = None if frames is None else context + frames
         if self.frames is not None and scene.frames >= self.frames:
@@ -161,6 +157,7 @@ class Stream:
         if layout.relation_noise == "token":
             self.related = torch.zeros_like(self.known)
             self.related[: scene.frames // STRIDE] = True
+        check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
         self.health.begin(B)
@@ -211,7 +208,7 @@ class Stream:
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.health.add_call(len(noisy))
-        with torch.autocast(*self._autocast):
+        with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
             return self.model.denoise(noisy, levels, present).float()
 
     @torch.no_grad()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 import torch
@@ -43,6 +45,19 @@ def block_causal(time: Tensor, size: int) -> Tensor:
     """
     block = time // size
     return block[:, None] >= block[None, :]
+
+
+@contextmanager
+def without_dropout(network: nn.Module) -> Iterator[None]:
+    """Within it a network drops nothing out, whatever mode it is in; it is left in that mode."""
+    training = network.training
+    if training:
+        network.eval()
+    try:
+        yield
+    finally:
+        if training:
+            network.train()
 
 
 class Block(nn.Module):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from magnet.body import Body, load_body
+from magnet.body import Body, load_body, on_floor
+from magnet.body.floor import level
 from magnet.export.bvh import Unit, save_bvh
 from magnet.export.cast import Style
 from magnet.export.glb import save_glb
@@ -58,7 +59,7 @@ class Reading:
         unit: of a BVH's lengths; None: by the length of its legs.
         up: axis of the file that points up; None: found.
         joints: for BVH: our joint's name: theirs, where no naming scheme fits.
-        keep_floor: leave people whose skeleton had to be fitted at the height they were recorded at.
+        keep_floor: leave people of other programs' files at the height they were recorded at.
     """
 
     fps: float | None = None
@@ -103,24 +104,44 @@ def read(
         if imported.floor:
             way = "lowered" if imported.floor > 0 else "raised"
             notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
-        return Read(imported.scene, body, tuple(notes))
-    scenes, notes = [], []
+        return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
+    scenes, notes, foreign = [], [], False
     for file in files:
-        scene, note = _read_npz(file, body, options.up)
+        scene, note, strange = _read_npz(file, body, options.up)
         scenes.append(scene)
         notes += note
+        foreign |= strange
     if len(scenes) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
-        return Read(scene, body, tuple(notes))
+        return _grounded(scene, body, notes, foreign and not options.keep_floor)
     for file, scene in zip(files, scenes, strict=True):
         if scene.scenes != 1:
             raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
     labels = [str(file) for file in files]
-    return Read(together(scenes, labels, fps=options.fps, trim=options.trim), body, tuple(notes))
+    scene = together(scenes, labels, fps=options.fps, trim=options.trim)
+    return _grounded(scene, body, notes, foreign and not options.keep_floor)
 
 
-def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str]]:
-    """A scene of ours or SMPL-X's keys, told apart by what they hold."""
+def _grounded(scene: Scene, body: Body, notes: Sequence[str], moves: bool) -> Read:
+    """Everybody put on the floor where they are far from it and other programs made the file."""
+    metres = level(scene, body)
+    if metres and moves:
+        way = "lowered" if metres > 0 else "raised"
+        notes = [*notes, f"everybody was {way} by {abs(metres):.2f} m onto the floor; --keep-floor leaves them"]
+        return Read(on_floor(scene, body), body, tuple(notes))
+    return Read(scene, body, (*notes, *_floor_note(scene, body)))
+
+
+def _floor_note(scene: Scene, body: Body) -> list[str]:
+    metres = level(scene, body)
+    if not metres:
+        return []
+    where = "over" if metres > 0 else "under"
+    return [f"everybody stands {abs(metres):.2f} m {where} y = 0, where models have their floor; see --on-floor"]
+
+
+def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str], bool]:
+    """A scene of ours or SMPL-X's keys, told apart by what they hold; notes; whether other programs wrote it."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     if not zipfile.is_zipfile(path):
@@ -136,14 +157,14 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str]]
             raise ValueError(
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
             )
-        return scene, []
+        return scene, [], False
     scene = load_smplx(path, body, up)
     note = []
     if "body" not in keys and body.id.startswith("open"):
         note.append(
             f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
         )
-    return scene, note
+    return scene, note, "body" not in keys
 
 
 def write(

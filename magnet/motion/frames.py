@@ -98,7 +98,7 @@ def canonical_steps(T_world_can: Tensor) -> Tensor:
     """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same"""
     before = torch.cat([T_world_can[..., :1, :, :, :], T_world_can[..., :-1, :, :, :]], dim=-4)
     steps = inverse(before) @ T_world_can
-    steps[..., 0, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
+    steps[..., :1, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
     return steps
 
 

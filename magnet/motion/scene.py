@@ -61,6 +61,10 @@ class Scene:
             got = tuple(getattr(self, field).shape)
             if got != want:
                 raise ValueError(f"{field}: got {got}, expected {want} for {B} scenes, {T} frames, {P} agents")
+        for field, tensor in self.tensors().items():
+            flags = field in ("present", "valid", "given")
+            if (tensor.dtype == torch.bool) != flags or not (flags or tensor.is_floating_point()):
+                raise ValueError(f"{field}: got {tensor.dtype}, expected {'bool' if flags else 'a float type'}")
         if self.names and len(self.names) != B:
             raise ValueError(f"names: got {len(self.names)} for {B} scenes")
 
@@ -99,6 +103,11 @@ class Scene:
         """The same scene on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
 
+    def single(self) -> Scene:
+        """The same scene in float32, as models take it."""
+        floats = {name: value.float() for name, value in self.tensors().items() if value.dtype != torch.bool}
+        return self if all(value is getattr(self, name) for name, value in floats.items()) else self.replace(**floats)
+
     def cut(self, start: int, stop: int | None = None) -> Scene:
         """Frames `start:stop` of every scene."""
         return self.picked(slice(start, stop))
@@ -106,7 +115,8 @@ class Scene:
     def pick(self, scenes: Tensor | Sequence[int] | slice) -> Scene:
         """Some of the B scenes, in the order given."""
         if not isinstance(scenes, slice):
-            scenes = torch.as_tensor(scenes, device=self.device)
+            empty = not isinstance(scenes, Tensor) and not len(scenes)
+            scenes = torch.as_tensor(scenes, device=self.device, dtype=torch.long if empty else None)
             if scenes.dtype == torch.bool:
                 scenes = scenes.nonzero()[:, 0]
         chosen = torch.arange(self.scenes, device=self.device)[scenes].tolist()

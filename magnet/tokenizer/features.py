@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, pose_features, posed
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, require_rate
 from magnet.motion.tokens import STRIDE, scene_steps
 from magnet.tokenizer.codebook import sum_over_processes
 
@@ -27,7 +27,12 @@ class Features:
 
 
 def features(scene: Scene) -> Features:
-    """Read a scene, cut to a whole number of tokens."""
+    """Read a scene, cut to a whole number of tokens.
+
+    Raises:
+        ValueError: another frame rate than the model's.
+    """
+    require_rate(scene)
     scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
     # Mixed precision would round the products of transforms.
     with torch.autocast(scene.device.type, enabled=False):
@@ -84,6 +89,6 @@ def fold(x: Tensor) -> Tensor:
     return x.transpose(1, 2).flatten(0, 1)
 
 
-def unfold(x: Tensor, agents: int) -> Tensor:
-    """(B P, T, ...) -> (B, T, P, ...)"""
-    return x.unflatten(0, (-1, agents)).transpose(1, 2)
+def unfold(x: Tensor, like: Tensor) -> Tensor:
+    """Inverse of `fold` of `like`. (B P, T, ...), (B, _, P, ...) -> (B, T, P, ...)"""
+    return x.unflatten(0, (like.shape[0], like.shape[2])).transpose(1, 2)

@@ -180,14 +180,14 @@ class Tokenizer(L.LightningModule):
             known = torch.stack([valid, step_known(valid)], dim=-1)
         known = known.repeat_interleave(P, dim=0)
         vectors = self.vqvae.encode(fold(pose), betas.flatten(0, 1), fold(steps), known)
-        return unfold(vectors, P)
+        return unfold(vectors, pose)
 
     def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
         P = latent.shape[2]
         known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
         pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
         with torch.autocast(pose.device.type, enabled=False):
-            return proper(unfold(pose, P))
+            return proper(unfold(pose, latent))
 
     # -- statistics and start ------------------------------------------------------------------
 

@@ -158,7 +158,7 @@ class VQVAE(nn.Module):
         self, pose: int, latent: int, hidden: int, depth: int, causal: bool, stride: int, std_floor: float
     ) -> None:
         super().__init__()
-        self.stride = stride
+        self.stride, self.latent = stride, latent
         self.pose = Standard(pose, std_floor)
         self.steps = Standard(9, std_floor)
         # Shape numbers come in units of a population's spread; few people in training must not narrow that,
@@ -176,6 +176,8 @@ class VQVAE(nn.Module):
         seen = torch.where(known[..., :1], self.pose(pose), 0.0)
         moved = torch.where(known[..., 1:], self.steps(steps), 0.0)
         inputs = torch.cat([seen, moved, shape], dim=-1)
+        if not inputs.numel():  # convolutions refuse nothing
+            return inputs.new_zeros(len(pose), pose.shape[1] // self.stride, self.latent)
         return self.encoder(inputs.to(dtype_of(self.encoder))).float()
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, known: Tensor | None = None) -> Tensor:
@@ -185,4 +187,6 @@ class VQVAE(nn.Module):
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
         inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)
+        if not inputs.numel():
+            return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
         return self.pose.restore(self.decoder(inputs.to(dtype_of(self.decoder))))

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.generation import SamplerOptions
+from magnet.denoiser.inputs import check_given
 from magnet.denoiser.module import Denoiser
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, absent, joined, require_rate
@@ -85,7 +86,8 @@ class Live:
         asked: whether the next piece is to be made `between` the keyframes.
 
     Raises:
-        ValueError: more people than the model has slots, or `start` is shorter than `CONTEXT`.
+        ValueError: more people than the model has slots, `start` is shorter than `CONTEXT`, or motion that the model
+            cannot go on from.
     """
 
     def __init__(
@@ -98,6 +100,9 @@ class Live:
     ) -> None:
         self.model = model
         self.generator = generator or torch.Generator(device=model.device).manual_seed(1)
+        if partner is not None:
+            require_rate(partner, "partner")
+            check_given(partner, torch.ones(partner.frames // STRIDE, partner.agents, dtype=torch.bool))
         self.partner = partner
         self.settings = Settings()
         self.keys: list[Keyframe] = []
@@ -143,7 +148,10 @@ class Live:
                 f"start: {start.scenes} scenes, {start.frames} frames, {start.agents} agents; expected 1, at least "
                 f"{CONTEXT}, at most {slots}"
             )
+        if not bool(start.present.any()):
+            raise ValueError("start: nobody is there to go on")
         require_rate(start, "start")
+        check_given(start, torch.ones(start.frames // STRIDE, start.agents, dtype=torch.bool))
 
     def restart(self, frame: int) -> int:
         """Forget what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
@@ -255,8 +263,10 @@ class Live:
 
     def _sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
         # A piece fits into the window, so denoising it all at once costs the fewest steps.
+        # What it has made itself is not asked where its floor is.
         settings = self.settings
-        options = dataclasses.replace(settings.sampler, steps=settings.steps, rolling=0, guidance=settings.guidance)
+        own: dict[str, Any] = {"steps": settings.steps, "guidance": settings.guidance, "rolling": 0, "any_floor": True}
+        options = dataclasses.replace(settings.sampler, **own)
         longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
         return longer.order(torch.arange(scene.agents)).to("cpu").replace(names=())
 

@@ -149,3 +149,38 @@ def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, bo
     assert twice is not None and twice[0].sum(dim=0).tolist() == [11, 0]  # frame 5.5 is half generated
     both = formats.together([said.order([0]), duet.order([1])], ["a", "b"])
     assert torch.equal(both.given, given)  # type: ignore[arg-type]
+
+
+# -- the floor ---------------------------------------------------------------------------------
+
+
+def upstairs(duet: Scene, path: Path, body: Body, ours: bool) -> Path:
+    """A duet two metres over the floor, in a file of ours or, without the body's name, of another program."""
+    T_world_root = duet.T_world_root.clone()
+    T_world_root[..., 1, 3] += 2.0
+    (path,) = formats.write(duet.replace(T_world_root=T_world_root), path, body, smplx=True)
+    if not ours:
+        with np.load(path) as file:
+            np.savez(path, **{key: file[key] for key in file.files if key != "body"})
+    return path
+
+
+def test_another_programs_people_are_put_on_the_floor_and_ours_stay(duet: Scene, body: Body, tmp_path: Path):
+    expected = duet.T_world_root[..., 1, 3]
+    theirs = upstairs(duet, tmp_path / "a.npz", body, ours=False)
+    lowered = formats.read(theirs)
+    away = lowered.scene.T_world_root[..., 1, 3] - expected
+    assert away.abs().max() < 0.25 and (away - away.flatten()[0]).abs().max() < 1e-2
+    assert any("lowered by" in note and "--keep-floor" in note for note in lowered.notes)
+    for kept in (
+        formats.read(theirs, options=formats.Reading(keep_floor=True)),
+        formats.read(upstairs(duet, tmp_path / "b.npz", body, ours=True)),
+    ):
+        assert torch.allclose(kept.scene.T_world_root[..., 1, 3], expected + 2, atol=1e-2)
+        assert any("m over y = 0, where models have their floor; see --on-floor" in note for note in kept.notes)
+
+
+def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, tmp_path: Path):
+    for name, smplx in (("a.npz", False), ("b.npz", True), ("c.bvh", False)):
+        notes = formats.read(formats.write(duet, tmp_path / name, body, smplx=smplx)).notes
+        assert not any("y = 0" in note or "floor" in note for note in notes)

@@ -142,3 +142,23 @@ def test_a_damaged_file_is_refused_by_name(scene, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="not a scene file"):
             Scene.load(path)
+
+
+def test_no_scenes_can_be_picked(scene: Scene):
+    for nothing in ([], torch.zeros(2, dtype=torch.bool), slice(0, 0)):
+        assert scene.pick(nothing).scenes == 0
+
+
+def test_tensors_of_other_types_are_named(scene: Scene):
+    with pytest.raises(ValueError, match=r"present: got torch\.float32, expected bool"):
+        scene.replace(present=scene.present.float())
+    with pytest.raises(ValueError, match=r"betas: got torch\.int64, expected a float type"):
+        scene.replace(betas=scene.betas.long())
+    with pytest.raises(ValueError, match=r"given: got torch\.uint8, expected bool"):
+        scene.replace(given=torch.ones(scene.T_world_root.shape[:3], dtype=torch.uint8))
+
+
+def test_a_scene_in_single_precision_is_itself(scene: Scene):
+    assert scene.single() is scene
+    double = scene.replace(body_rot=scene.body_rot.double())
+    assert double.single().body_rot.dtype == torch.float32 and torch.equal(double.single().body_rot, scene.body_rot)

@@ -17,7 +17,7 @@ from magnet.body import load_body
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import by_token, scene_steps
-from magnet.testing import random_scene, without_absent
+from magnet.testing import random_scene, tiny_denoiser, without_absent
 from magnet.tokenizer import RawPose, Tokenizer
 from magnet.tokenizer.features import features
 
@@ -367,3 +367,27 @@ def test_raw_poses_return_exactly(scene: Scene) -> None:
         raw.set_statistics([scene])
     torch.testing.assert_close(latent.mean(), torch.tensor(0.0), atol=0.2, rtol=0)
     assert not list(raw.parameters())
+
+
+def test_nothing_in_nothing_out():
+    """No scenes, no people or less than a token of frames: no tokens, and no motion."""
+    tokenizer = tiny_denoiser(2).tokenizer
+    scene = random_scene(2, 16, 2, torch.Generator().manual_seed(0))
+    nobody = torch.tensor([], dtype=torch.long)
+    for empty, shape in [
+        (scene.pick([]), (0, 4, 2)),
+        (scene.order(nobody), (2, 4, 0)),
+        (scene.cut(0, 0), (2, 0, 2)),
+        (scene.cut(0, 3), (2, 0, 2)),
+    ]:
+        assert tokenizer.encode_scene(empty).shape == (*shape, tokenizer.latent)
+        again = tokenizer.reconstruct(empty)
+        assert (again.scenes, again.frames, again.agents) == (shape[0], 4 * shape[1], shape[2])
+
+
+def test_a_tokenizer_takes_the_frame_rate_it_was_trained_on():
+    tokenizer = tiny_denoiser(2).tokenizer
+    scene = random_scene(1, 16, 1, torch.Generator().manual_seed(0)).replace(fps=60.0)
+    for use in (tokenizer.encode_scene, tokenizer.reconstruct):
+        with pytest.raises(ValueError, match="runs at 60 fps, the model at 30"):
+            use(scene)

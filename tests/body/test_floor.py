@@ -1,0 +1,148 @@
+"""Whose floor is not y = 0 is told from whoever jumps, lies, crawls or stands on the hands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+import roma
+import torch
+from torch import Tensor
+
+from magnet.body import load_body
+from magnet.body.floor import JUMP, lowest, off_floor, on_floor, standing
+from magnet.datamodules.asf_amc import read_amc, read_asf
+from magnet.datamodules.synthetic import Synthetic
+from magnet.export.bvh_read import read_bvh
+from magnet.motion.frames import from_planar
+from magnet.motion.scene import Scene, absent
+from magnet.synthesis import COUPLINGS
+
+BODY = load_body()
+CONTEXTS = (4, 8, JUMP - 1, JUMP, 32)
+
+
+def lifted(scene: Scene, metres: float) -> Scene:
+    return scene.moved(torch.eye(4) + metres * torch.eye(4)[1][:, None] * torch.eye(4)[3])
+
+
+def still(rotation: list[float], height: float, frames: int = 40) -> Scene:
+    """Somebody in the rest pose, turned by a rotation vector, pelvis at a height."""
+    scene = absent(1, frames, 1, torch.zeros(())).replace(present=torch.ones(1, 1, dtype=torch.bool))
+    T = scene.T_world_root.clone()
+    T[..., :3, :3] = roma.rotvec_to_rotmat(torch.tensor(rotation, dtype=torch.float32))
+    T[..., 1, 3] = height
+    return scene.replace(T_world_root=T)
+
+
+def off(scene: Scene) -> float:
+    return float(off_floor(lowest(scene), scene.present[:, None].expand(scene.T_world_root.shape[:3]))[0])
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_nobody_of_a_synthetic_scene_is_off_the_floor_and_everybody_is_once_it_is_moved(coupling):
+    scene = Synthetic(couplings=[coupling], test_clips=1).scene("test", 0).scene
+    assert standing(lowest(scene), torch.ones(scene.T_world_root.shape[:3]).bool()).abs().max() < 0.02
+    assert off(scene) == 0.0
+    for metres in (1.0, 0.4, -0.4, -1.0, 90.0):
+        assert off(lifted(scene, metres)) == pytest.approx(metres, abs=0.02)
+    for metres in (0.1, -0.1):
+        assert off(lifted(scene, metres)) == 0.0
+
+
+def test_heights_are_those_of_the_skin():
+    """Of people at rest: their lowest vertex, to the thickness of a sole."""
+    scene = still([0.0, 0.0, 0.0], 0.95)
+    assert lowest(scene)[0, 0, 0] == pytest.approx(float(BODY.vertices(scene)[0, 0, 0, :, 1].min()), abs=0.01)
+    lying = still([-torch.pi / 2, 0.0, 0.0], 0.1)
+    assert lowest(lying)[0, 0, 0] == pytest.approx(float(BODY.vertices(lying)[0, 0, 0, :, 1].min()), abs=0.12)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "height"),
+    [([-1.57, 0, 0], 0.12), ([1.57, 0, 0], 0.12), ([0, 0, 1.57], 0.7), ([3.14, 0, 0], 0.75), ([0, 0, 0], 0.93)],
+    ids=["on the back", "on the belly", "on one arm", "on the head", "standing"],
+)
+def test_wherever_the_feet_are_whoever_touches_the_floor_is_on_it(rotation, height):
+    assert off(still(rotation, height)) == 0.0
+
+
+def test_somebody_in_the_air_is_not_off_the_floor_unless_for_longer_than_anybody_jumps():
+    jump = lifted(still([0, 0, 0], 0.93), 0.7)
+    assert off(jump.cut(0, JUMP - 1)) == 0.0
+    assert off(jump.cut(0, JUMP)) == pytest.approx(0.7, abs=0.05)
+    assert off(lifted(still([0, 0, 0], 0.93), -0.7).cut(0, 4)) == pytest.approx(-0.7, abs=0.05)  # nobody sinks
+
+
+def test_one_person_on_the_floor_clears_the_scene():
+    two = torch.cat([lowest(still([0, 0, 0], 0.93)), lowest(still([0, 0, 0], 2.0))], dim=2)
+    everywhere = torch.ones_like(two).bool()
+    assert float(off_floor(two, everywhere)) == 0.0
+    alone = everywhere.clone()
+    alone[..., 0] = False  # the first is not looked at
+    assert float(off_floor(two, alone)) > 1.0
+    assert float(off_floor(two, torch.zeros_like(alone))) == 0.0
+
+
+def test_scenes_are_put_on_the_floor_each_by_itself():
+    scene = Synthetic(test_clips=1).scene("test", 0).scene.cut(0, 60)
+    both = torch.tensor([1.0, -0.5])
+    high = scene.repeat(2).moved(from_planar(torch.zeros(2), torch.zeros(2, 2))[:, None, None])
+    T = high.T_world_root.clone()
+    T[..., 1, 3] += both[:, None, None]
+    placed = on_floor(high.replace(T_world_root=T))
+    assert standing(lowest(placed), placed.present[:, None].expand(2, 60, -1)).amin(dim=1).abs().max() < 1e-5
+    assert torch.allclose(placed.T_world_root[0], placed.T_world_root[1], atol=1e-5)
+    other = scene.T_world_root[..., [0, 2], 3]
+    assert torch.equal(placed.T_world_root[:1, ..., [0, 2], 3], other)
+
+
+def test_nobody_and_nothing_is_put_nowhere():
+    nobody = absent(2, 4, 2, torch.zeros(()))
+    assert torch.equal(on_floor(nobody).T_world_root, nobody.T_world_root)
+    assert on_floor(nobody.cut(0, 0)).frames == 0
+
+
+def test_shapes_of_another_body_are_taken_for_average_ones():
+    scene = still([0, 0, 0], 0.93).replace(body="mine", betas=torch.full((1, 1, 10), 50.0))
+    assert off(scene) == 0.0
+
+
+# -- recordings --------------------------------------------------------------------------------
+
+
+LEAPS = ("test__jumping__jumping_1", "train__jumping__jumping_5", "05_05", "05_17", "90_31", "131_07", "131_08")
+"""Takes with the longest and highest leaps, and a foot that dips into the floor."""
+
+
+def recorded(folder: Path, takes: Sequence[str] | None) -> Iterator[tuple[str, Tensor]]:
+    """The lowest joint of everybody in each frame of some takes (None: all) at 30 fps. (T,) each"""
+    for path in sorted(folder.glob("bvh/*.bvh")):
+        if takes is not None and path.stem not in takes:
+            continue
+        file = read_bvh(path)
+        yield path.stem, torch.from_numpy(file.world()[1][:, :, 1].min(axis=1))[:: round(file.fps / 30)] * 0.0254 / 0.45
+    for path in sorted([*folder.glob("singles/*.amc"), *folder.glob("salsa/*.amc")]):
+        if takes is not None and path.stem not in takes:
+            continue
+        subject = path.stem.split("_")[0]
+        fps = 60.0 if subject in ("60", "61", "143") else 120.0
+        ends = read_amc(path, read_asf(path.with_name(f"{subject}.asf")), fps).world()[1]
+        yield path.stem, torch.from_numpy(ends[:, :, 1].min(axis=1))[:: round(fps / 30)]
+
+
+@pytest.mark.parametrize("takes", [LEAPS, pytest.param(None, marks=pytest.mark.slow)], ids=["leaps", "all"])
+def test_no_stretch_of_a_recording_is_taken_for_off_the_floor(cmu_root, takes):
+    """Jumps, leaps, rolls and cartwheels included, at every frame and context, of each person alone."""
+    count = 0
+    for name, height in recorded(cmu_root, takes):
+        height = (height - height.quantile(0.5)).float()
+        for frames in CONTEXTS:
+            if len(height) < frames:
+                continue
+            windows = height.unfold(0, frames, 1)[..., None]  # (n, frames, 1)
+            away = off_floor(windows, torch.ones_like(windows).bool())
+            assert not away.any(), f"{name}: {float(away.abs().max()):.2f} m in {frames} frames"
+            count += len(windows)
+    assert count > (4_000 if takes else 100_000)
