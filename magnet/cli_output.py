@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from magnet import cli_record
-from magnet.evaluation import Evaluation
+from magnet.evaluation import UNALIGNED, Evaluation
 from magnet.motion.scene import Scene
 from magnet.report import machine, print_table
 
@@ -21,19 +23,34 @@ PANELS = 4
 """Samples that a moving picture shows side by side."""
 
 
-def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any]) -> None:
-    """Print the table; write it as JSON and CSV, with how it came about."""
+WIDE = 100
+"""Columns that a table may have where it is written to no screen."""
+
+
+def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
+    """Print the table; write all of it as JSON and CSV, with how it came about.
+
+    Args:
+        evaluation: a run that is finished.
+        folder: to write to.
+        facts: more of how it came about.
+        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
+    """
     results = evaluation.results
     if results is None:
         return
     results.meta.update(cli_record.provenance() | {"machine": machine()} | facts)
-    print_table(
-        results, title=f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
+    title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
+    console = Console() if sys.stdout.isatty() else Console(width=WIDE)
+    shown = (
+        results if full else replace(results, rows={m: row for m, row in results.rows.items() if m not in UNALIGNED})
     )
+    print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
     print(cost(results.meta["health"]))
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
-    print(f"written: {folder / 'results.json'} and .csv")
+    more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"
+    print(f"written: {folder / 'results.json'} and .csv{more}")
 
 
 def cost(health: dict[str, float]) -> str:

@@ -234,6 +234,10 @@ class MagnetCLI(LightningCLI):
             parser.add_class_arguments(SamplerOptions, "sampler")
             parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
             parser.add_class_arguments(Evaluation, skip={"task", "options"}, instantiate=False)
+        if self.command == "test":
+            parser.add_argument(
+                "--full", action="store_true", help="print all that was measured, with intervals, not the main numbers"
+            )
         if self.command == "predict":
             parser.add_argument("--pictures", type=int, default=1, help="so many of the first scenes are drawn")
             parser.add_argument(
@@ -371,7 +375,7 @@ class MagnetCLI(LightningCLI):
             return cli_output.show_metrics(self.trainer, self.folder, self.command)
         task = self._option("task").class_path.rsplit(".", 1)[-1]
         facts = {"task": task, "checkpoint": str(self.checkpoint), "data": self.config_dump.get("data")}
-        cli_output.show_results(self.evaluation, self.folder, facts)
+        cli_output.show_results(self.evaluation, self.folder, facts, self._option("full"))
 
     def after_predict(self) -> None:
         """Write scenes and pictures."""

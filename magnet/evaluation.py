@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 MODEL, TRUTH, TRAINING = "magnet", "ground truth", "training set"
 """The rows of the model, of the recorded futures, and of training windows in place of samples."""
 
+UNALIGNED = ("NN, not aligned", "RS, not aligned")
+"""The rows of retrieved motion that stays where it was recorded."""
+
 CONFIDENCE = 0.95
 BASELINE_COMPOSED = 500
 """Composed training stretches that baselines choose from where test scenes are composed too."""
@@ -194,9 +197,9 @@ class Evaluation:
             "NN": of_scenes(NearestNeighbour(train)),
             "RS": of_scenes(RandomSample(train), draws=True),
             "zero velocity": of_scenes(HoldPose()),
-            "ridge regression": JointBaseline(RidgeRegression(windows), self.context, self.horizon),
-            "NN, not aligned": of_scenes(NearestNeighbour(train, aligned=False)),
-            "RS, not aligned": of_scenes(RandomSample(train, aligned=False), draws=True),
+            "ridge": JointBaseline(RidgeRegression(windows), self.context, self.horizon),
+            UNALIGNED[0]: of_scenes(NearestNeighbour(train, aligned=False)),
+            UNALIGNED[1]: of_scenes(RandomSample(train, aligned=False), draws=True),
         }
 
     # -- the run -------------------------------------------------------------------------------

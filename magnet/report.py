@@ -30,8 +30,8 @@ REFERENCES = ("ground truth", "training set")
 
 RESULTS_FORMAT = 1
 
-FIRST = ("fd", "div", "mi", "fs", "ip_ratio", "mpjpe@1s", "mpjpe", "mpjve", "fd_pair")
-"""Columns that a short table begins with, in the order of the paper's tables; others follow as they were measured."""
+FIRST = ("fd", "fd_pair", "div", "mpjpe@1s", "mpjpe_mean@1s", "fs")
+"""Columns that a short table begins with; others follow as they were measured."""
 
 ARROWS: dict[Better, str] = {"low": " ↓", "high": " ↑", "real": " →", "": ""}
 
@@ -223,13 +223,10 @@ def print_table(
 
 
 def _table(results: Results, metrics: list[str], best: dict[str, set[str]], intervals: bool) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False, collapse_padding=True)
     table.add_column("method", no_wrap=True)
     for metric in metrics:
-        title = results._title(metric)
-        table.add_column(
-            title.replace(" ", "\n", 1) if "@" in metric else title, justify="right", no_wrap=True, vertical="bottom"
-        )
+        table.add_column(_in_two_lines(results, metric), justify="right", no_wrap=True, vertical="bottom")
     for method in results.rows:
         cells = [Text(method, style="italic" if method in REFERENCES else "")]
         for metric in metrics:
@@ -240,6 +237,16 @@ def _table(results: Results, metrics: list[str], best: dict[str, set[str]], inte
             cells.append(cell)
         table.add_row(*cells)
     return table
+
+
+def _in_two_lines(results: Results, metric: str) -> str:
+    """A title of several words, cut at the space nearest to its middle."""
+    title = results._title(metric)
+    spaces = [at for at, letter in enumerate(results.column(metric).title) if letter == " "]
+    if not spaces:
+        return title
+    middle = min(spaces, key=lambda at: abs(2 * at + 1 - len(title)))
+    return f"{title[:middle]}\n{title[middle + 1 :]}"
 
 
 def _natural_width(table: Table, console: Console) -> int:

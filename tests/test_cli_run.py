@@ -179,6 +179,21 @@ def test_sampling_options_reach_the_model(trained: Path) -> None:
     assert (evaluation.samples, evaluation.options.steps, evaluation.baselines) == (3, 7, False)
 
 
+@pytest.mark.parametrize("given", [(), ("--full",)])
+def test_one_flag_asks_for_the_full_table(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...]
+) -> None:
+    """Whatever stands around it: it takes no value."""
+    asked: list[bool] = []
+    monkeypatch.setattr(cli_run.cli_output, "show_results", lambda *words: asked.append(words[-1]))
+    monkeypatch.setattr(ToyModel, "on_test_end", lambda self: setattr(self.evaluation, "results", 1), raising=False)
+    monkeypatch.setattr(
+        ToyModel, "configure_test", lambda self, evaluation: setattr(self, "evaluation", evaluation), raising=False
+    )
+    go("test", *given, "--ckpt_path", "trained/checkpoints/last.ckpt", "--samples", "2")
+    assert asked == [bool(given)]
+
+
 def test_joint_future_is_the_task_when_none_is_named(trained: Path) -> None:
     go("predict", "--ckpt_path", "trained/checkpoints/last.ckpt")
     assert type(ToyModel.seen["evaluation"].task).__name__ == "JointFuture"

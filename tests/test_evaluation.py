@@ -45,17 +45,17 @@ def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluation]:
 
 def test_every_method_is_measured_on_the_same_scenes():
     results = run(data()).results
-    answering = {MODEL, "NN", "RS", "zero velocity", "ridge regression", "NN, not aligned", "RS, not aligned"}
+    answering = {MODEL, "NN", "RS", "zero velocity", "ridge", "NN, not aligned", "RS, not aligned"}
     assert set(results.rows) == answering | {TRUTH, TRAINING}
     for method in answering:
         assert {"fd", "mi", "fs", "ip_ratio", "mpjpe", "mpjve", "mpjpe@0.5s"} <= set(results.rows[method])
     assert {"fd", "fd_pair", "fs", "ip_ratio"} <= set(results.rows[TRAINING])
     assert not {name for name in results.rows[TRAINING] if name.startswith(("mpj", "div"))}
     assert results.rows[MODEL]["div"] > 0
-    for method in ("NN", "zero velocity", "ridge regression"):
+    for method in ("NN", "zero velocity", "ridge"):
         assert results.rows[method]["div"] == 0
     assert {method for method, row in results.rows.items() if "nearest_training" in row} == {MODEL, TRUTH}
-    assert results.rows["ridge regression"]["mpjpe"] < results.rows["zero velocity"]["mpjpe"]
+    assert results.rows["ridge"]["mpjpe"] < results.rows["zero velocity"]["mpjpe"]
     assert results.meta["test scenes"] == 9
 
 
@@ -181,7 +181,7 @@ def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
     clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]
     results = run(data(clips, composed_test=2)).results
     assert math.isfinite(results.rows["NN"]["mpjpe"])
-    assert math.isfinite(results.rows["ridge regression"]["mpjpe"])
+    assert math.isfinite(results.rows["ridge"]["mpjpe"])
     assert math.isfinite(results.rows[MODEL]["nearest_training"])
 
 

@@ -41,8 +41,8 @@ class PartnerBearing(ClipMeans):
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
-        "facing": Column("facing", "", "real", "share of frames in which two people face each other", main=True),
-        "behind": Column("behind", "", "real", "share of frames in which one has the other behind", main=True),
+        "facing": Column("facing", "", "real", "share of frames in which two people face each other"),
+        "behind": Column("behind", "", "real", "share of frames in which one has the other behind"),
     }
 
     def __init__(

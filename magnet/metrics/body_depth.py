@@ -49,14 +49,14 @@ class BodyDepth(ClipMeans):
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
-        "depth_p99": Column(
-            "depth 99 %", "m", "low", "99th percentile of how deep two bodies are in each other", main=True
-        ),
+        "depth_p99": Column("depth 99 %", "m", "low", "99th percentile of how deep two bodies are in each other"),
         "depth_p99_in_contact": Column("depth in contact", "m", "low", "the same over frames of at least 5 cm"),
         "depth_over_5cm": Column("over 5 cm", "", "low", "share of frames with two bodies over 5 cm in each other"),
         "depth_over_10cm": Column("over 10 cm", "", "low", "share of frames with two bodies over 10 cm in each other"),
         "depth_body_p99": Column("body depth 99 %", "m", "low", "99th percentile of depth without arm on arm"),
-        "depth_body_over_5cm": Column("body over 5 cm", "", "low", "share of frames over 5 cm without arm on arm"),
+        "depth_body_over_5cm": Column(
+            "body over 5 cm", "", "low", "share of frames over 5 cm in each other, arm on arm apart", main=True
+        ),
         "depth_body_over_10cm": Column("body over 10 cm", "", "low", "share of frames over 10 cm without arm on arm"),
         "depth_arms_p99": Column("arms depth 99 %", "m", "real", "99th percentile of depth of arm on arm"),
         "depth_arms_over_5cm": Column("arms over 5 cm", "", "real", "share of frames with arm on arm over 5 cm"),

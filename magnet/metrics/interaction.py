@@ -66,7 +66,7 @@ class MotionInteraction(MotionMetric):
     higher_is_better = False
 
     columns: ClassVar[Mapping[str, Column]] = {
-        "mi": Column("MI", "", "low", "error of the correlation between people", main=True),
+        "mi": Column("MI", "", "low", "error of the correlation between people"),
         "mi_generated": Column("MI made", "", "real", "correlation between people"),
         "mi_truth": Column("MI real", "", "", "correlation between people in the recording"),
         "mi_left_out": Column("MI still", "", "", "how many coordinates were constant and are not in MI"),

@@ -88,7 +88,7 @@ class Interpenetration(ClipMeans):
 
     higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
-        "ip_ratio": Column("IP", "", "low", "share of frames in which people run through each other", main=True),
+        "ip_ratio": Column("IP", "", "low", "share of frames in which people run through each other"),
         "ip_mean_total_depth": Column("IP depth", "m", "low", "summed depth of penetration, mean over all frames"),
         "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
     }

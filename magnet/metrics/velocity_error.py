@@ -28,7 +28,7 @@ class VelocityError(ClipMeans):
 
     higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
-        "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities", main=True)
+        "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities")
     }
 
     def __init__(
