@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magnet.cli import CommandError, no_such
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
@@ -146,6 +146,9 @@ def add_download(one: argparse.ArgumentParser) -> None:
     one.add_argument("out", nargs="?", help="folder to write to; run again to go on")
     one.add_argument("--subjects", default="60,61", help="numbers with commas (default: %(default)s, salsa couples)")
     one.add_argument("--base_url", default=None, help="another copy of the site")
+    one.add_argument(
+        "--any_version", action="store_true", help="take files, too, whose SHA-256 is known to be another: issued anew"
+    )
 
 
 def needed(given: argparse.Namespace, *names: str) -> list[str]:
@@ -351,9 +354,10 @@ def run_download(given: argparse.Namespace) -> int:
     from magnet.datamodules.download import download_cmu
 
     subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]
-    where = {} if given.base_url is None else {"base_url": given.base_url}
+    options: dict[str, Any] = {"any_version": True} if given.any_version else {}
+    options |= {} if given.base_url is None else {"base_url": given.base_url}
     with file_bars() as tell:
-        got = download_cmu(subjects, out, progress=tell, **where)
+        got = download_cmu(subjects, out, progress=tell, **options)
     print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
     if got.unlike:
         print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")

@@ -20,18 +20,16 @@ from magnet.body import Body
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
+from magnet.datamodules.cmu_subjects import RATES, USUAL_RATE, couple_of
 from magnet.datamodules.speeds import at_speed
 from magnet.motion.scene import Scene
 from magnet.threads import one_thread
 
 FIT_VERSION = 4
 """Raise it whenever the same recordings would be fitted otherwise: caches are then made anew."""
-COUPLE = (60, 61)
-RATES = {"60": 60.0, "61": 60.0, "143": 60.0}
-"""Subject 143 jumps in 143_35 and falls with 10.2 m/s2 at 60 fps; at 120 it would be four times that."""
 WHERE = (
     "CMU's recordings come from mocap.cs.cmu.edu: `magnet data download cmu FOLDER` fetches them, or put NN.asf and "
-    "NN_TT.amc of subjects 60 and 61 (salsa couples) and of any single people into one folder yourself; say where with "
+    "NN_TT.amc of couples (60 and 61 dance salsa) and of any single people into one folder yourself; say where with "
     '--data.root or MAGNET_CMU. Published results must say: "The data used in this project was obtained from '
     'mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."'
 )
@@ -52,7 +50,7 @@ class Take:
 
 
 class CMU(MotionDataModule):
-    """Salsa couples of CMU's subjects 60 and 61, and single people, as bodies at 30 fps.
+    """Couples of CMU (60 and 61, who dance salsa, and four others) and single people, as bodies at 30 fps.
 
     `prepare_data` reads ASF and AMC files, mends or masks capture glitches, fits the body and caches each take.
     A take that cannot be used is reported after all others are done. Splits are by take. Sources of clips, for
@@ -63,8 +61,8 @@ class CMU(MotionDataModule):
         cache: folder for fitted takes; None: magnet/cmu in the user's cache folder. Never put it in a repository:
             the recordings may not be passed on, converted or not.
         singles: use recordings of single people as well.
-        test_takes: couples' takes held out for testing.
-        val_takes: couples' takes held out for validation.
+        test_takes: takes of every couple held out for testing, by number.
+        val_takes: takes of every couple held out for validation.
         test_singles: single people's recordings held out for testing, by name; they add scenes of one person.
         val_singles: single people's recordings held out for validation.
         fps: frame rate of a subject's recordings by its number, which AMC files do not say; adds to `RATES`, and
@@ -151,33 +149,13 @@ class CMU(MotionDataModule):
         return "test" if test else "val" if val else "train"
 
     def takes(self) -> list[Take]:
-        """Every take in the folder; a dancer without partner is listed too, and refused when it is read.
+        """Every take in the folder; a couple's without the partner's file is listed too, and refused when it is read.
 
         Raises:
             FileNotFoundError: no folder was given or it holds no recordings; says where to get them.
         """
         folder = self._folder()
-        files = {
-            path.name.lower(): path for path in sorted(folder.rglob("*")) if path.suffix.lower() in (".asf", ".amc")
-        }
-        found: dict[str, Take] = {}
-        for name in files:
-            match = re.fullmatch(r"(\d+)_(\d+)\.amc", name)
-            if not match:
-                continue
-            subject, number = match[1], match[2]
-            people: tuple[str, ...] = (subject,)
-            if int(subject) in COUPLE:
-                people = tuple(str(person) for person in COUPLE)
-            elif not self.singles:
-                continue
-            label = "+".join(f"{person}_{number}" for person in people)
-            found[label] = Take(
-                label,
-                int(number),
-                tuple(files.get(f"{person}.asf", folder / f"{person}.asf") for person in people),
-                tuple(files.get(f"{person}_{number}.amc", folder / f"{person}_{number}.amc") for person in people),
-            )
+        found = {take.name: take for take in found_takes(folder) if take.couple or self.singles}
         if not found:
             raise FileNotFoundError(f"{folder}: holds no files named NN_TT.amc. {WHERE}")
         return [found[label] for label in sorted(found)]
@@ -199,7 +177,7 @@ class CMU(MotionDataModule):
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet" / "cmu"
 
     def _rates(self, take: Take) -> list[float]:
-        return [self.fps.get(path.name.split("_")[0], 120.0) for path in take.amc]
+        return [self.fps.get(path.name.split("_")[0], USUAL_RATE) for path in take.amc]
 
     def _file(self, take: Take) -> Path:
         """Where the fitted take lies: the name holds a hash of all that it was made from."""
@@ -255,6 +233,30 @@ class CMU(MotionDataModule):
             _write(self._file(take), lambda path: scene.save(path))
         text = json.dumps(report, indent=1)
         _write(self._file(take).with_suffix(".json"), lambda path: path.write_text(text))
+
+
+def found_takes(folder: Path) -> list[Take]:
+    """Every take under a folder, of couples and of single people, by name.
+
+    Subjects who were recorded together make one take; where nothing at all of the partner is there, somebody alone.
+    """
+    files = {path.name.lower(): path for path in sorted(folder.rglob("*")) if path.suffix.lower() in (".asf", ".amc")}
+    matches = [match for name in files if (match := re.fullmatch(r"(\d+)_(\d+)\.amc", name))]
+    there = {int(match[1]) for match in matches} | {int(name[:-4]) for name in files if re.fullmatch(r"\d+\.asf", name)}
+    found: dict[str, Take] = {}
+    for match in matches:
+        subject, number = match[1], match[2]
+        couple = couple_of(subject)
+        together = couple is not None and there.issuperset(couple)
+        people = tuple(f"{person:02}" for person in couple or ()) if together else (subject,)
+        label = "+".join(f"{person}_{number}" for person in people)
+        found[label] = Take(
+            label,
+            int(number),
+            tuple(files.get(f"{person}.asf", folder / f"{person}.asf") for person in people),
+            tuple(files.get(f"{person}_{number}.amc", folder / f"{person}_{number}.amc") for person in people),
+        )
+    return [found[label] for label in sorted(found)]
 
 
 def _write(target: Path, write: Callable[[Path], object]) -> None:

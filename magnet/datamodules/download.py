@@ -10,14 +10,15 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from email.message import Message
 from importlib import resources
 from pathlib import Path
 
+from magnet.datamodules.cmu_subjects import folder_of
+
 SITE = "http://mocap.cs.cmu.edu"  # plain: the site's certificate chain is incomplete
-COUPLE = (60, 61)
 MOST_SUBJECTS = 20
 MANIFEST = "manifest.sha256"
 CHUNK = 1 << 16
@@ -39,7 +40,7 @@ class Downloaded:
     folder: Path
     fetched: tuple[str, ...]
     kept: tuple[str, ...]  # whole since an earlier run
-    unlike: tuple[str, ...]  # not the bytes that this project was tested with; the site has issued some files anew
+    unlike: tuple[str, ...]  # taken although they are not the bytes that this project was tested with
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,13 @@ def download_cmu(
     base_url: str = SITE,
     progress: Progress | None = None,
     retries: Retries | None = None,
+    any_version: bool = False,
 ) -> Downloaded:
     """Skeletons and all recordings of subjects, in the folders that the data set `CMU` reads.
 
-    Subjects 60 and 61 go to `salsa`, all others to `singles`. A run that was stopped goes on where it was; files that
-    are whole by `manifest.sha256`, which this writes and `sha256sum -c` reads, are not fetched again.
+    Subjects 60 and 61 go to `salsa`, other couples to `couples`, all others to `singles`. A run that was stopped goes
+    on where it was; files that are whole by `manifest.sha256`, which this writes and `sha256sum -c` reads, are not
+    fetched again. A file whose SHA-256 is known, and differs, is refused when all others are done.
 
     Args:
         subjects: numbers such as 60; at most 20, because the database asks not to be crawled.
@@ -83,10 +86,11 @@ def download_cmu(
         base_url: of the site or a mirror laid out alike: search.php?subjectnumber=N and subjects/NN/NN_TT.amc.
         progress: told about every piece of every file.
         retries: how patiently.
+        any_version: take files, too, that are not the bytes known; the site has issued some anew.
 
     Raises:
         ValueError: no subject, too many, or an address that is not http.
-        DownloadError: the site cannot be reached, or a file is not there or never whole.
+        DownloadError: the site cannot be reached, a file is not there or never whole, or not the one that is known.
     """
     numbers = _numbers(subjects)
     if urllib.parse.urlsplit(base_url).scheme not in ("http", "https"):
@@ -94,26 +98,53 @@ def download_cmu(
     base_url, folder, retries = base_url.rstrip("/"), Path(out).expanduser(), retries or Retries()
     folder.mkdir(parents=True, exist_ok=True)
     manifest, tested = _read_manifest(folder / MANIFEST), _tested()
-    fetched, kept, unlike = [], [], []
+    fetched: list[str] = []
+    kept: list[str] = []
+    unlike: list[str] = []
+    refused: list[str] = []
     for number in numbers:
         subject = f"{number:02}"
-        place = "salsa" if number in COUPLE else "singles"
         for file in (f"{subject}.asf", *_recordings(number, base_url, retries)):
-            name = f"{place}/{file}"
+            name, known = _place(folder, number, file, manifest), tested.get(file)
             target = folder / name
-            if _whole(target, manifest.get(name)):
-                kept.append(name)
-            else:
+            there = _whole(target, manifest.get(name))
+            if not there:
                 target.parent.mkdir(parents=True, exist_ok=True)
-                _fetch(f"{base_url}/subjects/{subject}/{file}", target, retries, progress)
-                fetched.append(name)
+                part = _fetch(f"{base_url}/subjects/{subject}/{file}", target, retries, progress)
                 time.sleep(retries.pause)
-            if manifest.get(name) != (found := sha256(target)):
+            found = sha256(target if there else part)
+            if known not in (None, found) and not any_version:
+                refused.append(f"{target}: its SHA-256 is {found}, expected {known}")
+                if not there:
+                    part.unlink()
+                continue
+            if known not in (None, found):
+                unlike.append(name)
+            if not there:
+                os.replace(part, target)
+            (kept if there else fetched).append(name)
+            if manifest.get(name) != found:
                 manifest[name] = found
                 _write_manifest(folder / MANIFEST, manifest)
-            if tested.get(file, found) != found:
-                unlike.append(name)
+    if refused:
+        raise DownloadError(_refusal(refused))
     return Downloaded(folder, tuple(fetched), tuple(kept), tuple(unlike))
+
+
+def _refusal(refused: list[str], most: int = 5) -> str:
+    listed = "".join(f"\n  {line}" for line in refused[:most])
+    more = f"\n  and {len(refused) - most} more" if len(refused) > most else ""
+    return (
+        f"{len(refused)} files are not the ones that this project was tested with, and were refused:{listed}{more}\n"
+        "they were changed on their way, or the site has issued them anew: try again, or take them as they are with "
+        "--any_version"
+    )
+
+
+def _place(folder: Path, number: int, file: str, manifest: Mapping[str, str]) -> str:
+    """Where a subject's file goes, or lies already."""
+    name, old = f"{folder_of(number)}/{file}", f"singles/{file}"
+    return old if not (folder / name).exists() and _whole(folder / old, manifest.get(old)) else name
 
 
 def _numbers(subjects: Iterable[int | str]) -> list[int]:
@@ -169,8 +200,8 @@ def _page(url: str, retries: Retries) -> str:
 # -- one file ----------------------------------------------------------------------------------
 
 
-def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) -> None:
-    """All of a file, or what there is of it in a .part file and an error."""
+def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) -> Path:
+    """All of a file in a .part file beside `target`, or what there is of it there and an error. Returns that file."""
     part, tag = target.with_name(f"{target.name}.part"), target.with_name(f"{target.name}.part.tag")
     failures = 0
     while True:
@@ -188,9 +219,8 @@ def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) 
             part.unlink()  # nothing of it can be trusted
             failures += 1
         else:
-            os.replace(part, target)
             tag.unlink(missing_ok=True)
-            return
+            return part
         if failures >= retries.attempts:
             raise DownloadError(f"{url}: {reason}, {failures} times over; run the same command later")
         retries.wait(failures)

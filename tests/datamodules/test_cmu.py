@@ -150,6 +150,27 @@ def test_wrists_apart_are_the_nearest_of_any_two_people_who_are_seen(generator: 
     assert len(wrists_apart(wrists[:, :1], valid[:, :1])) == 0
 
 
+def test_couples_are_as_the_database_has_them(tmp_path: Path) -> None:
+    """Subjects and rates by the database's list; 18 and 19 lie apart, 33 has no partner here, 1 never had one."""
+    files = ("18.asf", "18_15.amc", "a/19.asf", "a/19_15.amc", "20.asf", "20_01.amc", "21.asf", "22_07.amc",
+             "23_07.amc", "33.asf", "33_01.amc", "61.asf", "61_04.amc", "60_04.amc", "01.asf", "01_02.amc")  # fmt: skip
+    for file in files:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    data = CMU(str(tmp_path), fps={"1": 30.0, "01": 60.0})
+    takes = {take.name: data._rates(take) for take in data.takes()}
+    assert takes == {
+        "01_02": [60.0],
+        "18_15+19_15": [120.0, 120.0],
+        "20_01+21_01": [120.0, 120.0],  # 21_01.amc is missing, which is said when it is read
+        "22_07+23_07": [120.0, 120.0],
+        "33_01": [60.0],
+        "60_04+61_04": [60.0, 60.0],
+    }
+    assert {name for name in takes if "+" in name} == {take.name for take in CMU(str(tmp_path), singles=False).takes()}
+    assert [take.name for take in data.takes() if data.split_of(take) == "test"] == ["18_15+19_15"]
+
+
 # -- bad input ---------------------------------------------------------------------------------
 
 

@@ -92,6 +92,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 @pytest.fixture
 def site(database: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(download, "_tested", dict)  # nothing is known of made-up files
     made = Site(dict(database))
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Bound", (Handler,), {"site": made}))
     made.url = f"http://127.0.0.1:{server.server_port}"
@@ -106,8 +107,8 @@ def site(database: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Iterato
 AMC = "subjects/02/02_01.amc"
 
 
-def fetch(site: Site, out: Path, *subjects: int, retries: Retries = QUICK) -> download.Downloaded:
-    return download_cmu(subjects or (2,), out, base_url=site.url, retries=retries)
+def fetch(site: Site, out: Path, *subjects: int, any_version: bool = False) -> download.Downloaded:
+    return download_cmu(subjects or (2,), out, base_url=site.url, retries=QUICK, any_version=any_version)
 
 
 def check(site: Site, out: Path) -> None:
@@ -284,12 +285,32 @@ def test_what_cannot_be_meant_is_refused(subjects: list[int], url: str, match: s
     assert not (tmp_path / "out").exists()
 
 
-def test_files_that_differ_from_the_tested_ones_are_named(
+def test_a_file_that_is_known_to_be_another_is_refused_after_the_others_unless_told_otherwise(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    same = hashlib.sha256(site.files[AMC]).hexdigest()
+    same, other = (hashlib.sha256(site.files[f"subjects/02/02{end}"]).hexdigest() for end in ("_01.amc", ".asf"))
     monkeypatch.setattr(download, "_tested", lambda: {"02_01.amc": same, "02.asf": "0" * 64})
-    assert fetch(site, tmp_path).unlike == ("singles/02.asf",)
+    for _ in range(2):
+        with pytest.raises(DownloadError, match=rf"02\.asf: its SHA-256 is {other}, expected 0{{64}}\n.*--any_version"):
+            fetch(site, tmp_path)
+        assert [path.name for path in (tmp_path / "singles").iterdir()] == ["02_01.amc"]
+    assert fetch(site, tmp_path, any_version=True).unlike == ("singles/02.asf",)
+    check(site, tmp_path)
+    with pytest.raises(DownloadError, match="1 files are not the ones"):  # it lies there, and is left
+        fetch(site, tmp_path)
+    check(site, tmp_path)
+
+
+def test_partners_go_to_a_folder_of_couples_unless_they_lie_among_singles(site: Site, tmp_path: Path) -> None:
+    for path in [path for path in site.files if "60" in path or "61" in path]:
+        other = path.replace("60", "18").replace("61", "19")
+        site.files[other] = site.files[path].replace(b"60", b"18").replace(b"61", b"19")
+    (tmp_path / "singles").mkdir()
+    (tmp_path / "singles" / "18.asf").write_bytes(site.files["subjects/18/18.asf"])
+    done = fetch(site, tmp_path, 18, 19)
+    assert done.kept == ("singles/18.asf",)
+    assert {name.split("/")[0] for name in done.fetched} == {"couples"}
+    assert [take.name for take in CMU(str(tmp_path)).takes()] == ["18_01+19_01", "18_02+19_02"]
 
 
 def test_waits_grow_and_never_pass_the_longest(monkeypatch: pytest.MonkeyPatch) -> None:
