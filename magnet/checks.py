@@ -1,10 +1,11 @@
-"""Checks of the numbers that users give: finite, whole where they count something, and in range."""
+"""Checks of what users give: numbers finite, whole where they count something, and in range; choices that there are."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
+from typing import get_args
 
 
 def require_number(
@@ -43,6 +44,16 @@ def require_wholes(name: str, values: object, like: str = "(0, 1)") -> None:
     several = isinstance(values, Sequence) and not isinstance(values, str)
     if not several or not all(_fits(value, whole=True) for value in values):  # type: ignore[attr-defined]
         raise ValueError(f"{name}: got {values!r}, expected whole numbers in brackets, such as {like}")
+
+
+def require_choice(name: str, value: object, choices: object) -> None:
+    """Refuse what is not among the values of a `Literal`.
+
+    Raises:
+        ValueError: names the field, what was got and what there is.
+    """
+    if value not in get_args(choices):
+        raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(choices))}")
 
 
 def _require(

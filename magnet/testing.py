@@ -16,6 +16,7 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+from magnet.sampling.solvers import History
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -222,7 +223,7 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     present = torch.ones(2, grid.agents, dtype=torch.bool)
 
     def run(tokens: Tensor) -> Tensor:
-        return sample(mixing, schedule, tokens, present, layout, torch.Generator().manual_seed(2))
+        return sample(mixing, schedule, tokens, present, layout, torch.Generator().manual_seed(2), solver="dpmpp_2m")
 
     plain = run(tokens)
     _require(torch.equal(plain[:, given], tokens[:, given]), f"{place}: known tokens do not come back bit-identical")
@@ -238,17 +239,18 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 
 def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
-    """Change what a stage hides from an agent, on the canvas and in all that the model says of it."""
+    """Change what a stage hides from an agent, on the canvas, in all that the model says of it, and in what it said."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
     tokens, noise, veil, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     canvas = begin(tokens, noise, schedule.known, layout)
+    history = History.empty(canvas)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
-        before = canvas
-        canvas = run_stages(mixing, [stage], before, veil, present, layout, guidance=guidance)
+        before, past = canvas, history.copy()
+        canvas = run_stages(mixing, [stage], before, veil, present, layout, guidance=guidance, history=history)
         if stage.hidden is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -256,6 +258,8 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
             secret = layout.spread(layout.group_levels(hidden.long()) > 0)  # (W, P, D)
             changed = before.clone()
             changed[:, window] = torch.where(secret, 10 * other[:, window], before[:, window])
+            remembered = past.copy()
+            remembered.clean[:, window] = torch.where(secret, 10 * other[:, window], past.clean[:, window])
 
             def lying(noisy: Tensor, levels: Tensor, present: Tensor, secret: Tensor = secret) -> Tensor:
                 said = mixing(noisy, levels, present)
@@ -263,7 +267,7 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
 
             # Smoothing follows what is said of everybody, in each agent's own view: not told by what is hidden.
             model = mixing if guidance is not None and guidance.smooth else lying
-            after = run_stages(model, [stage], changed, veil, present, layout, guidance=guidance)
+            after = run_stages(model, [stage], changed, veil, present, layout, guidance=guidance, history=remembered)
             same = ((after == canvas)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"

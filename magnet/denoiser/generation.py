@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from magnet.checks import require_number, require_whole
+from magnet.checks import require_choice, require_number, require_whole
 from magnet.denoiser.presets import preset_fields
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
 from magnet.motion.scene import Scene, absent
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
-from magnet.sampling.grid import NoiseSampling
+from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.sampling.solvers import Solver
 from magnet.tokenizer.module import Tokenizer
 
 if TYPE_CHECKING:
@@ -54,6 +55,9 @@ class SamplerOptions:
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
             passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
+        solver: `ddim`, as in the paper, or `dpmpp_2m`, DPM-Solver++(2M), of second order: few steps keep the variance.
+        spacing: of the levels that are passed: `even`, as in the paper, which `shift` moves; or evenly in `log_snr`,
+            with a last level near 0.
     """
 
     steps: int = 30
@@ -69,10 +73,12 @@ class SamplerOptions:
     any_floor: bool = False
     guidance: Guidance = field(default_factory=Guidance)
     noise_sampling: NoiseSampling = "joint"
+    solver: Solver = "ddim"
+    spacing: Spacing = "even"
 
     def __post_init__(self) -> None:
-        if self.placement not in get_args(Placement):
-            raise ValueError(f"placement: got {self.placement!r}, expected {' or '.join(get_args(Placement))}")
+        require_choice("placement", self.placement, Placement)
+        require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)
         if self.rolling is not None:
@@ -80,7 +86,7 @@ class SamplerOptions:
         require_number("trust", self.trust, least=0)
         require_whole("blend", self.blend, 0)
         require_number("eta", self.eta, 0, 1)
-        require_number("shift", self.shift, over=0)
+        require_spacing(self.spacing, self.shift)
 
     @classmethod
     def preset(cls, name: str, **fields: Any) -> SamplerOptions:
@@ -98,7 +104,7 @@ class SamplerOptions:
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o = options
-    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift, o.noise_sampling)
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift, o.noise_sampling, o.spacing)
 
 
 def occupied(scene: Scene) -> int:

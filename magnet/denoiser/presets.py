@@ -22,6 +22,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "any_floor": False,  # recordings stand on the floor
         "guidance": {"kind": "none", "weight": 1.0, "literal": True, "smooth": 0.0, "context_level": 0},  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2
+        "solver": "ddim",  # A.3
+        "spacing": "even",  # A.3
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `paper` gives every field, so that it stays the

@@ -28,6 +28,7 @@ from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+from magnet.sampling.solvers import History
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -110,7 +111,8 @@ def stream(
 class Stream:
     """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
 
-    The rows held are [first, stop): `tokens` and `veil` (B, n, P, D), and the world in `canvas`.
+    The rows held are [first, stop): `tokens` and `veil` (B, n, P, D), the `history` of a multistep solver, and the
+    world in `canvas`.
     """
 
     def __init__(
@@ -164,6 +166,7 @@ class Stream:
         self.first = self.stop = 0
         self.canvas = Canvas(model, scrub(self.scene, self.known, 0, 0), schedule, o, samples, self.health)
         self.tokens, self.veil = self.noise.rows(0)
+        self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         kind = model.device.type
         self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
 
@@ -204,6 +207,7 @@ class Stream:
                 self.options.guidance,
                 self.noise,
                 self.first,
+                self.history,
             )
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
@@ -222,6 +226,7 @@ class Stream:
         if surplus > 0:
             self.canvas.release(surplus)
             self.tokens, self.veil = self.tokens[:, surplus:].clone(), self.veil[:, surplus:].clone()
+            self.history = None if self.history is None else self.history.release(surplus)
             self.first += surplus
         given = self._known(start, stop).repeat_interleave(STRIDE, dim=0).to(made.device)
         return made.replace(given=given[None] & made.present[:, None])
@@ -240,7 +245,9 @@ class Stream:
             tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             fresh, veil = self.noise.rows(last - self.stop)
-            self.tokens = torch.cat([self.tokens, begin(tokens, fresh, known[part], self.model.layout)], dim=1)
+            new = begin(tokens, fresh, known[part], self.model.layout)
+            self.tokens = torch.cat([self.tokens, new], dim=1)
+            self.history = None if self.history is None else self.history.extend(new)
             self.veil = torch.cat([self.veil, veil], dim=1)
             self.canvas.extend(given.cut(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last

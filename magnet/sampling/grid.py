@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from magnet.checks import require_number, require_whole
+from magnet.checks import require_choice, require_number, require_whole
 
 NoiseSampling = Literal["joint", "independent"]
+Spacing = Literal["even", "log_snr"]
+
+
+def require_spacing(spacing: str, shift: float) -> None:
+    """Raises ValueError where there is no such spacing, or where `shift` would be ignored."""
+    require_choice("spacing", spacing, Spacing)
+    require_number("shift", shift, over=0)
+    if spacing != "even" and shift != 1:
+        raise ValueError(f"shift: got {shift:g}, which moves even levels; leave it at 1, or take the spacing even too")
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,7 @@ class Grid:
     rolling: int | None = 0  # steps between a token and the next; 0: a stride's go together; None: see `slope`
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
     noise_sampling: NoiseSampling = "joint"  # see `magnet.sampling.plans.token_levels`
+    spacing: Spacing = "even"  # of the levels that a token passes, or `log_snr`: see `magnet.sampling.noise`
 
     def __post_init__(self) -> None:
         for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
@@ -34,12 +44,10 @@ class Grid:
             raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
         if self.stride > self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
-        require_number("shift", self.shift, over=0)
         if self.rolling is not None:
             require_whole("rolling", self.rolling, 0)
-        if self.noise_sampling not in get_args(NoiseSampling):
-            choices = " or ".join(get_args(NoiseSampling))
-            raise ValueError(f"noise_sampling: got {self.noise_sampling!r}, expected {choices}")
+        require_choice("noise_sampling", self.noise_sampling, NoiseSampling)
+        require_spacing(self.spacing, self.shift)
 
     @property
     def slope(self) -> int:

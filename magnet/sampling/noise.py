@@ -113,6 +113,44 @@ def _levels(steps: int, shift: float, K: int) -> Tensor | None:
     return levels if bool((levels.diff() < 0).all()) else None
 
 
+HIGHEST_NOISE, LOWEST_NOISE, LONGEST_STEP = -3.0, 4.67, 2.6
+"""Of levels evenly spaced in `half_log_snr`: pure noise counts as -3, the last level before 0 is at 4.67 (level 2), and
+steps are no longer than 2.6, which makes fewer than four steps end at a noisier level."""
+
+
+def half_log_snr(levels: Tensor, K: int = LEVELS) -> Tensor:
+    """log(signal / noise), lambda of DPM-Solver; of level K -inf, of level 0 inf. (...) int in 0..K -> (...) float32"""
+    return _half_log_snrs(K, levels.device)[levels]
+
+
+@functools.cache
+def _half_log_snrs(K: int, device: torch.device) -> Tensor:
+    share = alpha_bar(torch.arange(K + 1), K).double()
+    return ((share / (1 - share)).log() / 2).float().to(device)
+
+
+def log_snr_levels(steps: int, K: int = LEVELS) -> Tensor:
+    """Levels of S denoising steps from K down to 0, evenly spaced in `half_log_snr`, no two alike. -> (S + 1,) int
+
+    Raises:
+        ValueError: fewer than one step, or more than there are levels.
+    """
+    require_whole("denoising steps", steps, 1, K)
+    length = min((LOWEST_NOISE - HIGHEST_NOISE) / max(steps - 1, 1), LONGEST_STEP)
+    return nearest_levels(HIGHEST_NOISE + length * torch.arange(1, steps, dtype=torch.float64), K)
+
+
+def nearest_levels(wanted: Tensor, K: int = LEVELS) -> Tensor:
+    """K, then the levels nearest to rising values of `half_log_snr`, no two alike, and 0. (n,) -> (n + 2,) int"""
+    known = half_log_snr(torch.arange(1, K), K).double()
+    levels = [K, *(1 + (wanted[:, None] - known).abs().argmin(dim=1)).tolist(), 0]
+    for i in range(len(levels) - 2, 0, -1):
+        levels[i] = max(levels[i], levels[i + 1] + 1)
+    for i in range(1, len(levels) - 1):
+        levels[i] = min(levels[i], levels[i - 1] - 1)
+    return torch.tensor(levels)
+
+
 @dataclass
 class NoiseStream:
     """Noise of tokens in the order of time: row i is the same however many rows are drawn at a time.

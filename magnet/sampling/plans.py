@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from magnet.sampling.grid import Grid
-from magnet.sampling.noise import LEVELS, ddim_levels, shifted
+from magnet.sampling.noise import (
+    HIGHEST_NOISE,
+    LEVELS,
+    LOWEST_NOISE,
+    ddim_levels,
+    log_snr_levels,
+    nearest_levels,
+    shifted,
+)
 from magnet.seeding import derive
 
 
@@ -19,17 +27,24 @@ def token_levels(grid: Grid) -> Tensor:
     (`noise_levels` of the denoiser), or, as here, when sampling, which fits that both of its rows are of one trained
     model and that it is used "for all joint prediction experiments":
 
-    `joint`: the levels of `ddim_levels` for all; agents at a time step share their level throughout.
-    `independent`: each token of each agent passes levels of its own, drawn evenly from 1..K-1 (and then `shifted`)
-    between K and 0. They are drawn once and for all, the same for every scene: a plan draws no random numbers.
+    `joint`: the same levels for all, of `ddim_levels` or `log_snr_levels`; agents at a time step share their level
+    throughout.
+    `independent`: each token of each agent passes levels of its own between K and 0, drawn evenly from 1..K-1 (and then
+    `shifted`), or evenly in log-SNR. They are drawn once and for all, the same for every scene: a plan draws no random
+    numbers.
     """
+    in_log_snr = grid.spacing == "log_snr"
+    plan = log_snr_levels(grid.steps) if in_log_snr else ddim_levels(grid.steps, grid.shift)
     if grid.noise_sampling == "joint":
-        return ddim_levels(grid.steps, grid.shift)[:, None, None].expand(-1, grid.window, grid.agents)
-    ddim_levels(grid.steps, grid.shift)  # refuses steps that make no sense
+        return plan[:, None, None].expand(-1, grid.window, grid.agents)
     drawn = torch.empty(grid.steps + 1, grid.window, grid.agents, dtype=torch.long)
     for row in range(grid.window):
         for agent in range(grid.agents):
             generator = torch.Generator().manual_seed(derive("independent noise sampling", row, agent))
+            if in_log_snr:
+                places = torch.rand(grid.steps - 1, generator=generator, dtype=torch.float64).sort().values
+                drawn[:, row, agent] = nearest_levels(HIGHEST_NOISE + (LOWEST_NOISE - HIGHEST_NOISE) * places)
+                continue
             between = 1 + torch.randperm(LEVELS - 1, generator=generator)[: grid.steps - 1]
             own = torch.cat([torch.tensor([0, LEVELS]), between]).sort(descending=True).values
             drawn[:, row, agent] = shifted(own, grid.shift)

@@ -12,8 +12,9 @@ from torch import Tensor
 from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.noise import LEVELS, NoiseStream, ddim_step
+from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
+from magnet.sampling.solvers import History, Solver, solver_step
 
 
 class DenoiseFn(Protocol):
@@ -40,6 +41,7 @@ def sample(
     progress: Callable[[int], None] | None = None,
     guidance: Guidance | None = None,
     noise: NoiseStream | None = None,
+    solver: Solver = "ddim",
 ) -> Tensor:
     """Fill in what a schedule leaves open.
 
@@ -55,6 +57,7 @@ def sample(
         progress: told 1 after each denoising step.
         guidance: what the prediction is pushed toward.
         noise: instead of `generator`.
+        solver: `ddim`, or the second-order `dpmpp_2m`; see `magnet.sampling.solvers`.
 
     Returns:
         (B, N, P, D). Known tokens come back bit-identical.
@@ -65,7 +68,10 @@ def sample(
     noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
     fresh, veil = noise.rows(N)
     canvas = begin(tokens, fresh, schedule.known, layout)
-    return run_stages(denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance, noise)
+    history = None if solver == "ddim" else History.empty(canvas)
+    return run_stages(
+        denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance, noise, history=history
+    )
 
 
 def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> Tensor:
@@ -87,18 +93,20 @@ def run_stages(
     guidance: Guidance | None = None,
     noise: NoiseStream | None = None,
     offset: int = 0,
+    history: History | None = None,
 ) -> Tensor:
     """Run stages in their order on a canvas. canvas, veil (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`; `noise` gives what is new in each step, and `offset` says which of its rows the canvas
-    begins with.
+    begins with. A `history` of the canvas makes the solver a multistep one, and is brought up to date.
     """
     canvas = canvas.clone()
     for stage in stages:
         window = slice(stage.start, stage.stop)
         tokens, hides, first = canvas[:, window], veil[:, window], offset + stage.start
+        past = None if history is None else history.window(window)
         canvas[:, window] = run_stage(
-            denoise, stage, tokens, hides, present, layout, progress, guidance or Guidance(), noise, first
+            denoise, stage, tokens, hides, present, layout, progress, guidance or Guidance(), noise, first, past
         )
         if settle is not None:
             finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
@@ -118,10 +126,11 @@ def run_stage(
     guidance: Guidance,
     noise: NoiseStream | None = None,
     first: int = 0,
+    history: History | None = None,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)
 
-    `first` is the row of `noise` that the window begins with.
+    `first` is the row of `noise` that the window begins with; `history` is that of the window.
     """
     device = tokens.device
     levels = stage.levels.to(device).long()
@@ -134,15 +143,17 @@ def run_stage(
         if hidden is None:
             each = now.expand(len(tokens), -1, -1)
             tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout, moves)
-            tokens = ddim_step(tokens, clean, group, group_after, eta, fresh)
         else:
-            tokens = _step_in_views(denoise, tokens, veil, now, after, hidden, present, layout, guidance, eta, fresh)
+            tokens, clean, group, group_after = _predict_in_views(
+                denoise, tokens, veil, now, after, hidden, present, layout, guidance
+            )
+        tokens = solver_step(tokens, clean, group, group_after, eta, fresh, history)
         if progress is not None:
             progress(1)
     return tokens
 
 
-def _step_in_views(
+def _predict_in_views(
     denoise: DenoiseFn,
     tokens: Tensor,
     veil: Tensor,
@@ -152,13 +163,15 @@ def _step_in_views(
     present: Tensor,
     layout: TokenLayout,
     guidance: Guidance,
-    eta: float,
-    fresh: Tensor | None,
-) -> Tensor:
-    """Each agent's tokens are updated from its own view, in which hidden tokens are unknown. hidden (P, W, P)
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Each agent's tokens are predicted in its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
-    Agents that see the same share a view. A relation to somebody hidden is unknown too; it is updated from that
+    Agents that see the same share a view. A relation to somebody hidden is unknown too; it is predicted in that
     agent's view if that one sees both, or else stays noise.
+
+    Returns:
+        The noisy tokens that the next step starts from and their clean prediction (B, W, P, D), and the levels of their
+        numbers before and after it (W, P, D).
     """
     B, W, P, _ = tokens.shape
     views_hidden, view_of = hidden.unique(dim=0, return_inverse=True)
@@ -182,9 +195,13 @@ def _step_in_views(
     )
     moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
     moved = torch.where(unknown, tokens[:, None], moved)
-    stepped = ddim_step(moved, clean, group, group_after, eta, None if fresh is None else fresh[:, None])
     source = layout.spread(_views_to_read(hidden, view_of, layout))  # (W, P, D)
-    return stepped.gather(1, source.expand(B, 1, W, P, -1))[:, 0]
+
+    def read(views: Tensor) -> Tensor:
+        """From each number's own view. (..., V, W, P, D) -> (..., W, P, D)"""
+        return views.gather(-4, source.expand(*views.shape[:-4], 1, W, P, -1)).squeeze(-4)
+
+    return read(moved), read(clean), read(group), read(group_after)
 
 
 def _views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tensor:

@@ -57,10 +57,8 @@ def at_once(model, scene: Scene, task, context: int, frames: int, options: Sampl
     start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid))
     generator = torch.Generator().manual_seed(seed)
     noise = NoiseStream((scene.scenes, 3, model.layout.width), generator, eta=options.eta)
-    present, guidance = given.present, options.guidance
-    out = sample(
-        model.denoise, schedule, start, present, model.layout, settle=canvas.settle, guidance=guidance, noise=noise
-    )
+    how = {"guidance": options.guidance, "noise": noise, "solver": options.solver}
+    out = sample(model.denoise, schedule, start, given.present, model.layout, settle=canvas.settle, **how)
     with torch.no_grad():
         return canvas.scene(out).cut(0, context + frames)
 
@@ -105,6 +103,8 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
         SamplerOptions(steps=4, rolling=2),
         SamplerOptions(steps=3, stride=2, eta=1.0, shift=3.0),
         SamplerOptions(steps=4, rolling=2, eta=0.5),
+        SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
+        SamplerOptions(steps=5, rolling=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
         SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
         SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
     ],
@@ -266,10 +266,10 @@ def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
 # -- one generator for each scene --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("eta", [0.0, 1.0])
+@pytest.mark.parametrize(("solver", "eta"), [("ddim", 0.0), ("ddim", 1.0), ("dpmpp_2m", 0.0)])
 @pytest.mark.parametrize("name", registry.names())
-def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, eta):
-    context, options = context_of(name), SamplerOptions(steps=2, stride=2, eta=eta)
+def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, solver, eta):
+    context, options = context_of(name), SamplerOptions(steps=3, stride=2, eta=eta, solver=solver)
 
     def run(scene: Scene, seeds: range, samples: int) -> Scene:
         each = [torch.Generator().manual_seed(seed) for seed in seeds]
