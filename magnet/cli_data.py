@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli import CommandError, no_such
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
-from magnet.cli_data_shown import bar, file_bars, show_persons, show_skipped, show_splits
+from magnet.cli_data_shown import bar, clips_by_people, file_bars, show_gaps, show_persons, show_skipped, show_splits
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -225,6 +225,7 @@ def run_info(given: argparse.Namespace) -> int:
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
         out.print(f"{len(m['left out'])} takes are in no split")
+    show_gaps(clips_by_people(m))
     return 0
 
 
@@ -245,6 +246,7 @@ def run_check(given: argparse.Namespace) -> int:
     for note in found.notes:
         print(f"note: {note}")
     show_skipped(found.skipped)
+    show_gaps(found.clips_by_people())
     picture = Path(given.picture or f"{found.name}_check.png")
     if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
@@ -313,6 +315,7 @@ def run_prepare(given: argparse.Namespace) -> int:
         print(absent_note(m["listed but not there"]))
     print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    show_gaps(clips_by_people(m))
     takes = sum(split["takes"] for split in m["splits"].values())
     data = catalogue.find(name).data.partition(":")[2]
     body = "" if given.body == "open" else f" --data.body_model {given.body}"

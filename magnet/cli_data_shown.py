@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magnet.datamodules.windows import Split
 
 SKIPPED_SHOWN = 20
 PERSONS_SHOWN = 8
@@ -31,6 +35,20 @@ def show_skipped(skipped: list[tuple[str, str]]) -> None:
         print(f"  {take}: {why}")
     if len(skipped) > SKIPPED_SHOWN:
         print(f"  ... and {len(skipped) - SKIPPED_SHOWN} more, all of them in the store's manifest.json")
+
+
+def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
+    """Clips of each split of a store by number of people."""
+    splits = manifest["splits"].items()
+    return {split: {int(n): count for n, count in of["clips by people"].items()} for split, of in splits}
+
+
+def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
+    """What the splits lack, where nobody overlooks it."""
+    from magnet.datamodules.split_gaps import split_gaps
+
+    for line in split_gaps(clips):
+        print(f"WARNING: {line}", file=sys.stderr)
 
 
 def show_persons(groups: list[tuple[list[str], int]]) -> None:

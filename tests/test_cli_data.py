@@ -155,6 +155,27 @@ def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message)
     assert message in said and len(said.splitlines()) == 1
 
 
+@pytest.mark.parametrize("command", ["prepare", "check dl", "check store", "info"])
+def test_an_empty_split_is_said_loudly(copy, capsys, command):
+    takes = [take.name for take in catalogue.find("dd100").load_reader()(copy / "dl").takes()]
+    (copy / "mine.txt").write_text(f"{takes[0]} train\n{takes[1]} test\n")
+    work = ("--splits", "mine.txt", "--body", "dl/body.npz", "--workers", "1")
+    prepare = ("data", "prepare", "dd100", "--root", "dl", "--out", "store", *work)
+    words = {
+        "prepare": prepare,
+        "check dl": ("data", "check", "dl", "--picture", "none", *work),
+        "check store": ("data", "check", "store", "--picture", "none"),
+        "info": ("data", "info", "store"),
+    }[command]
+    if "store" in words and command != "prepare":
+        assert cli.main(list(prepare)) == 0
+        capsys.readouterr()
+    assert cli.main(list(words)) == 0
+    heard = capsys.readouterr().err
+    assert "WARNING: split val is EMPTY: training goes without validation" in heard and "--splits FILE" in heard
+    assert "split train" not in heard and "split test" not in heard
+
+
 @pytest.mark.parametrize("command", cli_data.COMMANDS)
 def test_names_and_folders_may_stand_before_between_and_after_options(command, monkeypatch):
     add, _, what = cli_data.COMMANDS[command]

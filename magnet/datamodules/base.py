@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
+from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from magnet.body import Body, load_body
@@ -19,7 +20,11 @@ from magnet.datamodules.windows import Clip, Draw, Split, Store, at_least
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 
-__all__ = ["Clip", "MotionDataModule", "Split"]
+__all__ = ["Clip", "EmptySplitError", "MotionDataModule", "Split"]
+
+
+class EmptySplitError(ValueError):
+    """A split without clips; names what else there is."""
 
 
 class MotionDataModule(LightningDataModule):
@@ -158,11 +163,11 @@ class MotionDataModule(LightningDataModule):
         """The clips of a split as a store on the CPU; all in memory, unless a data set knows better.
 
         Raises:
-            ValueError: the split has no clips.
+            EmptySplitError: the split has no clips.
         """
         clips = self.clips(split)
         if not clips:
-            raise ValueError(
+            raise EmptySplitError(
                 f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
             )
         return Store(clips, self.max_agents)
@@ -227,9 +232,17 @@ class MotionDataModule(LightningDataModule):
         for number in range(batches):
             yield self._gather("train", self.window_frames, draws(0, number * self.batch_size, self.batch_size))
 
-    def val_dataloader(self) -> FixedLoader:
-        """Windows of the val split side by side, nothing random (val_batch_size, window_frames, max_agents)."""
-        draw = fixed_draws(self.store("val"), self.window_frames, self.window_frames, pad=True)
+    def val_dataloader(self) -> FixedLoader | list[Any]:
+        """Windows of the val split side by side, nothing random (val_batch_size, window_frames, max_agents).
+
+        Without clips to validate on there is no loader: training goes on without validation, and says so.
+        """
+        try:
+            store = self.store("val")
+        except EmptySplitError as error:
+            rank_zero_warn(f"training goes without validation, and no best checkpoint is chosen: {error}")
+            return []
+        draw = fixed_draws(store, self.window_frames, self.window_frames, pad=True)
         return self._fixed("val", draw, self.window_frames, self.val_batch_size)
 
     def test_dataloader(self) -> FixedLoader:

@@ -45,6 +45,13 @@ class Checked:
     notes: list[str] = field(default_factory=list)
     scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
 
+    def clips_by_people(self) -> dict[Split, dict[int, int]]:
+        """Clips of each split that has any, by number of people."""
+        of = {
+            split: [(n.removeprefix("of "), k) for n, k in c.items() if "of " in n] for split, c in self.counts.items()
+        }
+        return {split: {int(n): count for n, count in counts} for split, counts in of.items()}
+
     def count_skipped(self, takes: int) -> None:
         """Skipped ones of so many takes are a problem."""
         if not self.counts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,20 +15,24 @@ from magnet.datamodules.arrays import (
     AGAIN,
     Doubles,
     floats,
-    hashed_split,
     one_length,
     one_shape,
     open_json,
     open_npy,
     require,
 )
-from magnet.datamodules.fields import Person, mapping, side_by_side
+from magnet.datamodules.fields import Person, listing, mapping, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.session_split import split_sessions
+from magnet.datamodules.windows import Split
 
 WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
 FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")
 BETAS = 300
+LIST = "dataset.json"
+USUAL = ("acting", "daylife")
+"""Sections that are taken unless others are named."""
 FIRST = "the first 10 of 300 shape numbers are used: the same basis, slightly another mesh"
 
 
@@ -36,6 +41,7 @@ class _Scene:
     section: str
     capture: str
     people: tuple[str, ...]  # subject ids, sorted
+    frames: int  # by the list; at least 1
 
     @property
     def session(self) -> str:
@@ -47,14 +53,18 @@ class _Scene:
 class Embody3DReader(Reader):
     """Embody 3D's `datasets/<section>/<capture>/<subject>/<feature>/<capture>.npy`.
 
-    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by scene: a hash
-    of its session, date and time, gives a tenth of the sessions to test and a tenth to val. So a scene is in the same
-    split whichever sections and numbers of people are chosen or were downloaded, and those of one session are together.
+    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by session, date
+    and time of the capture, so that scenes of one session are together: `split_sessions` gives test and val a tenth of
+    the frames of each number of people. It looks at the lists alone: first at acting's and daylife's, then at those of
+    each other section, in alphabetical order, where sessions seen before stay. So a scene is in the same split
+    whichever sections and numbers of people are chosen and whatever else was downloaded, as long as the same lists lie
+    there; the toolbox has them all.
 
     Args:
-        root: the folder `datasets`, or the one above.
-        sections: such as acting, daylife, aiagent, emotions, icebreakers, location, polyadic. The paper's own choice
-            is not published; acting and daylife come closest to its numbers.
+        root: the folder `datasets`, the one above, or one section's.
+        sections: such as acting, daylife, aiagent, emotions, icebreakers, location, polyadic; None: acting and daylife
+            as far as they were downloaded, else all that were. The paper's own choice is not published; acting and
+            daylife come closest to its numbers.
         people: how many people a scene may have.
         good: what `missing` holds where tracking is good: 1 by the README, against the name.
 
@@ -71,34 +81,63 @@ class Embody3DReader(Reader):
     def __init__(
         self,
         root: str | Path,
-        sections: Sequence[str] = ("acting", "daylife"),
+        sections: Sequence[str] | None = None,
         people: Sequence[int] = (2, 3, 4),
         good: int = 1,
     ) -> None:
         super().__init__(root)
         if good not in (0, 1):
             raise ValueError(f"good: got {good}, expected 1 (the README) or 0")
-        self.sections, self.people, self.good = tuple(sections), tuple(people), good
+        self.people, self.good = tuple(people), good
         self.folder = self.root / "datasets" if (self.root / "datasets").is_dir() else self.root
-        there = sorted(path.parent.name for path in self.folder.glob("*/dataset.json"))
-        if lacking := [section for section in self.sections if section not in there]:
+        if (self.root / LIST).is_file():
+            self.folder, sections = self.root.absolute().parent, sections or (self.root.absolute().name,)
+        self.listed = sorted(path.parent.name for path in self.folder.glob(f"*/{LIST}"))
+        if lacking := [section for section in sections or () if section not in self.listed]:
             raise DataError(
-                f"{self.folder}: no {', '.join(f'{section}/dataset.json' for section in lacking)}; sections with one: "
-                f"{', '.join(there) or 'none'}; give those as --reader.sections, or get dataset.json from the toolbox"
+                f"{self.folder}: no {', '.join(f'{section}/{LIST}' for section in lacking)}; sections with one: "
+                f"{', '.join(self.listed) or 'none'}; give those as --reader.sections, or get {LIST} from the toolbox"
             )
+        self.sections = tuple(sections) if sections is not None else self._downloaded()
+
+    def _downloaded(self) -> tuple[str, ...]:
+        """Sections of which captures are there: acting and daylife, or all others."""
+        there = [section for section in self.listed if any(self.folder.glob(f"{section}/c--*/*/missing"))]
+        if not there:
+            listed = f"lists of {', '.join(self.listed)}" if self.listed else f"no SECTION/{LIST}"
+            raise DataError(
+                f"{self.folder}: {listed}, but no captures SECTION/CAPTURE/SUBJECT/missing; it holds "
+                f"{listing(self.folder)}; unpack the downloaded categories there, each with its {LIST} of the toolbox"
+            )
+        return tuple(section for section in there if section in USUAL) or tuple(there)
 
     def found(self) -> list[Take]:
+        splits, scenes = self._splits()
         return [
             Take(
                 name=scene.capture if len(scene.people) > 1 else f"{scene.capture}/{scene.people[0]}",
                 files=tuple(self._file(scene, person, feature) for person in scene.people for feature in FEATURES),
-                split=hashed_split(scene.session),
+                split=splits[scene.session],
                 group=scene.capture,
             )
             for section in self.sections
-            for scene in self._scenes(section)
+            for scene in scenes[section]
             if len(scene.people) in self.people
         ]
+
+    def _splits(self) -> tuple[dict[str, Split], dict[str, list[_Scene]]]:
+        """The split of every listed session, whatever was chosen of them; and the scenes of each section."""
+        scenes: dict[str, list[_Scene]] = {}
+        splits: dict[str, Split] = {}
+        first = [section for section in USUAL if section in self.listed]
+        for sections in (first, *([section] for section in self.listed if section not in first)):
+            sessions: dict[str, Counter[int]] = {}
+            for section in sections:
+                scenes[section] = self._scenes(section)
+                for scene in scenes[section]:
+                    sessions.setdefault(scene.session, Counter())[len(scene.people)] += scene.frames
+            splits |= split_sessions(sessions, splits)
+        return splits, scenes
 
     def read(self, take: Take) -> Recording:
         """Everybody in a scene, sorted by id, with the frames where everybody's tracking is good."""
@@ -109,22 +148,26 @@ class Embody3DReader(Reader):
 
     def _scenes(self, section: str) -> list[_Scene]:
         """Everybody by capture, and whom they say they met."""
-        path = self.folder / section / "dataset.json"
+        path = self.folder / section / LIST
         together: dict[str, set[str]] = {}
+        frames: Counter[str] = Counter()
         alone: list[_Scene] = []
         for subject, captures in mapping(path, open_json(path)).items():
             for capture, said in mapping(f"{path}: {subject}", captures).items():
                 where = f"{path}: {subject}, {capture}"
                 require(where, mapping(where, said), ("multiperson",))
-                others = said["multiperson"]
+                others, length = said["multiperson"], said.get("length")
+                frames[capture] = max(frames[capture], length if isinstance(length, int) else 1, 1)
                 if not others:
-                    alone.append(_Scene(section, capture, (subject,)))
+                    alone.append(_Scene(section, capture, (subject,), frames[capture]))
                     continue
                 if not isinstance(others, list) or not all(isinstance(other, str) for other in others):
                     raise DataError(f"{where}: multiperson is {others!r:.80}, expected subjects' ids or null")
                 # Whoever is named was there: a partner without files must be missed when the scene is read.
                 together.setdefault(capture, set()).update((subject, *others))
-        scenes = [_Scene(section, capture, tuple(sorted(people))) for capture, people in together.items()]
+        scenes = [
+            _Scene(section, capture, tuple(sorted(people)), frames[capture]) for capture, people in together.items()
+        ]
         for scene in (*scenes, *alone):
             for part in (scene.capture, *scene.people):
                 if part in ("", ".", "..") or len(part) > 240 or set("/\\\0") & set(part):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
-from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.base import Clip, EmptySplitError, MotionDataModule, Split
 from magnet.datamodules.recording import Reader
 from magnet.datamodules.store import Folder, StoreError, body_hash
 from magnet.datamodules.store_mapped import MappedStore, Piece
@@ -103,7 +103,7 @@ class Prepared(MotionDataModule):
         piece = self.piece(split)
         if piece is None:
             has = [name for name, facts in self.folder.manifest["splits"].items() if facts["clips"]]
-            raise ValueError(
+            raise EmptySplitError(
                 f"{self.folder.path}: split {split} is empty, the store has {', '.join(has)}; prepare it with a list "
                 f"of splits of your own (--splits FILE), or leave out what needs it"
             )

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from magnet.body.mirror import mirror_scene
+from magnet.datamodules.base import EmptySplitError
 from magnet.datamodules import Clip, Mixed
 from magnet.datamodules.draws import dropped
 from magnet.motion.scene import concatenate
@@ -232,10 +233,15 @@ def test_mixed_trains_on_all_and_tests_on_the_chosen_one() -> None:
 # -- bad input ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loader", ["train_dataloader", "val_dataloader", "test_dataloader"])
+@pytest.mark.parametrize("loader", ["train_dataloader", "test_dataloader"])
 def test_an_empty_split_is_named(loader: str) -> None:
-    with pytest.raises(ValueError, match=f"split {loader[: loader.index('_')]} is empty"):
+    with pytest.raises(EmptySplitError, match=f"split {loader[: loader.index('_')]} is empty"):
         getattr(FakeData([]), loader)()
+
+
+def test_without_clips_to_validate_on_training_goes_on_and_says_so() -> None:
+    with pytest.warns(UserWarning, match="training goes without validation.*: FakeData: split val is empty"):
+        assert FakeData([random_clip("a")]).val_dataloader() == []
 
 
 def test_what_is_too_long_for_the_clips_is_named() -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from magnet.datamodules.check import recognise
 from magnet.datamodules.embody3d import Embody3D, Embody3DReader
 from magnet.datamodules.fakes.embody3d import write
 from magnet.datamodules.recording import DataError, Take
@@ -59,14 +63,19 @@ def test_sections_choose_scenes(root: Path) -> None:
 # -- splits ------------------------------------------------------------------------------------
 
 
-def listed(root: Path, scenes: list[tuple[str, list[str]]]) -> Embody3DReader:
+SPLITS = ("train", "val", "test")
+
+
+def listed(root: Path, scenes: list[tuple[str, list[str]]], lengths: list[int] | None = None) -> Embody3DReader:
     """A download of which only dataset.json is there: (session, people) of each scene."""
     subjects: dict[str, dict[str, Any]] = {}
     for number, (session, people) in enumerate(scenes):
-        capture = f"c--{session}--{'--'.join(people)}--pilot--MotionPrior--ACTING_x--{number:06}-{number + 9:06}"
+        length, start = lengths[number] if lengths else 10, 10_000 * number
+        span = f"{start:06}-{start + length - 1:06}"
+        capture = f"c--{session}--{'--'.join(people)}--pilot--MotionPrior--ACTING_x--{span}"
         for person in people:
             others = [other for other in people if other != person] or None
-            subjects.setdefault(person, {})[capture] = {"length": 10, "id": number, "multiperson": others}
+            subjects.setdefault(person, {})[capture] = {"length": length, "id": number, "multiperson": others}
     (root / "acting").mkdir(parents=True)
     (root / "acting" / "dataset.json").write_text(json.dumps(subjects))
     return Embody3DReader(root, sections=("acting",))
@@ -82,7 +91,8 @@ def test_a_scene_is_in_one_split_whatever_else_is_chosen_or_there(root: Path) ->
         for people in ((2,), (3, 4)):
             takes = Embody3DReader(root, sections=sections, people=people).takes()
             assert {take.name: take.split for take in takes}.items() <= whole.items()
-    shutil.rmtree(root / "datasets/daylife")
+    for capture in (root / "datasets/daylife").glob("c--*"):
+        shutil.rmtree(capture)
     left = {take.name: take.split for take in Embody3DReader(root, sections=("acting",)).takes()}
     assert left and left.items() <= whole.items()
 
@@ -95,6 +105,79 @@ def test_sessions_stay_whole(tmp_path: Path) -> None:
     assert len({(session[take.name], take.split) for take in takes}) == len(set(session.values()))
     shares = [sum(take.split == split for take in takes) / len(takes) for split in ("val", "test")]
     assert all(0.03 <= share <= 0.2 for share in shares)
+
+
+@pytest.mark.parametrize("having", [(3, 3), (4, 5), (9, 6), (22, 22)], ids=str)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_list_like_the_official_one_leaves_no_number_of_people_out_of_a_split(
+    tmp_path: Path, having: tuple[int, int], seed: int
+) -> None:
+    """As acting and daylife are listed: 22 sessions of four, 55, 27 and 620 scenes of two, three and four people."""
+    rng = np.random.default_rng(seed)
+    sessions = [f"2025{1 + k % 6:02}{3 + k:02}--{rng.integers(900, 1700):04}" for k in range(22)]
+    casts = {session: [f"{chr(65 + k)}BC{100 * p + k:03}" for p in range(4)] for k, session in enumerate(sessions)}
+    some = {2: sessions[: having[0]], 3: sessions[-having[1] :], 4: sessions}
+    scenes = []
+    for people, count in ((2, 55), (3, 27), (4, 620)):
+        of = some[people]
+        for number in range(count):
+            session = of[number] if number < len(of) else str(rng.choice(of))
+            scenes.append((session, casts[session][:people]))
+    takes = listed(tmp_path, scenes, lengths=rng.integers(450, 9000, len(scenes)).tolist()).takes()
+    frames: Counter[tuple[int, str]] = Counter()
+    for take in takes:
+        first, last = map(int, re.findall(r"--(\d+)-(\d+)$", take.name)[0])
+        frames[len(people_of(take)), str(take.split)] += last - first + 1
+    assert len(takes) == 702 and all(frames[n, split] for n in (2, 3, 4) for split in ("train", "val", "test"))
+    four = {split: frames[4, split] / sum(frames[4, other] for other in ("train", "val", "test")) for split in SPLITS}
+    assert all(0.05 <= four[split] <= 0.16 for split in ("val", "test")), four
+
+
+@pytest.fixture
+def official_lists() -> Path:
+    """The folder `datasets` of a clone of facebookresearch/embody-3d, which holds all lists and no recordings."""
+    folder = os.environ.get("MAGNET_EMBODY3D_LISTS")
+    if not folder:
+        pytest.skip("MAGNET_EMBODY3D_LISTS is not set")
+    return Path(folder)
+
+
+def test_the_official_list_leaves_no_number_of_people_out_of_a_split(official_lists: Path) -> None:
+    takes = Embody3DReader(official_lists, sections=("acting", "daylife")).takes()
+    assert len({"--".join(take.name.split("--")[1:3]) for take in takes}) == 22
+    counts = Counter((len(people_of(take)), take.split) for take in takes)
+    assert [sum(counts[n, split] for split in SPLITS) for n in (2, 3, 4)] == [55, 27, 620]
+    assert all(counts[n, split] for n in (2, 3, 4) for split in SPLITS), counts
+
+
+@pytest.mark.parametrize("there", [("daylife",), ("polyadic", "emotions")], ids=str)
+def test_a_download_of_one_category_is_recognised(root: Path, there: tuple[str, ...]) -> None:
+    """The toolbox's clone has the lists of all sections; captures are of one category alone."""
+    acting, daylife = root / "datasets/acting", root / "datasets/daylife"
+    if "daylife" in there:
+        for capture in acting.glob("c--*"):
+            shutil.rmtree(capture)
+    else:
+        acting.rename(acting.with_name("polyadic"))
+        daylife.rename(daylife.with_name("emotions"))
+    assert recognise(root) == "embody3d"
+    reader = Embody3DReader(root)
+    assert set(reader.sections) == set(there) and len(reader.takes()) == 2 * len(there)
+    assert all(reader.read(take).frames == 12 for take in reader.takes())
+
+
+def test_the_folder_of_one_section_is_a_root_too(root: Path) -> None:
+    reader = Embody3DReader(root / "datasets" / "daylife")
+    assert {take.name: take.split for take in reader.takes()}.items() <= {
+        take.name: take.split for take in Embody3DReader(root).takes()
+    }.items()
+    assert len(reader.takes()) == 2 and reader.read(reader.takes()[0]).frames == 12
+
+
+def test_lists_without_captures_are_no_download(tmp_path: Path) -> None:
+    listed(tmp_path, [("20250101--0900", ["AAA001", "BBB002"])])
+    with pytest.raises(DataError, match=r"lists of acting, but no captures .* unpack the downloaded categories there"):
+        Embody3DReader(tmp_path)
 
 
 def test_solo_captures_are_scenes_of_one(tmp_path: Path) -> None:

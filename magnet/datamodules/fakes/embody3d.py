@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magnet.datamodules.arrays import hashed_split
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people
-from magnet.datamodules.windows import Split
 
 LABELS = {"acting": "ACTING_Adult_Birthday_", "daylife": "DAYLIFE_Going_out"}
-SPLITS: tuple[Split, ...] = ("train", "val", "test", "train")
 ELSEWHERE = "/social_ai/datasets/opensource"
 """dataset.json names files by paths on its authors' machines."""
 LOST = 3
@@ -61,7 +58,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
         ids = [
             f"{'ABCD'[p]}{chr(65 + index // 26 % 26)}{chr(65 + index % 26)}{100 + index % 900}" for p in range(persons)
         ]
-        session = next(at for at in _sessions(index) if hashed_split(at) == SPLITS[index % len(SPLITS)])
+        session = f"{20250101 + index // 28 % 12 * 100 + index % 28}--{900 + index // 336:04}"
         label = LABELS["daylife" if index % 2 else "acting"]
         span = f"{1000 * index:06}-{1000 * index + frames - 1:06}"
         capture = f"c--{session}--{'--'.join(ids)}--pilot--MotionPrior--{label}--{span}"
@@ -77,11 +74,6 @@ def section_of(capture: str) -> str:
 def ids_of(capture: str) -> list[str]:
     """Subjects in a capture's name."""
     return capture.split("--pilot")[0].split("--")[3:]
-
-
-def _sessions(index: int) -> Iterator[str]:
-    day = f"{20250101 + index // 28 % 12 * 100 + index % 28}"
-    return (f"{day}--{minute // 60:02}{minute % 60:02}" for minute in range(24 * 60))
 
 
 def _features(motion: FakeMotion, p: int, lost: int) -> dict[str, np.ndarray]:
