@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from magnet.body.mirror import mirror_scene
-from magnet.datamodules.base import EmptySplitError
 from magnet.datamodules import Clip, Mixed
+from magnet.datamodules.base import EmptySplitError
 from magnet.datamodules.draws import dropped
 from magnet.motion.scene import concatenate
 from magnet.testing import random_scene
