@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import os
 import re
@@ -47,6 +48,7 @@ for example:
 """
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
 UNION = "Does not validate against any of the Union subtypes"
 """How jsonargparse begins to tell that a class refused its options."""
 
@@ -126,6 +128,9 @@ def explain(error: Exception) -> str | None:
         return misfit(text)
     if isinstance(error, ImportError) and "pip install" in text:
         return text
+    if isinstance(error, OSError) and error.errno in FULL and error.args[:1] == (error.errno,):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}the disk is full: free some space, then run the same command again (--debug shows where)"
     if isinstance(error, (ValueError, OSError)) or type(error).__name__ == "MisconfigurationException":
         said = re.findall(r"^ *- (?!Expected )(.+)", text, re.MULTILINE) if text.startswith(UNION) else []
         return f"{said[0] if said else text or type(error).__name__} (--debug shows where)"

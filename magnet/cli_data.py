@@ -327,6 +327,7 @@ def run_prepare(given: argparse.Namespace) -> int:
 def run_fake(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
     from magnet.datamodules.windows import at_least
+    from magnet.files import writing
 
     name, out = needed(given, "name", "out")
     folder = Path(out).expanduser()
@@ -340,7 +341,8 @@ def run_fake(given: argparse.Namespace) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
     at_least(1, takes=given.takes, frames=given.frames)
-    write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
+    with writing(folder, "choose another --out"):
+        write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
     print(f"{len(files)} files of a made-up {name} are in {folder}. To {then}")
     return 0
@@ -355,11 +357,12 @@ def run_download(given: argparse.Namespace) -> int:
         raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
     (out,) = needed(given, "out")
     from magnet.datamodules.download import download_cmu
+    from magnet.files import writing
 
     subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]
     options: dict[str, Any] = {"any_version": True} if given.any_version else {}
     options |= {} if given.base_url is None else {"base_url": given.base_url}
-    with file_bars() as tell:
+    with file_bars() as tell, writing(out, "choose another --out; then run the same command again, which goes on"):
         got = download_cmu(subjects, out, progress=tell, **options)
     print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
     if got.unlike:

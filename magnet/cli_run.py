@@ -27,6 +27,7 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.presets import PRESETS
 from magnet.evaluation import Evaluation
+from magnet.files import writing
 from magnet.motion.scene import Scene
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
@@ -91,7 +92,9 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
     layers = [word for each in settled.layers if each.options for word in ("--config", each.word())]
-    MagnetCLI(command, [*layers, *words], checkpoint, folder, settled.classes)
+    goes_on = "; then go on with --ckpt_path last, if there is one" if command == "fit" else ""
+    with writing(folder, f"choose another --out{goes_on}"):
+        MagnetCLI(command, [*layers, *words], checkpoint, folder, settled.classes)
     return 0
 
 

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from magnet.files import load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 JOINT_NAMES: tuple[str, ...] = (
@@ -222,7 +223,7 @@ def _arrays(path: Path) -> dict[str, NDArray]:
     wanted = (*KEYS, "J_regressor", "J_template", "J_shapedirs", "posedirs", "body_id")
     name = ""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with load_npz(path, wanted) as file:
             there = set(file.files)
             arrays = {}
             for name in wanted:

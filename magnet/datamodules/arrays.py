@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from magnet.datamodules.recording import DataError
 from magnet.datamodules.windows import Split
+from magnet.files import Refused, load_npz, regular
 
 Doubles = NDArray[np.float64]
 AGAIN = "download or unpack it again, or leave it out"
@@ -30,7 +31,7 @@ def open_npy(path: Path) -> NDArray:
     Raises:
         DataError: no such file, cut short, damaged, or it holds pickled objects.
     """
-    with _reported(path, "an npy file"), path.open("rb") as file:
+    with _reported(path, "an npy file"), regular(path).open("rb") as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(file)
@@ -52,9 +53,10 @@ def open_npz(path: Path, keys: Sequence[str], optional: Sequence[str] = ()) -> d
         optional: what is read if it is there and holds no pickle.
 
     Raises:
-        DataError: no such file, cut short, damaged, a key missing, or pickled objects behind one.
+        DataError: no such file, cut short, damaged, a key missing, pickled objects behind one, or an array that
+            would unpack to far more than the file holds.
     """
-    with _reported(path, "an npz archive"), np.load(path, allow_pickle=False) as file:
+    with _reported(path, "an npz archive"), load_npz(path, (*keys, *optional)) as file:
         require(path, file.files, keys)
         arrays = {key: file[key] for key in keys}
         for key in set(optional) & set(file.files):
@@ -72,7 +74,7 @@ def open_json(path: Path) -> Any:
         DataError: no such file, cut short or not json.
     """
     with _reported(path, "a json file"):
-        return json.loads(path.read_bytes())
+        return json.loads(regular(path).read_bytes())
 
 
 def open_names(path: Path) -> list[str]:
@@ -82,7 +84,7 @@ def open_names(path: Path) -> list[str]:
         DataError: no such file, or it is not text.
     """
     with _reported(path, "a list of names"):
-        return [name for line in path.read_text(encoding="utf-8-sig").splitlines() if (name := line.strip())]
+        return [name for line in regular(path).read_text(encoding="utf-8-sig").splitlines() if (name := line.strip())]
 
 
 @contextmanager
@@ -94,6 +96,8 @@ def _reported(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file; {AGAIN}") from error
+    except Refused as error:
+        raise DataError(str(error)) from error
     except Exception as error:  # damaged bytes raise nearly anything
         said = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise DataError(f"{path}: not {what}, cut short or damaged ({said}); {AGAIN}") from error

@@ -22,6 +22,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
 from magnet.datamodules.cmu_subjects import RATES, USUAL_RATE, couple_of
 from magnet.datamodules.speeds import at_speed
+from magnet.files import writing
 from magnet.motion.scene import Scene
 from magnet.threads import one_thread
 
@@ -204,7 +205,8 @@ class CMU(MotionDataModule):
     # -- fitting -------------------------------------------------------------------------------
 
     def _convert(self, takes: list[Take]) -> None:
-        self.cache_folder.mkdir(parents=True, exist_ok=True)
+        with writing(self.cache_folder, "give another --data.cache"):
+            self.cache_folder.mkdir(parents=True, exist_ok=True)
         rank_zero_info(f"CMU: fitting {len(takes)} takes to body {self.body.id} once, into {self.cache_folder}")
         size = {take.name: sum(path.stat().st_size for path in take.amc if path.is_file()) for take in takes}
         bar = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
@@ -261,14 +263,15 @@ def found_takes(folder: Path) -> list[Take]:
 
 def _write(target: Path, write: Callable[[Path], object]) -> None:
     """All of a file or none of it."""
-    handle, name = tempfile.mkstemp(prefix=".", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    try:
-        write(Path(name))
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with writing(target.parent, "give another --data.cache; then run the same command again, which keeps fitted takes"):
+        handle, name = tempfile.mkstemp(prefix=".", suffix=target.suffix, dir=target.parent)
+        os.close(handle)
+        try:
+            write(Path(name))
+            os.replace(name, target)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
 
 
 def fit_take(

@@ -17,9 +17,11 @@ from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all, tak
 from magnet.datamodules.recording import DataError, Reader, Take
 from magnet.datamodules.store import MANIFEST, SPLITS, STATE, Folder, StoreError, as_json, file_hash, write_whole
 from magnet.datamodules.windows import Split, at_least
+from magnet.files import writing
 
 SHARD_ROWS = 2**18
 """Rows of a shard at most, 49 MB; small enough that ten million frames spread over some forty processes."""
+ON_FULL = "choose another --out; then run the same command again, which keeps finished takes"
 
 
 @dataclass(frozen=True)
@@ -56,17 +58,19 @@ def prepare(
     Raises:
         DataError: nothing of the data set was found, or no take could be used; says why for each.
         ValueError: a number out of range, a list of splits that does not fit, or `out` holds something else.
-        OSError: another prepare works there, or the disk is full.
+        OSError: another prepare works there, the disk is full, or the folder may not be written to.
     """
     at_least(1, workers=workers, limit=limit, shard_rows=shard_rows)
     reader, body = order.reader(), order.body()
     use = chosen(reader, splits, limit)
     takes = use.takes
     out = Path(out).expanduser()
-    old = opened(out, reader)
+    opened(out, reader)  # a stranger's folder is refused before anything is made in it
     state = out / STATE
-    state.mkdir(parents=True, exist_ok=True)
-    with locked(state):
+    with writing(out, "choose another --out"):
+        state.mkdir(parents=True, exist_ok=True)
+    with writing(out, ON_FULL), locked(state):
+        old = opened(out, reader)  # again: whoever held the lock before may have made a new store
         settings = order.settings(body)
         keys = {take.name: take_key(take, reader.root, settings) for take in takes}
         finished = remembered(state, old)
@@ -200,6 +204,8 @@ def opened(out: Path, reader: Reader) -> Folder | None:
     Raises:
         ValueError: the folder holds another data set's store, or something that is no store.
     """
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file, expected a folder; choose another --out")
     if not out.exists() or not any(out.iterdir()):
         return None
     if not (out / MANIFEST).exists() and not (out / STATE).is_dir():

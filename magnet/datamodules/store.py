@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 from magnet.body import Body
 from magnet.datamodules.store_rows import ROW, SCALE, decode, encode
 from magnet.datamodules.windows import Clip, Ints, Split
+from magnet.files import file_hash, inside, write_whole
 from magnet.motion.scene import Scene
 
 __all__ = ["ROW", "SCALE", "Folder", "Part", "StoreError", "body_hash", "decode", "encode", "file_hash", "write_whole"]
@@ -47,63 +46,9 @@ def body_hash(body: Body) -> str:
     return hashlib.sha256(joints).hexdigest()
 
 
-# -- files -------------------------------------------------------------------------------------
-
-
-class _Hashed:
-    """A file that is hashed while it is written."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file, self.digest = file, hashlib.sha256()
-
-    def write(self, data: Any) -> None:
-        self.digest.update(data)
-        self.file.write(data)
-
-
-def write_whole(folder: Path, name: Callable[[str], str], write: Callable[[Any], object]) -> tuple[str, str]:
-    """All of a file or none: written aside, synced, renamed. Returns its name and sha256.
-
-    Args:
-        folder: where; it exists.
-        name: sha256 to the file's name.
-        write: is given something to call `write(bytes)` of.
-    """
-    handle, aside = tempfile.mkstemp(prefix=".new-", dir=folder)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            hashed = _Hashed(file)
-            write(hashed)
-            file.flush()
-            os.fsync(file.fileno())
-        digest = hashed.digest.hexdigest()
-        os.chmod(aside, 0o644)
-        os.replace(aside, folder / name(digest))
-    except BaseException:
-        Path(aside).unlink(missing_ok=True)
-        raise
-    sync(folder)
-    return name(digest), digest
-
-
-def sync(folder: Path) -> None:
-    """Make renames in a folder last."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def as_json(value: Any) -> bytes:
     """Always the same bytes for the same value."""
     return (json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode()
-
-
-def file_hash(path: Path) -> str:
-    """sha256 of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # -- reading -----------------------------------------------------------------------------------
@@ -236,7 +181,7 @@ class Folder:
 
     @cached_property
     def _clips(self) -> dict[str, list[Any]]:
-        path = self.path / self.manifest["clips"]["file"]
+        path = self._file(self.manifest["clips"])
         try:
             return json.loads(path.read_text())
         except (OSError, ValueError) as error:
@@ -244,7 +189,7 @@ class Folder:
 
     @cached_property
     def _betas(self) -> NDArray[np.float32]:
-        path = self.path / self.manifest["betas"]["file"]
+        path = self._file(self.manifest["betas"])
         try:
             return np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
@@ -255,6 +200,13 @@ class Folder:
         if split not in self._splits:
             self._splits[split] = self._part(split)
         return self._splits[split]
+
+    def _file(self, entry: Any) -> Path:
+        """A file that the manifest names; it lies in the store's own folder, wherever the store came from."""
+        try:
+            return inside(self.path, entry["file"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{self.path / MANIFEST}: damaged ({error}); prepare the store again") from error
 
     def _part(self, split: Split) -> Part:
         table = self._clips
@@ -269,7 +221,7 @@ class Folder:
             frames=np.array([table["frames"][i] for i in mine], dtype=np.int64),
             people=people[mine] if mine else people[:0],
             betas=self._betas[low:high],
-            files=[self.path / shard["file"] for shard in shards],
+            files=[self._file(shard) for shard in shards],
             ends=np.cumsum([shard["rows"] for shard in shards], dtype=np.int64),
             persons=[tuple(table["persons"][i]) for i in mine] if "persons" in table else [],
         )
@@ -302,7 +254,7 @@ class Folder:
         """Every file of the store but the manifest, and its sha256."""
         manifest = self.manifest
         shards = [shard for split in SPLITS for shard in manifest["splits"][split]["shards"]]
-        return {entry["file"]: entry["sha256"] for entry in (manifest["clips"], manifest["betas"], *shards)}
+        return {self._file(entry).name: entry["sha256"] for entry in (manifest["clips"], manifest["betas"], *shards)}
 
 
 def _advice(path: Path) -> str:

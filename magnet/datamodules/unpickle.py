@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.datamodules.recording import DataError
+from magnet.files import Refused, regular
 
 AGAIN = "download or copy it again"
 KINDS = "?bhilqpBHILQPefdgFDGSU"
@@ -35,11 +36,13 @@ def contents(path: str | Path) -> bytes:
         DataError: it is not there or cannot be read.
     """
     try:
-        return Path(path).read_bytes()
+        return regular(Path(path)).read_bytes()
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file; is the download complete?") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Refused as error:
+        raise DataError(str(error)) from error
+    except (OSError, MemoryError) as error:
+        raise DataError(f"{path}: cannot be read ({_said(error)}); {AGAIN}") from error
 
 
 def load_pickle(path: str | Path) -> Any:

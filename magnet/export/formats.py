@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import level
 from magnet.export.bvh import Unit, save_bvh
@@ -19,6 +17,7 @@ from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.retarget import load_bvh
 from magnet.export.retime import resampled, together
+from magnet.files import load_npz
 from magnet.motion.scene import Scene
 
 if TYPE_CHECKING:
@@ -147,7 +146,7 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with load_npz(path) as file:
             keys = set(file.files)
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error

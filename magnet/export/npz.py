@@ -11,6 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
+from magnet.files import load_npz
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -137,7 +138,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with load_npz(path) as file:
             there = set(file.files)
             key = {ours: next((k for k in keys if k in there), ours) for ours, keys in ALSO.items()}
             parts = ["poses"] if "poses" in there else ["root_orient", "pose_body"]

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from magnet.files import load_npz
+
 BODY_JOINTS = 22
 """The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
 
@@ -205,7 +207,7 @@ class Scene:
             ValueError: the file is not such a file, or of a later format.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with load_npz(path) as file:
                 meta = json.loads(str(file["meta"]))
                 arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in TENSORS if name in file.files}
             version = meta["format"]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.stream import Stream
+from magnet.files import load_npz
 from magnet.motion.scene import Scene, joined, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS
@@ -86,7 +87,7 @@ class Recording:
             ValueError: not such a file, or of a later format.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with load_npz(path) as file:
                 meta = json.loads(str(file["meta"]))
                 arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
             if meta["recording"] > FORMAT:

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body.base import Body, load_body
+from magnet.files import load_npz
 from magnet.motion.scene import Scene
 from magnet.viewer.recording import Recording
 from magnet.viewer.rig import Array
@@ -144,7 +145,7 @@ def is_recording(path: Path) -> bool:
         ValueError: the archive is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with load_npz(path) as file:
             return "meta" in file.files and "recording" in json.loads(str(file["meta"]))
     except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error

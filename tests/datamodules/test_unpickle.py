@@ -157,5 +157,5 @@ def test_every_truncation_is_a_data_error(load: Any, tmp_path: Path) -> None:
 def test_a_missing_file_and_a_folder_are_data_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         load_pickle(tmp_path / "none.pkl")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="is a folder, expected a file"):
         load_object_npy(tmp_path)

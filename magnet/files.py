@@ -1,0 +1,208 @@
+"""Files that come from outside or must last: whole or not there, hashed, and bounded before memory is taken."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+ANYHOW, RATIO = 64 * 2**20, 100
+"""Bytes that any array of an npz may unpack to, and how many times its packed size a larger one may."""
+
+
+class CannotWrite(OSError):
+    """A disk is full, or a place may not be written to; names the path and says what to do next."""
+
+
+class Refused(ValueError):
+    """A file that is not read for what it is, before anything of it is; names it and says what to do."""
+
+
+# -- writing -----------------------------------------------------------------------------------
+
+
+@contextmanager
+def writing(path: str | Path, advice: str) -> Iterator[None]:
+    """Say which path it was, and what to do next, when the disk is full or does not take a file.
+
+    Args:
+        path: file or folder that the block writes.
+        advice: what to do next, such as "choose another --out".
+
+    Raises:
+        CannotWrite: in place of the system's error, whose `errno` it keeps.
+    """
+    try:
+        yield
+    except CannotWrite:
+        raise
+    except OSError as error:
+        if error.errno in FULL:
+            said = f"{path}: the disk is full{_space(Path(path))}: free some space, or {advice}"
+        elif error.errno in REFUSED and _about(error, Path(path)):
+            said = f"{path}: cannot be written ({error.strerror}): give yourself the right to, or {advice}"
+        else:
+            raise
+        told = CannotWrite(said)
+        told.errno = error.errno
+        raise told from error
+
+
+def _about(error: OSError, path: Path) -> bool:
+    """Whether an error is about a path, its folders or what is in it, and not about something else that was read."""
+    if not isinstance(error.filename, str | bytes | os.PathLike):
+        return True
+    named = Path(os.fsdecode(error.filename))
+    return named.is_relative_to(path) or path.is_relative_to(named)
+
+
+def _space(path: Path) -> str:
+    """How much is left where a path is or would be; nothing where that is not known."""
+    there = next((place for place in (path, *path.absolute().parents) if place.exists()), None)
+    try:
+        return "" if there is None else f" ({shutil.disk_usage(there).free / 2**20:,.1f} MiB are free)"
+    except OSError:
+        return ""
+
+
+class _Hashed:
+    """A file that is hashed while it is written, and remembers an error that a library may hide behind its own."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.digest = file, hashlib.sha256()
+        self.failed: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        self.digest.update(data)
+        try:
+            return self.file.write(data)
+        except OSError as error:
+            self.failed = error
+            raise
+
+    def flush(self) -> None:
+        self.file.flush()
+
+
+def write_whole(
+    folder: Path,
+    name: Callable[[str], str],
+    write: Callable[[Any], object],
+    ready: Callable[[str], object] | None = None,
+    advice: str = "choose another folder; then run the same command again, which keeps what is finished",
+) -> tuple[str, str]:
+    """All of a file or none: written aside, synced, renamed. Returns its name and sha256.
+
+    Args:
+        folder: where; it exists.
+        name: sha256 to the file's name.
+        write: is given something to call `write(bytes)` of.
+        ready: is called with the sha256 once the file is whole, before it takes its place.
+        advice: what to do where the disk is full.
+
+    Raises:
+        CannotWrite: the disk is full, or the folder does not take files; nothing is left behind.
+    """
+    with writing(folder, advice):
+        handle, aside = tempfile.mkstemp(prefix=".new-", dir=folder)
+    try:
+        with writing(folder, advice):
+            with os.fdopen(handle, "wb") as file:
+                hashed = _Hashed(file)
+                try:
+                    write(hashed)
+                except Exception as error:
+                    raise hashed.failed or error from error
+                file.flush()
+                os.fsync(file.fileno())
+            digest = hashed.digest.hexdigest()
+            os.chmod(aside, 0o644)
+            if ready is not None:
+                ready(digest)
+            os.replace(aside, folder / name(digest))
+    except BaseException:
+        Path(aside).unlink(missing_ok=True)
+        raise
+    sync(folder)
+    return name(digest), digest
+
+
+def sync(folder: Path) -> None:
+    """Make renames in a folder last."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# -- reading -----------------------------------------------------------------------------------
+
+
+def regular(path: Path) -> Path:
+    """The path, when a plain file or a link to one is there: a pipe or a device would never end.
+
+    Raises:
+        FileNotFoundError: nothing is there, or a link leads nowhere.
+        Refused: something else is.
+    """
+    if not path.exists():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "a pipe, a socket or a device"
+        raise Refused(f"{path}: is {what}, expected a file; copy the file itself there")
+    return path
+
+
+def inside(folder: Path, name: Any) -> Path:
+    """The file of a folder that an index names, which is a plain name: no index leads out of its folder.
+
+    Raises:
+        Refused: it is a path, or no name at all.
+    """
+    if not isinstance(name, str) or name in ("", ".", "..") or set("/\\\0") & set(name):
+        raise Refused(f"{folder}: its index names {name!r:.80}, expected the name of a file in it; make it anew")
+    return folder / name
+
+
+def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:
+    """An npz without pickles, opened, when what it unpacks to is in proportion to what it holds.
+
+    Args:
+        path: the file.
+        names: arrays that will be read; None: any.
+
+    Raises:
+        FileNotFoundError: no such file.
+        Refused: not a file, or an array that would unpack to more than 64 MiB and 100 times its packed size.
+        zipfile.BadZipFile: not an npz.
+    """
+    with zipfile.ZipFile(regular(Path(path))) as archive:
+        for member in archive.infolist():
+            key = member.filename.removesuffix(".npy")
+            if names is not None and key not in names:
+                continue
+            if member.file_size > ANYHOW + RATIO * member.compress_size:
+                raise Refused(
+                    f"{path}: {key!r:.80} would unpack from {member.compress_size / 2**20:,.1f} to "
+                    f"{member.file_size / 2**20:,.0f} MiB, expected at most {RATIO} times as much: no recording is so "
+                    f"even; do not use the file"
+                )
+    return np.load(path, allow_pickle=False)

@@ -1,0 +1,139 @@
+"""Files that are whole or not there, disks that are full, archives that promise too much."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import resource
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnet import files
+from magnet.files import CannotWrite, inside, load_npz, regular, write_whole, writing
+
+HERE = "choose another --out"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_names_the_path_what_is_free_and_what_to_do(code: int, tmp_path: Path) -> None:
+    said = rf"store: the disk is full \([\d,.]+ MiB are free\): free some space, or {HERE}$"
+    with pytest.raises(CannotWrite, match=said) as caught, writing(tmp_path / "new/store", HERE):
+        raise OSError(code, os.strerror(code))
+    assert caught.value.errno == code
+
+
+def test_a_place_that_takes_no_files_is_named_and_other_errors_stay_as_they_are(tmp_path: Path) -> None:
+    for code in (errno.EROFS, errno.EACCES):
+        with pytest.raises(CannotWrite, match=rf"store: cannot be written .*{HERE}"), writing(tmp_path / "store", HERE):
+            raise OSError(code, os.strerror(code), str(tmp_path / "store/.new"))
+    for other in (PermissionError(errno.EACCES, "no", "/download/take"), FileNotFoundError(errno.ENOENT, "no", "x")):
+        with pytest.raises(OSError) as caught, writing(tmp_path / "store", HERE):
+            raise other
+        assert caught.value is other
+
+
+def test_a_real_full_device_is_told_as_such() -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    with pytest.raises(CannotWrite, match=r"/dev/full: the disk is full"), writing("/dev/full", HERE):
+        Path("/dev/full").write_bytes(b"1" * 10)
+
+
+def test_a_file_is_whole_and_its_hash_is_that_of_its_bytes(tmp_path: Path) -> None:
+    seen: list[str] = []
+    name, digest = write_whole(tmp_path, lambda digest: digest[:8], lambda out: out.write(b"whole"), seen.append)
+    assert digest == hashlib.sha256(b"whole").hexdigest() and seen == [digest]
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_bytes() == b"whole"
+
+
+def test_nothing_is_left_of_a_file_that_did_not_fit_and_the_old_one_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_bytes(b"old")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def hidden(out: files._Hashed) -> None:  # as torch does, which raises an error of its own
+        try:
+            out.write(b"new")
+        except OSError:
+            raise RuntimeError("file write failed") from None
+
+    for fails in ("fsync", "replace"):
+        monkeypatch.setattr(os, fails, full)
+        with pytest.raises(CannotWrite, match="the disk is full"):
+            write_whole(tmp_path, lambda _: "a", lambda out: out.write(b"new"))
+        monkeypatch.undo()
+    monkeypatch.setattr(files._Hashed, "write", _failing(files._Hashed.write))
+    with pytest.raises(CannotWrite, match="the disk is full"):
+        write_whole(tmp_path, lambda _: "a", hidden)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"old"}
+
+
+def _failing(write):  # type: ignore[no-untyped-def]
+    def begin(self: files._Hashed, data: bytes) -> int:
+        os.dup2(os.open("/dev/full", os.O_WRONLY), self.file.fileno())
+        self.file = self.file.raw  # type: ignore[attr-defined]
+        return write(self, data)
+
+    return begin
+
+
+# -- reading -----------------------------------------------------------------------------------
+
+
+def test_links_are_followed_and_what_would_never_end_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    assert regular(tmp_path / "link").read_text() == "x"
+    with pytest.raises(FileNotFoundError):
+        regular(tmp_path / "nowhere")
+    for name, what in (("zero", "a device"), ("pipe", "a pipe"), (".", "a folder")):
+        with pytest.raises(ValueError, match=f"is .*{what}.*, expected a file"):
+            regular(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["../a", "/etc/passwd", "a/b", "..", "", ".", "a\0", 7, None, "a\\b"])
+def test_no_index_leads_out_of_its_folder(name: object, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected the name of a file in it; make it anew"):
+        inside(tmp_path, name)
+    assert inside(tmp_path, "a.npy") == tmp_path / "a.npy"
+
+
+def bomb(path: Path, mib: int) -> Path:
+    """An npz of a few kilobytes a MiB whose array of zeros unpacks to so many, written without holding them."""
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({mib * 2**18},), }}".ljust(117) + "\n"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("poses.npy", "w") as member:
+        member.write(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
+        for _ in range(mib):
+            member.write(bytes(2**20))
+    return path
+
+
+def test_a_bomb_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "bomb.npz", 300)
+    assert path.stat().st_size < 2**20
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"bomb\.npz: 'poses' would unpack from .* to 300 MiB, .*do not use the file"):
+        load_npz(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 * 1024  # KiB
+    assert load_npz(path, ("other",)).files == ["poses"]  # which nobody reads
+
+
+def test_arrays_of_any_size_that_hold_something_are_read(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    held = {"even": np.zeros(2**22), "odd": random.normal(size=2**16)}  # 32 MiB of zeros
+    np.savez_compressed(tmp_path / "held.npz", **held)  # type: ignore[arg-type]
+    with load_npz(tmp_path / "held.npz") as file:
+        assert all(np.array_equal(file[key], value) for key, value in held.items())
+    for array in (np.arange(2**23), np.zeros(2**24, dtype=np.uint8)):  # 64 MiB of numbers; packed not at all
+        np.savez(tmp_path / "plain.npz", array=array)
+        assert load_npz(tmp_path / "plain.npz")["array"].nbytes == array.nbytes
