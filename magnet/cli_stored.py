@@ -142,7 +142,7 @@ class Stored:
             if isinstance(error.__cause__, pickle.UnpicklingError):
                 reason = "not a checkpoint, or one that holds more than weights and plain values, which could run code"
                 raise CommandError(f"{path}: {reason}; it is not loaded") from error
-            raise CommandError(textwrap.shorten(str(error).partition("\n")[0], 200)) from error
+            raise CommandError(textwrap.shorten(str(error).partition("\n")[0], 400)) from error
         if not isinstance(checkpoint, dict) or "state_dict" not in checkpoint:
             raise CommandError(f"{path}: not a checkpoint of a model, it has no state_dict")
         config = checkpoint.get(CONFIG_KEY) or {}

@@ -88,8 +88,8 @@ def test_explicit_data_options_beat_what_is_linked(trained: Path) -> None:
 
 
 def test_options_that_no_longer_exist_are_left_out(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = trained / "checkpoints" / "last.ckpt"
-    checkpoint = torch.load(path, weights_only=True)
+    path = trained / "checkpoints" / "older.ckpt"
+    checkpoint = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
     checkpoint["magnet_config"]["data"]["init_args"]["gone"] = 1
     torch.save(checkpoint, path)
     _, data = go("test", "--ckpt_path", str(path))

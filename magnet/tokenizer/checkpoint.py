@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from magnet import weights
+
 SHAPING = ("latent", "hidden", "codes", "levels", "depth", "causal")
 """Fields that decide the shape of the weights, or what they mean."""
 
@@ -23,6 +25,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such tokenizer checkpoint; train one with `magnet fit`")
+    weights.verify(path)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
         fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]

@@ -2,12 +2,16 @@
 
 A released model is a folder: `config.json` (how to build it, what it was trained on, a hash of every
 part) and tensors in safetensors files of at most 16 MB. Nothing in it can run code.
+
+A checkpoint of training is one file, with its SHA-256 in a file beside it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,8 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from magnet.files import file_hash, inside, write_whole
 
 FOLDER = Path(__file__).parent
 DEFAULT = "duet"
@@ -56,6 +62,7 @@ def read(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if path.is_dir():
         return _read_folder(path)
+    verify(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -66,27 +73,94 @@ def read(path: str | Path) -> dict[str, Any]:
         ) from error
 
 
+def checksum_file(path: Path) -> Path:
+    """Where the SHA-256 of a checkpoint lies, in a line that `sha256sum -c` reads."""
+    return path.with_name(path.name + ".sha256")
+
+
+def verify(path: Path) -> None:
+    """A checkpoint's bytes are those that were written, as far as can be known.
+
+    By the checksum beside it; a checkpoint without one, as older versions and others wrote it, by the CRC-32 that its
+    archive keeps of each record.
+
+    Raises:
+        ValueError: they are not; says what to do.
+    """
+    beside = checksum_file(path)
+    if path.is_file() and beside.is_file():
+        match = re.match(r"[0-9a-f]{64}(?![0-9a-f])", beside.read_text(errors="replace"))
+        if match is None:
+            raise ValueError(f"{beside}: holds no SHA-256; copy it again, or delete it to load {path.name} without")
+        if file_hash(path) != match[0]:
+            raise ValueError(
+                f"{path}: damaged, its SHA-256 is not the one in {beside.name}: copy both again, or take another "
+                f"checkpoint; if you changed it yourself, delete {beside.name}"
+            )
+    elif path.is_file() and zipfile.is_zipfile(path):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                bad = archive.testzip()
+        except Exception as error:  # damaged headers raise nearly anything
+            bad = str(error)
+        if bad is not None:
+            raise ValueError(f"{path}: not a checkpoint that is whole ({bad}): copy it again, or take another one")
+
+
+def save(checkpoint: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint whole or not at all, and its SHA-256 beside it.
+
+    Raises:
+        CannotWrite: the disk is full; the checkpoint that was there before is whole.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside, advice = checksum_file(path), "choose another --out; then go on with --ckpt_path last"
+    # Between the two files' renames a checkpoint has no checksum, never another one's.
+    _, digest = write_whole(
+        path.parent,
+        lambda _: path.name,
+        lambda out: torch.save(checkpoint, out),
+        ready=lambda _: beside.unlink(missing_ok=True),
+        advice=advice,
+    )
+    line = f"{digest}  {path.name}\n".encode()
+    write_whole(path.parent, lambda _: beside.name, lambda out: out.write(line), advice=advice)
+
+
 def _read_folder(folder: Path) -> dict[str, Any]:
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder}: a folder without config.json is no released model")
-    config = json.loads((folder / "config.json").read_text())
-    if config["format"] > FORMAT:
-        raise ValueError(f"{folder}: weights format {config['format']}, this version reads up to {FORMAT}")
+    try:
+        config = json.loads((folder / "config.json").read_bytes())
+        version, parts = config["format"], [(part["file"], part["sha256"]) for part in config["parts"]]
+        kept = {name: config[name] for name in ("steps", *KEPT)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{folder / 'config.json'} is damaged ({error}): fetch the release again") from error
+    if version > FORMAT:
+        raise ValueError(f"{folder}: weights format {version}, this version reads up to {FORMAT}")
+    if config.get("sha256", own := _config_hash(config)) != own:
+        raise ValueError(f"{folder / 'config.json'} is damaged: its hash is not the one in it: fetch the release again")
     state: dict[str, Tensor] = {}
-    for part in config["parts"]:
-        file = folder / part["file"]
+    for name, digest in parts:
+        file = inside(folder, name)
         if not file.exists():
             raise ValueError(f"{file} is missing: fetch the release again")
-        if hashlib.sha256(file.read_bytes()).hexdigest() != part["sha256"]:
-            raise ValueError(f"{file} is damaged: its hash is not the one in config.json")
+        if file_hash(file) != digest:
+            raise ValueError(f"{file} is damaged: its hash is not the one in config.json: fetch the release again")
         state |= {name: _widen(value) for name, value in load_file(file).items()}
     return {
         "state_dict": state,
         "pytorch-lightning_version": "2.6.4",
         "epoch": 0,
-        "global_step": config["steps"],
-        **{name: config[name] for name in KEPT},
+        "global_step": kept.pop("steps"),
+        **kept,
     }
+
+
+def _config_hash(config: dict[str, Any]) -> str:
+    """Of all that a config.json says but this hash itself."""
+    said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
+    return hashlib.sha256(said.encode()).hexdigest()
 
 
 def _widen(value: Tensor) -> Tensor:
@@ -141,7 +215,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     for number, part in enumerate(parts, 1):
         file = folder / f"weights-{number:02d}.safetensors"
         save_file(part, file)
-        listed.append({"file": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()})
+        listed.append({"file": file.name, "sha256": file_hash(file)})
     config = {
         "format": FORMAT,
         "steps": int(checkpoint.get("global_step", 0)),
@@ -149,7 +223,8 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
         **{name: checkpoint.get(name) for name in KEPT},
         "about": about or {},
     }
-    (folder / "config.json").write_text(json.dumps(config, indent=1, default=str) + "\n")
+    config = json.loads(json.dumps(config, default=str))  # as it will be read
+    (folder / "config.json").write_text(json.dumps(config | {"sha256": _config_hash(config)}, indent=1) + "\n")
     return folder
 
 
@@ -158,7 +233,21 @@ def _any(parts: tuple[str, ...], name: str) -> bool:
 
 
 class CheckpointIO(TorchCheckpointIO):
-    """Lets Lightning load released folders as it loads its own checkpoints; never unpickles anything else."""
+    """Lets Lightning load released folders as it loads its own checkpoints; never unpickles anything else.
+
+    What it writes has a checksum beside it.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        if storage_options is not None or "://" in str(path):  # elsewhere than on a disk
+            super().save_checkpoint(checkpoint, path, storage_options)
+        else:
+            save(checkpoint, Path(path))
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         return read(path)
+
+    def remove_checkpoint(self, path: Any) -> None:
+        super().remove_checkpoint(path)
+        if "://" not in str(path):
+            checksum_file(Path(path)).unlink(missing_ok=True)
