@@ -100,7 +100,9 @@ def add_info(one: argparse.ArgumentParser) -> None:
 
 
 def add_work(one: argparse.ArgumentParser) -> None:
-    one.add_argument("--body", default="open", help="SMPL-X's npz (register at https://smpl-x.is.tue.mpg.de)")
+    one.add_argument(
+        "--body", default="open", help="SMPL-X's or SMPL's file, npz or pkl (register at https://smpl-x.is.tue.mpg.de)"
+    )
     one.add_argument(
         "--bodies",
         nargs="+",

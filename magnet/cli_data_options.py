@@ -57,10 +57,11 @@ def order_of(given: argparse.Namespace, name: str, root: str) -> Order:
     from magnet.datamodules import catalogue
     from magnet.datamodules.common import Steps
     from magnet.datamodules.genders import find_bodies
-    from magnet.datamodules.prepare_takes import Order
+    from magnet.datamodules.prepare_takes import Order, families_of
 
     options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
     if given.body == "open" and given.bodies:
-        given.body = str(find_bodies(given.bodies).get("neutral", "open"))
+        families = families_of(catalogue.find(name).load_reader())
+        given.body = str(find_bodies(given.bodies, families).get("neutral", "open"))
     steps = Steps(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)
     return Order(name, root, options, given.body, steps, tuple(given.bodies))

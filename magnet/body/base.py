@@ -1,11 +1,12 @@
 """What a body model is: shape numbers to rest joints, rotations and pelvis poses to joints or vertices.
 
-A body is read from an npz file with SMPL-X's keys. Hands, jaw and eyes stay at rest, so that every joint
+A body is read from an npz or pickled file with SMPL's keys. Hands, jaw and eyes stay at rest, so that every joint
 beyond the 22 moves rigidly with its nearest ancestor among them; their skinning weights are added to it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 import zlib
 from functools import lru_cache
@@ -17,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from magnet.body.family import TREE, body_files, family_of, title
+from magnet.body.pickles import pickled_arrays
 from magnet.files import load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -25,7 +28,7 @@ JOINT_NAMES: tuple[str, ...] = (
     "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
-PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+PARENTS: tuple[int, ...] = TREE
 MIRROR: tuple[int, ...] = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20)
 """Index of each joint's counterpart on the other side; joints on the midline are their own."""
 
@@ -64,6 +67,7 @@ class Body(nn.Module):
         weights: (V, 22) skinning weights; rows sum to one.
         faces: (F, 3) int.
         posedirs: (V, 3, 189) pose correctives over the 21 rotations less the identity, or None.
+        family: "smpl", "smplh" or "smplx" by the file's whole tree of joints; "": another tree, or not known.
     """
 
     J_template: Tensor
@@ -84,9 +88,10 @@ class Body(nn.Module):
         weights: Tensor,
         faces: Tensor,
         posedirs: Tensor | None = None,
+        family: str = "",
     ) -> None:
         super().__init__()
-        self.id = id
+        self.id, self.family = id, family
         tensors = {
             "J_template": J_template,
             "J_shapedirs": J_shapedirs,
@@ -191,10 +196,10 @@ def _blend(directions: Tensor, amounts: Tensor) -> Tensor:
 
 
 def load_body(which: str | Path = "open") -> Body:
-    """The open body that ships with the package ("open"), or one from a file with SMPL-X's npz keys.
+    """The open body that ships with the package ("open"), or one from a file of SMPL, SMPL-H or SMPL-X: npz or pkl.
 
-    The file is never unpickled. Its id is its own `body_id` if it has one, else made from the file's name:
-    SMPLX_NEUTRAL.npz is "smplx-neutral". Each call gives a module of its own; "open" is read only once.
+    Nothing in a pickle is run, and chumpy is not needed. The body's id is the file's own `body_id` if it has one, else
+    made from its name: SMPLX_NEUTRAL.npz is "smplx-neutral". Each call gives a module of its own; "open" is read once.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -214,19 +219,40 @@ def _open_body() -> dict:
 KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 
 
+WANTED = (*KEYS, "J_regressor", "J_template", "J_shapedirs", "posedirs", "body_id")
+
+
 def _arrays(path: Path) -> dict[str, NDArray]:
-    """The numeric arrays of an npz that a body is made from."""
+    """The arrays of a file that a body is made from."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; {_told(path)}")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such body file; give the path of a SMPL-X npz, or 'open'")
+        raise FileNotFoundError(f"{path}: no such body file; give the path of SMPL's or SMPL-X's npz or pkl, or 'open'")
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"PK"
+    if path.suffix.lower() == ".pkl" and not zipped:
+        arrays, there = pickled_arrays(path, WANTED)
+    else:
+        arrays, there = _npz_arrays(path)
+    missing = [key for key in KEYS if key not in arrays]
+    if "J_regressor" not in arrays and not {"J_template", "J_shapedirs"} <= set(arrays):
+        missing.append("J_regressor")
+    if missing:
+        has = ", ".join(sorted(there))
+        raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {has}; expected SMPL's or SMPL-X's npz or pkl")
+    return arrays
+
+
+def _npz_arrays(path: Path) -> tuple[dict[str, NDArray], set[str]]:
+    """Those of an npz without pickles, and all its keys."""
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable body file (no npz archive, or cut short); download or copy it again")
-    wanted = (*KEYS, "J_regressor", "J_template", "J_shapedirs", "posedirs", "body_id")
     name = ""
     try:
-        with load_npz(path, wanted) as file:
+        with load_npz(path, WANTED) as file:
             there = set(file.files)
             arrays = {}
-            for name in wanted:
+            for name in WANTED:
                 if name in there:
                     arrays[name] = file[name]
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
@@ -235,13 +261,21 @@ def _arrays(path: Path) -> dict[str, NDArray]:
             f"{path}: not a readable body file{at} ({error}); expected SMPL-X's npz with plain numeric arrays "
             f"(pickles are refused); download or copy it again"
         ) from error
-    missing = [key for key in KEYS if key not in arrays]
-    if "J_regressor" not in arrays and not {"J_template", "J_shapedirs"} <= set(arrays):
-        missing.append("J_regressor")
-    if missing:
-        has = ", ".join(sorted(there))
-        raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {has}; expected SMPL-X's npz")
-    return arrays
+    return arrays, there
+
+
+def _told(folder: Path, most: int = 8) -> str:
+    """Which bodies lie in a folder, and how one is given."""
+    found = []
+    for path in body_files(folder):
+        with contextlib.suppress(ValueError, OSError, LookupError):
+            found.append((path, title(family_of(_arrays(path)["kintree_table"][0]))))
+    if not found:
+        return "it holds no body files (SMPL's or SMPL-X's npz or pkl); give the path of one"
+    listed = ", ".join(f"{path.relative_to(folder)} ({what})" for path, what in found[:most])
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    neutral = next((path for path, _ in found if "neutral" in path.as_posix().lower()), found[0][0])
+    return f"it holds {listed}{more}; give one of them, such as {neutral}, and the folder itself as --bodies"
 
 
 def _check_shapes(path: Path, arrays: dict[str, NDArray]) -> None:
@@ -303,7 +337,8 @@ def _read(path: Path) -> dict[str, object]:
         "posedirs": posedirs,
     }
     tensors = {name: None if a is None else torch.from_numpy(a.astype(np.float32)) for name, a in fields.items()}
-    return {"id": body_id, "faces": torch.from_numpy(faces), **tensors}
+    family = family_of(arrays["kintree_table"][0].astype(np.int64).tolist())
+    return {"id": body_id, "faces": torch.from_numpy(faces), "family": family, **tensors}
 
 
 def _fold(path: Path, weights: NDArray, kintree_table: NDArray) -> NDArray:

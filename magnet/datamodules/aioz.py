@@ -13,8 +13,8 @@ from magnet.datamodules.arrays import AGAIN, Doubles, floats, hashed_split, list
 from magnet.datamodules.fields import Person, listing, mapping, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.unpickle import load_pickle
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_pickle
 
 LARGEST = 7
 LIST = "split_sequence_names.txt"

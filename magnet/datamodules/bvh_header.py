@@ -9,8 +9,8 @@ import numpy as np
 
 from magnet.datamodules.arrays import AGAIN, Doubles
 from magnet.datamodules.recording import DataError
-from magnet.datamodules.unpickle import contents
 from magnet.motion.bvh import bvh_header
+from magnet.unpickle import contents
 
 
 @dataclass(frozen=True)

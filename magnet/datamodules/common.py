@@ -141,8 +141,6 @@ def to_clips(
         check_motion.check_rate(motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.fps, FPS)
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
     motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
-    if family == "smpl" and not any("shape" in note for note in notes):
-        notes.append("shape numbers are SMPL's, another basis than SMPL-X's: without --bodies limbs are approximate")
     return Outcome(_cut(motion, jumps, body, name, source, split, steps.min_frames), tuple(notes))
 
 

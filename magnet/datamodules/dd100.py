@@ -21,8 +21,8 @@ from magnet.datamodules.fields import (
 )
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.unpickle import load_object_npy
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_object_npy
 
 FPS = 30.0
 ROLES = ("follower", "leader")

@@ -11,8 +11,8 @@ from magnet.datamodules.arrays import one_length
 from magnet.datamodules.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.unpickle import load_object_npy, load_pickle
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_object_npy, load_pickle
 
 FPS = 120.0
 THINNING, UNIT, SKIPPED = 4, 4, 4

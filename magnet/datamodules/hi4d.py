@@ -16,7 +16,6 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.windows import Split
 
-BASIS = "shape numbers are SMPL's, another basis than SMPL-X's: without --bodies limbs differ by centimetres"
 SHAPES = {"global_orient": (2, 3), "body_pose": (2, 69), "transl": (2, 3), "betas": (2, 10)}
 
 
@@ -75,7 +74,7 @@ class Hi4DReader(Reader):
             person(f"{where}, person {p}", {key: array[p] for key, array in arrays.items()}, f"person {p}", gender=one)
             for p, one in enumerate(genders)
         ]
-        return side_by_side(where, people, 30.0, "+y", notes=[*notes, BASIS])
+        return side_by_side(where, people, 30.0, "+y", notes=notes)
 
     def _pairs(self) -> list[tuple[int, Path]]:
         found = ((re.fullmatch(r"pair(\d+)", path.name), path) for path in sorted(self.root.iterdir()))

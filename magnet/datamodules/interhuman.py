@@ -12,13 +12,12 @@ from magnet.datamodules.arrays import AGAIN, OR_YOURS, floats, listed_splits, op
 from magnet.datamodules.fields import listing, mapping, natural, person, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.unpickle import load_pickle
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_pickle
 
 FPS = 59.94
 PEOPLE = ("person1", "person2")
 LISTS: tuple[Split, ...] = ("train", "val", "test")
-BASIS = "shape numbers are SMPL-H's, another basis than SMPL-X's: without --bodies limbs differ by centimetres"
 
 
 class InterHumanReader(Reader):
@@ -40,6 +39,7 @@ class InterHumanReader(Reader):
     source: ClassVar[str] = "https://github.com/tr3e/InterGen"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    shapes_of: ClassVar[tuple[str, ...]] = ("smplh", "smpl")
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(self, root: str | Path, fps: float = FPS) -> None:
@@ -76,7 +76,7 @@ class InterHumanReader(Reader):
             raise DataError(
                 f"{path}: the partner {' and '.join(lacking)} is missing; it has {', '.join(said)}; {AGAIN}"
             )
-        notes = [*self._rate(path, said), BASIS]
+        notes = self._rate(path, said)
         keys = {"orient": "root_orient", "body": "pose_body", "transl": "trans"}
         held = {name: mapping(f"{path}, {name}", said[name]) for name in PEOPLE}
         people = [person(f"{path}, {name}", one, name, gender=one.get("gender"), **keys) for name, one in held.items()]

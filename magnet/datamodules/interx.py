@@ -11,8 +11,8 @@ from magnet.datamodules.arrays import OR_YOURS, open_names, open_npz
 from magnet.datamodules.fields import Person, first_folder, listing, person, side_by_side
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.unpickle import load_pickle
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_pickle
 
 FPS = 120.0
 FILES = ("P1.npz", "P2.npz")

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body import Body, load_body
+from magnet.body.family import title, titles
 from magnet.datamodules import catalogue
 from magnet.datamodules.common import STEPS_VERSION, Steps, to_clips
 from magnet.datamodules.genders import load_bodies, one_body
@@ -31,9 +32,33 @@ from magnet.threads import one_thread
 PART_VERSION = 2
 """Raise it whenever a part holds something else: takes prepared before are then made anew."""
 BODY_FROM = {
-    "smplx": "https://smpl-x.is.tue.mpg.de (register, then download the model in npz form, such as SMPLX_NEUTRAL.npz)",
-    "smpl": "https://smpl-x.is.tue.mpg.de or https://smpl.is.tue.mpg.de (register; npz form)",
+    "smplx": "https://smpl-x.is.tue.mpg.de (register; SMPLX_NEUTRAL.npz or .pkl)",
+    "smpl": "https://smpl.is.tue.mpg.de for SMPL, https://mano.is.tue.mpg.de for SMPL-H (register; npz or pkl)",
 }
+
+
+def families_of(kind: type[Reader]) -> tuple[str, ...]:
+    """Families of bodies that a data set's shape numbers belong to; none where it has no such numbers."""
+    return kind.shapes_of or ((kind.family,) if kind.family in BODY_FROM else ())
+
+
+def require_family(kind: type[Reader], body: Body, option: str, file: str) -> None:
+    """Refuse a body whose tree of joints is another family's: its shape numbers mean something else.
+
+    Raises:
+        ValueError: it is.
+    """
+    families = families_of(kind)
+    if not families or body.family in ("", *families) or body.id.startswith("open"):
+        return
+    other = (
+        "" if option == "--bodies" else f", or with --bodies beside this one, to have everybody as {title(body.family)}"
+    )
+    raise ValueError(
+        f"{option} {file}: body {body.id!r} is {title(body.family)}'s by its tree of joints, but {kind.title} holds "
+        f"shape numbers of {titles(families)}: give that body's file with {option}{other}; it is from "
+        f"{BODY_FROM[kind.family]}"
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +89,8 @@ class Order:
         """The body model.
 
         Raises:
-            ValueError: the data set holds shape numbers, but no body file was given; says where to get it.
+            ValueError: the data set holds shape numbers, but no body file was given, or another family's; says where to
+                get it.
         """
         kind = catalogue.find(self.name).load_reader()
         if self.body_file == "open" and kind.family != "positions":
@@ -72,15 +98,22 @@ class Order:
                 f"{kind.title} holds shape numbers of {kind.family.upper()}: give the body's file with --body FILE, "
                 f"from {BODY_FROM[kind.family]}; `magnet data fake` writes a made-up body.npz beside its files"
             )
-        return load_body(self.body_file)
+        body = load_body(self.body_file)
+        if not self.body_files:
+            require_family(kind, body, "--body", self.body_file)
+        return body
 
     def bodies(self) -> dict[Gender, Body]:
         """Gendered bodies that shape numbers belong to.
 
         Raises:
-            ValueError: files that are not there, or not to be told apart.
+            ValueError: files that are not there, not to be told apart, or of another family.
         """
-        return load_bodies(self.body_files) if self.body_files else {}
+        kind = catalogue.find(self.name).load_reader()
+        bodies = load_bodies(self.body_files, families_of(kind)) if self.body_files else {}
+        for gender, body in bodies.items():
+            require_family(kind, body, "--bodies", f"the {gender} one")
+        return bodies
 
     def settings(self, body: Body) -> dict[str, Any]:
         """Everything besides a take's files that its part depends on."""

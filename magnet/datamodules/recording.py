@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.datamodules.windows import Split
+from magnet.errors import DataError as DataError
 
 Floats = NDArray[np.floating]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Gender = Literal["neutral", "male", "female"]
 GENDERS: tuple[Gender, ...] = get_args(Gender)
-
-
-class DataError(ValueError):
-    """A file that is not what its data set's layout says; names the file, what was found and what to do."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +109,7 @@ class Reader(ABC):
     source: ClassVar[str]  # address where to ask for it
     licence: ClassVar[str]  # in one line
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
 
     def __init__(self, root: str | Path) -> None:

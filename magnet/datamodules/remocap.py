@@ -13,8 +13,8 @@ from magnet.datamodules.fields import first_folder, listing, mapping, person, sh
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.remocap_track import FPS, MAP, file_like, track
-from magnet.datamodules.unpickle import load_object_npy, load_pickle
 from magnet.datamodules.windows import Split
+from magnet.unpickle import load_object_npy, load_pickle
 
 PLACES = ("", "LindyHop", "ReMoCap/LindyHop", "data/LindyHop")
 PEOPLE = ("0", "1")

@@ -15,7 +15,7 @@ from magnet.datamodules.asf import euler
 from magnet.datamodules.bvh_header import BvhHeader, read_bvh_header
 from magnet.datamodules.fields import mapping
 from magnet.datamodules.recording import DataError
-from magnet.datamodules.unpickle import contents, load_pickle
+from magnet.unpickle import contents, load_pickle
 
 FPS = 50.0
 MAP = {

@@ -13,7 +13,7 @@ import pytest
 from magnet.datamodules.duobox import FITS, MAP, SKELETONS, SKIPPED, DuoBoxReader
 from magnet.datamodules.fakes import duobox as fake
 from magnet.datamodules.recording import DataError, Recording
-from magnet.datamodules.unpickle import load_object_npy
+from magnet.unpickle import load_object_npy
 
 from .reading import world_joints
 

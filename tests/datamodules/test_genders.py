@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,14 @@ from magnet import cli
 from magnet.body import Body, load_body
 from magnet.body.shape import reshaped
 from magnet.datamodules import catalogue
-from magnet.datamodules.common import to_clips
-from magnet.datamodules.fakes.body import arrays
+from magnet.datamodules.common import Steps, to_clips
+from magnet.datamodules.fakes.body import arrays, write_body
 from magnet.datamodules.fakes.motion import people
 from magnet.datamodules.genders import find_bodies, one_body
+from magnet.datamodules.prepare_takes import Order, families_of
 from magnet.datamodules.recording import DataError, Recording
 from magnet.datamodules.store import Folder
+from tests.body.pickled import write_smpl_pkl
 
 SHAPE = {"female": (-1.2, 0.4, 0.3), "male": (1.1, -0.5, -0.2)}
 """What a gendered body's mean is in the neutral one's shape numbers."""
@@ -179,3 +182,91 @@ def test_people_of_no_gender_are_neutral(bodies):
     found = one_body(given, other, bodies["male"])
     (note,) = found.notes
     assert note.startswith("neutral shapes expressed in body made-up-male")
+
+
+# -- families ----------------------------------------------------------------------------------
+
+
+def smpl_files(folder: Path) -> Path:
+    """SMPL's files under its own names, of which nobody has a neutral one here."""
+    for letter in "fm":
+        write_smpl_pkl(folder / f"basicModel_{letter}_lbs_10_207_0_v1.0.0.pkl")
+    return folder
+
+
+def order(name: str, folder: Path, body: str, bodies: tuple[str, ...] = ()) -> Order:
+    return Order(name, str(folder), {}, body, Steps(), bodies)
+
+
+@pytest.mark.parametrize("name", catalogue.NAMES)
+def test_a_body_of_another_family_is_refused_by_its_tree(name, tmp_path):
+    """SMPL's for SMPL-X's numbers and the other way round, whatever the files are called."""
+    kind = catalogue.find(name).load_reader()
+    own, other = ("smpl", "smplx") if kind.family == "smpl" else ("smplx", "smpl")
+    files = {one: str(write_body(tmp_path / f"{one}_is_here.npz", one)) for one in ("smpl", "smplx")}
+    assert order(name, tmp_path, files[own]).body().family == own
+    if not families_of(kind):
+        assert order(name, tmp_path, files[other]).body().family == other
+        return
+    titles = {"smpl": "SMPL's", "smplx": "SMPL-X's"}
+    said = rf"{other}_is_here.*is {titles[other]} by its tree.*{kind.title} holds .* from"
+    with pytest.raises(ValueError, match=said):
+        order(name, tmp_path, files[other]).body()
+    neutral = {one: str(write_body(tmp_path / one / "neutral.npz", one)) for one in files}
+    both = order(name, tmp_path, files[other], (neutral[own],))
+    assert both.body().family == other and both.bodies()["neutral"].family == own
+    with pytest.raises(ValueError, match=rf"--bodies the neutral one: .* is {titles[other]} by its tree"):
+        order(name, tmp_path, files[own], (neutral[other],)).bodies()
+
+
+def test_a_folder_of_several_families_gives_those_of_the_data_set(folder, tmp_path):
+    models = tmp_path / "models"
+    smpl_files(models / "smpl")
+    shutil.copytree(folder, models / "smplx")
+    (models / "smplx" / "SMPLX_MALE.pkl").write_bytes(b"the same again, as SMPL-X hands it out")
+    assert {gender: path.name for gender, path in find_bodies([models], ("smpl",)).items()} == {
+        "female": "basicModel_f_lbs_10_207_0_v1.0.0.pkl",
+        "male": "basicModel_m_lbs_10_207_0_v1.0.0.pkl",
+        "neutral": "SMPLX_NEUTRAL.npz",
+    }
+    assert {path.parent.name for path in find_bodies([models], ("smplx",)).values()} == {"smplx"}
+    with pytest.raises(ValueError, match="are both female; give the files themselves"):
+        find_bodies([models])
+
+
+def test_somebody_of_no_gender_is_not_taken_for_another_familys_neutral(bodies, tmp_path):
+    own = {"male": load_body(smpl_files(tmp_path) / "basicModel_m_lbs_10_207_0_v1.0.0.pkl")}
+    with pytest.raises(DataError, match="person 0 is neutral, but the bodies are male alone; add the neutral one"):
+        one_body(replace(couple(), persons=()), own, bodies["neutral"])
+
+
+@pytest.mark.parametrize("name", ["hi4d", "aioz"])
+def test_smpls_pickles_prepare_and_train_as_they_are_handed_out(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", name, "dl", "--frames", "60", "--takes", "4"]) == 0
+    body = str(write_smpl_pkl(tmp_path / "SMPL_NEUTRAL.pkl"))
+    stores = {}
+    for out, file in (("pkl", body), ("npz", "dl/body.npz")):
+        words = ("--root", "dl", "--out", out, "--workers", "1", "--body", file)
+        assert cli.main(["data", "prepare", name, *words]) == 0
+        stores[out] = catalogue.find(name).load_data()(path=out, body_model=file)
+    for split in ("train", "val", "test"):
+        for one, other in zip(stores["pkl"].clips(split), stores["npz"].clips(split), strict=True):
+            torch.testing.assert_close(one.scene.T_world_root, other.scene.T_world_root, rtol=0, atol=1e-5)
+            assert one.scene.body == "smpl-neutral"
+    assert "basis" not in " ".join(entry["note"] for entry in stores["pkl"].folder.manifest["notes"])
+
+
+def test_smpl_and_its_genders_are_expressed_in_smplx(folder, tmp_path, monkeypatch, capsys):
+    """AIOZ with the body that other sets train with, so that they can be mixed."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", "aioz", "dl", "--frames", "60", "--takes", "3"]) == 0
+    write_smpl_pkl(tmp_path / "SMPL_NEUTRAL.pkl")
+    words = ("--root", "dl", "--out", "store", "--workers", "1", "--bodies", "SMPL_NEUTRAL.pkl")
+    assert cli.main(["data", "prepare", "aioz", *words, "--body", str(folder / "SMPLX_NEUTRAL.npz")]) == 0
+    manifest = Folder("store").manifest
+    assert manifest["skipped"] == [] and manifest["body"]["id"] == "made-up-smplx"
+    assert manifest["body"]["genders"].keys() == {"neutral"}
+    capsys.readouterr()
+    assert cli.main(["data", "prepare", "aioz", "--root", "dl", "--out", "x", "--body", str(folder)]) == 2
+    assert "is a folder; it holds SMPLX_FEMALE.npz (SMPL-X)" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from magnet.datamodules.bvh_header import read_bvh_header
 from magnet.datamodules.fakes import remocap as fake
 from magnet.datamodules.recording import DataError, Recording
 from magnet.datamodules.remocap import ReMoCapReader
-from magnet.datamodules.unpickle import load_pickle
+from magnet.unpickle import load_pickle
 
 TAKES, FRAMES = 4, 6
 PERSON = "ReMoCap/LindyHop/train/3/0"

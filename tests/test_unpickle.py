@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.recording import DataError
-from magnet.datamodules.unpickle import load_object_npy, load_pickle
+from magnet.unpickle import load_object_npy, load_pickle
 
 PLAIN: dict[str, Any] = {
     "floats": np.linspace(0.0, 1.0, 6).reshape(2, 3),

@@ -1,0 +1,46 @@
+"""Which model of SMPL's family a body file holds: told by its tree of joints, since their shape numbers differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+TREE = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+"""Parents of the 22 joints that all have in common."""
+
+
+def _hand(wrist: int, first: int) -> list[int]:
+    """Five fingers of three joints each, numbered from `first`."""
+    return [wrist if k % 3 == 0 else first + k - 1 for k in range(15)]
+
+
+TREES: dict[str, tuple[int, ...]] = {
+    "smpl": (*TREE, 20, 21),
+    "smplh": (*TREE, *_hand(20, 22), *_hand(21, 37)),
+    "smplx": (*TREE, 15, 15, 15, *_hand(20, 25), *_hand(21, 40)),
+}
+"""Parents of all joints: SMPL ends in two hands, SMPL-H in thirty finger joints, SMPL-X has a jaw and eyes as well."""
+TITLES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
+FILES = (".npz", ".pkl")
+
+
+def family_of(parents: Sequence[int]) -> str:
+    """ "smpl", "smplh", "smplx", or "" for another tree. parents: of all joints, the root's anything"""
+    tree = (-1, *(int(parent) for parent in parents[1:]))
+    return next((family for family, known in TREES.items() if known == tree), "")
+
+
+def title(family: str) -> str:
+    """What a family is called."""
+    return TITLES.get(family, "another tree of joints")
+
+
+def body_files(folder: Path) -> list[Path]:
+    """Files in a folder or its folders that may be bodies; of an npz and a pkl of one name, the npz."""
+    found = [path for end in FILES for path in (*folder.glob(f"*{end}"), *folder.glob(f"*/*{end}"))]
+    return sorted({path.with_suffix(""): path for path in reversed(found)}.values())
+
+
+def titles(families: Iterable[str]) -> str:
+    """Several families, in words."""
+    return " or ".join(map(title, families))

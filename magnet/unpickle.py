@@ -1,0 +1,302 @@
+"""Pickles that strangers made: nothing in them is run, and all damage is a `DataError`.
+
+A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; whatever else it
+names is refused. Arrays are rebuilt here, from bytes whose number must fit, so that a damaged header neither reserves
+memory nor reaches numpy's own unpickling.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import pickletools
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.errors import DataError
+from magnet.files import Refused, regular
+
+AGAIN = "download or copy it again"
+KINDS = "?bhilqpBHILQPefdgFDGSU"
+"""numpy's type letters that are plain numbers or text."""
+DEEPEST = 100
+Also = Callable[[str, str], Any]
+
+
+def contents(path: str | Path) -> bytes:
+    """All bytes of a file.
+
+    Raises:
+        DataError: it is not there or cannot be read.
+    """
+    try:
+        return regular(Path(path)).read_bytes()
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file; is the download complete?") from error
+    except Refused as error:
+        raise DataError(str(error)) from error
+    except (OSError, MemoryError) as error:
+        raise DataError(f"{path}: cannot be read ({_said(error)}); {AGAIN}") from error
+
+
+def load_pickle(path: str | Path) -> Any:
+    """What a pickle holds, of any protocol; text of Python 2 is read as latin-1 and bytes keys become str.
+
+    Raises:
+        DataError: the file is damaged, or names a class or function that is not admitted: names it.
+    """
+    return unpickled(contents(path), str(path))
+
+
+def load_object_npy(path: str | Path) -> Any:
+    """What an npy file with a pickled object holds, `array.item()` where the array has no dimensions.
+
+    Raises:
+        DataError: as `load_pickle`.
+    """
+    found = npy(contents(path), str(path))
+    if isinstance(found, np.ndarray) and found.dtype.char == "O" and found.ndim == 0:
+        return found.item()
+    return found
+
+
+# -- npy ---------------------------------------------------------------------------------------
+
+
+def npy(data: bytes, where: str) -> NDArray:
+    """The array in the bytes of an npy file; one of objects goes through the restricted unpickler.
+
+    Raises:
+        DataError: damaged or refused; begins with `where`.
+    """
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged text, and of headers that Python 2 wrote
+            shape, fortran, dtype = read(file)
+    except Exception as error:  # the header is a Python literal: its parser raises what it likes
+        raise DataError(f"{where}: not a readable npy array ({_said(error)}); {AGAIN}") from error
+    if dtype.char == "O":
+        found = unpickled(data[file.tell() :], where)
+        if not isinstance(found, np.ndarray) or found.dtype.char != "O" or found.shape != tuple(shape):
+            raise DataError(f"{where}: its header says an array of objects, the rest is none; {AGAIN}")
+        return found
+    return _array(data[file.tell() :], dtype, tuple(shape), fortran, where)
+
+
+def _array(data: bytes, dtype: np.dtype, shape: tuple[int, ...], fortran: bool, where: str) -> NDArray:
+    if dtype.hasobject or dtype.names or dtype.subdtype or dtype.char not in KINDS or dtype.itemsize == 0:
+        raise DataError(f"{where}: holds an array of {dtype}, expected plain numbers or text")
+    if not all(isinstance(n, int) and n >= 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(data):
+        raise DataError(
+            f"{where}: {len(data)} bytes follow the header of a {dtype} array of shape {shape}, which takes"
+            f" {math.prod(shape) * dtype.itemsize}: cut short or damaged; {AGAIN}"
+        )
+    try:
+        return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+    except Exception as error:  # absurd shapes of empty arrays
+        raise DataError(f"{where}: no array of shape {shape} ({_said(error)}); {AGAIN}") from error
+
+
+# -- pickle ------------------------------------------------------------------------------------
+
+
+def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
+    """What the bytes of a pickle hold.
+
+    Args:
+        data: the pickle.
+        where: what an error begins with.
+        also: gives what stands in for a further class that it may name, by module and name; None: refused.
+
+    Raises:
+        DataError: damaged or refused; begins with `where`.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # damaged text has escapes that mean nothing
+            for opcode, argument, _ in pickletools.genops(data):
+                # A damaged memo index would make the unpickler reserve and fill gigabytes.
+                if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > len(data):
+                    raise DataError(f"{where}: not a whole pickle (entry {argument} in {len(data)} bytes); {AGAIN}")
+            held = _Restricted(data, where, also or (lambda module, name: None)).load()
+        return _plain(held, where, {}, 0)
+    except DataError as error:
+        raise error if str(error).startswith(where) else DataError(f"{where}: {error}") from error
+    except Exception as error:  # a damaged pickle raises whatever its accidental opcodes lead to
+        raise DataError(f"{where}: not a whole pickle ({_said(error)}); {AGAIN}") from error
+
+
+class StandIn:
+    """Stands for a class that is not loaded: keeps what its pickle says, until the pickle is whole."""
+
+    state: Mapping[str, Any] = {}
+
+    def __init__(self, *_: object) -> None:
+        """Whatever it is made with is not needed."""
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state if isinstance(state, Mapping) else {}
+
+    def real(self, inner: Callable[[Any], Any]) -> Any:
+        """What it is, in plain data.
+
+        Args:
+            inner: gives plain data of something in `state`.
+
+        Raises:
+            DataError: its state makes no sense.
+        """
+        raise NotImplementedError
+
+
+class _Dtype:
+    """Stands for numpy.dtype while a pickle is read, because dtype itself trusts its state."""
+
+    def __init__(self, code: str | bytes, align: object = False, copy: object = False) -> None:
+        self.code = code.decode("latin-1") if isinstance(code, bytes) else str(code)
+        self.order = "="
+
+    def __setstate__(self, state: tuple) -> None:
+        order, subdtype, names = state[1:4]
+        if subdtype is not None or names is not None:
+            raise DataError("an array of records, expected plain numbers")
+        self.order = order.decode("latin-1") if isinstance(order, bytes) else str(order)
+
+    def real(self) -> np.dtype:
+        if self.code[:1] == "O":
+            return np.dtype(object)
+        dtype = np.dtype(self.code)
+        if dtype.names or dtype.subdtype or dtype.char not in KINDS:
+            raise DataError(f"an array of {dtype}, expected plain numbers")
+        return dtype.newbyteorder(">") if self.order == ">" else dtype
+
+
+class _Array:
+    """Stands for numpy.ndarray until the pickle is whole."""
+
+    def __init__(self, *_: object) -> None:
+        self.state: tuple[tuple[int, ...], _Dtype, bool, Any] | None = None
+
+    def __setstate__(self, state: tuple) -> None:
+        shape, dtype, fortran, raw = state[-4:]
+        self.state = (tuple(shape), dtype, bool(fortran), raw)
+
+
+def _from_buffer(raw: Any, dtype: _Dtype, shape: tuple[int, ...], order: str) -> _Array:
+    array = _Array()
+    array.state = (tuple(shape), dtype, order == "F", bytes(raw))
+    return array
+
+
+def _scalar(dtype: _Dtype, raw: Any = b"") -> Any:
+    real = dtype.real()
+    return raw if real.char == "O" else _array(_bytes(raw), real, (), False, "a number")[()]
+
+
+def _encode(text: str, encoding: str = "latin-1") -> bytes:
+    return text.encode(encoding)
+
+
+def _no_bytes() -> bytes:
+    return b""
+
+
+def _bytes(raw: Any) -> bytes:
+    return raw.encode("latin-1") if isinstance(raw, str) else bytes(raw)
+
+
+ADMITTED: dict[str, Callable[..., Any]] = {
+    "numpy ndarray": _Array,
+    "numpy dtype": _Dtype,
+    "numpy.core.multiarray _reconstruct": _Array,
+    "numpy._core.multiarray _reconstruct": _Array,
+    "numpy.core.multiarray scalar": _scalar,
+    "numpy._core.multiarray scalar": _scalar,
+    "numpy.core.numeric _frombuffer": _from_buffer,
+    "numpy._core.numeric _frombuffer": _from_buffer,
+    "_codecs encode": _encode,
+    "collections OrderedDict": OrderedDict,
+    **{
+        f"{module} {name}": call
+        for module in ("builtins", "__builtin__")
+        for name, call in (("set", set), ("frozenset", frozenset), ("complex", complex), ("bytes", _no_bytes))
+    },
+}
+"""Everything that a pickle may name; numpy's are replaced by stand-ins."""
+
+
+class _Restricted(pickle.Unpickler):
+    def __init__(self, data: bytes, where: str, also: Also) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin-1")
+        self.where, self.also = where, also
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Only what is admitted."""
+        admitted = ADMITTED.get(f"{module} {name}") or self.also(module, name)
+        if admitted is None:
+            raise DataError(
+                f"{self.where}: the pickle names {module}.{name}, which is not loaded because a pickle can run code; "
+                "expected numpy arrays, numbers, text, dict, list and tuple. If you trust the file, load it yourself "
+                "and save plain arrays"
+            )
+        return admitted
+
+    def persistent_load(self, pid: Any) -> Any:
+        """Refused."""
+        raise DataError(f"{self.where}: the pickle refers to an object outside it ({pid!r}); {AGAIN}")
+
+
+def _plain(found: Any, where: str, done: dict[int, Any], depth: int) -> Any:
+    """Stand-ins replaced by what they stand for, bytes keys by str."""
+    if depth > DEEPEST:
+        raise DataError(f"{where}: nested more than {DEEPEST} deep; {AGAIN}")
+    if id(found) in done:
+        return done[id(found)][1]
+
+    def inner(item: Any) -> Any:
+        return _plain(item, where, done, depth + 1)
+
+    plain = found
+    if isinstance(found, dict):
+        plain = {k.decode("latin-1") if isinstance(k, bytes) else inner(k): inner(v) for k, v in found.items()}
+    elif isinstance(found, list | tuple | set | frozenset):
+        plain = type(found)(inner(item) for item in found)
+    elif isinstance(found, _Array):
+        plain = _real(found, where, inner)
+    elif isinstance(found, StandIn):
+        plain = found.real(inner)
+    elif not isinstance(found, str | bytes | bool | int | float | complex | np.generic | None):
+        raise DataError(f"{where}: the pickle holds a bare {type(found).__name__}; {AGAIN}")
+    done[id(found)] = (found, plain)  # the original is kept too, so that its id stays its own
+    return plain
+
+
+def _real(array: _Array, where: str, inner: Callable[[Any], Any]) -> NDArray:
+    if array.state is None:
+        raise DataError(f"{where}: an array without data; {AGAIN}")
+    shape, stand_in, fortran, raw = array.state
+    dtype = stand_in.real()
+    if dtype.char != "O":
+        return _array(_bytes(raw), dtype, shape, fortran, where)
+    if not isinstance(raw, list) or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise DataError(f"{where}: an array of objects that lists none; {AGAIN}")
+    if math.prod(shape) != len(raw):
+        raise DataError(f"{where}: {len(raw)} objects for an array of shape {shape}; {AGAIN}")
+    objects = np.empty(len(raw), dtype=object)
+    for k, item in enumerate(raw):
+        objects[k] = inner(item)
+    return objects.reshape(shape, order="F" if fortran else "C")
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0][:160]
