@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from magnet.body import Body, load_body, on_floor
+from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
@@ -43,10 +45,22 @@ def load(
         sampler: how it samples: `default`, or `paper` for the paper's way; see `SamplerOptions.preset`.
 
     Raises:
-        ValueError: no such model or sampler; names those there are.
+        ValueError: no such model or sampler, which names those there are; or no such device here.
     """
+    place = _device(device)
     options = SamplerOptions.preset(sampler, **({} if steps is None else {"steps": steps}))
-    return Model(Denoiser.load(name_or_path).to(device), options)
+    return Model(Denoiser.load(name_or_path).to(place), options)
+
+
+def _device(device: str | torch.device) -> torch.device:
+    try:
+        place = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"device: got {device!r}, expected cpu, cuda, cuda:0 or mps") from error
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not there.get(place.type, True):
+        raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
+    return place
 
 
 def read(
@@ -140,6 +154,10 @@ class Motion(Scene):
             player: `page`, an interactive player that works without a server, or `film`, an animated picture.
             options: of `save` for that kind: style, title, fps.
         """
+        if player not in get_args(Player):
+            raise ValueError(f"player: got {player!r}, expected {' or '.join(get_args(Player))}")
+        if scene is not None:
+            require_whole("scene", scene, 0, self.scenes - 1)
         shown = self if scene is None else Motion.of(self.pick([scene]), self.model)
         with tempfile.TemporaryDirectory() as folder:
             kind = {"page": ".html", "film": ".webp"}[player]
@@ -189,6 +207,12 @@ class Model:
     denoiser: Denoiser
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
+    def __post_init__(self) -> None:
+        for name, kind in (("denoiser", Denoiser), ("sampler", SamplerOptions)):
+            if not isinstance(getattr(self, name), kind):
+                got = type(getattr(self, name)).__name__
+                raise ValueError(f"{name}: got {got}, expected {kind.__name__}; magnet.load() makes both")
+
     @property
     def most_people(self) -> int:
         return self.denoiser.layout.agents
@@ -199,8 +223,7 @@ class Model:
         Raises:
             ValueError: more people than the model has room for.
         """
-        if not 1 <= people <= self.most_people:
-            raise ValueError(f"people: got {people}, the model takes 1 to {self.most_people}")
+        require_whole("people", people, 1, self.most_people)
         empty = absent(1, STRIDE, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
         return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples)
@@ -217,6 +240,9 @@ class Model:
         Raises:
             ValueError: fewer than 4 frames.
         """
+        require_rate(scene)
+        if context is not None:
+            require_whole("context", context)
         given = scene.frames if context is None else min(scene.frames, context)
         given = given // STRIDE * STRIDE
         if given < STRIDE:
@@ -225,26 +251,47 @@ class Model:
         return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
 
     def inpaint(
-        self, scene: Scene, agent: int | Sequence[int] = 0, *, seed: int | None = None, samples: int = 1
+        self,
+        scene: Scene,
+        agent: int | Sequence[int] = 0,
+        *,
+        shape: Tensor | Sequence[float] | None = None,
+        seed: int | None = None,
+        samples: int = 1,
     ) -> Motion:
-        """The whole motion of some agents, given all of the others'; nothing of theirs in `scene` is read.
+        """The whole motion of some agents, given all of the others'; nothing of their own motion in `scene` is read.
 
-        An agent beyond those in the scene is added: `inpaint(solo, agent=1)` gives a person a partner.
+        An agent who is not in the scene is added: `inpaint(solo, agent=1)` gives a person a partner.
+
+        Args:
+            shape: their body's (10,) shape numbers, zeros for an average one. None: agents of the scene keep the
+                shape that they have there, which is read; who is added is of average shape.
+
+        Raises:
+            ValueError: no such agent, nobody left to be given, or a shape that is none.
         """
-        targets = (agent,) if isinstance(agent, int) else tuple(agent)
+        require_rate(scene)
+        targets = _slots("agent", agent)
         if not targets:
             raise ValueError("agent: got none; name who is to be filled in")
         scene = self._with_room(scene, max(targets) + 1)
-        present = scene.present.clone()
-        present[:, list(targets)] = True
-        scene = scene.replace(present=present)
+        rows = list(targets)
+        present, betas = scene.present.clone(), torch.where(scene.present[..., None], scene.betas, 0.0)
+        if shape is not None:
+            numbers = torch.as_tensor(shape).to(betas)
+            if numbers.shape != betas.shape[-1:]:
+                raise ValueError(f"shape: got {tuple(numbers.shape)}, expected ({betas.shape[-1]},) shape numbers")
+            betas[:, rows] = numbers
+        present[:, rows] = True
+        scene = scene.replace(present=present, betas=betas)
         return self.predict(scene, "partner_inpainting", context=0, seed=seed, samples=samples, target=targets)
 
     def react(
         self, scene: Scene, agent: int = 0, *, context: int = 32, seed: int | None = None, samples: int = 1
     ) -> Motion:
         """An agent's answer, from its first `context` frames on, to what the others do up to each moment."""
-        return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=(agent,))
+        target = _slots("agent", agent)
+        return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=target)
 
     def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> Partner:
         """Agents who answer live: `partner(past).answer(frames)` with the others' newest frames, 4 or more at a time.
@@ -257,8 +304,7 @@ class Model:
             ValueError: as `magnet.partner.Partner`.
         """
         plain = past.plain() if isinstance(past, Motion) else past
-        targets = (agents,) if isinstance(agents, int) else tuple(agents)
-        return Partner(self.denoiser, plain, targets, self.sampler, self._generator(seed))
+        return Partner(self.denoiser, plain, _slots("agents", agents), self.sampler, self._generator(seed))
 
     def predict(
         self,
@@ -285,13 +331,18 @@ class Model:
         slots = scene.agents
         if slots > self.most_people:
             raise ValueError(f"the scene has {slots} agents, the model takes 1 to {self.most_people}")
-        for name, number in (("frames", frames), ("samples", samples)):
-            if number is not None and number < 1:
-                raise ValueError(f"{name}: got {number}, expected 1 or more")
-        if frames is None:
+        require_whole("context", context, 0)
+        require_whole("samples", samples, 1)
+        if frames is not None:
+            require_whole("frames", frames, 1)
+        else:
             frames = scene.frames // STRIDE * STRIDE - context
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
+        known = [field.name for field in dataclasses.fields(kind)]
+        if strange := [name for name in fields if name not in known]:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            raise ValueError(f"task {task} has no field {strange[0]}; {has}")
         chosen: Task = kind(**fields)
         generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
@@ -301,6 +352,8 @@ class Model:
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)
+        if seed is not None:
+            require_whole("seed", seed, most=2**63 - 1)
         generator.manual_seed(seed) if seed is not None else generator.seed()
         return generator
 
@@ -308,3 +361,10 @@ class Model:
         if slots > self.most_people:
             raise ValueError(f"agent {slots - 1}: the model takes agents 0 to {self.most_people - 1}")
         return scene.pad_agents(max(slots, scene.agents))
+
+
+def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:
+    """One slot or several as a task takes them."""
+    several = (agents,) if isinstance(agents, int) else agents
+    require_wholes(name, several)
+    return tuple(several)

@@ -70,7 +70,7 @@ def _require(
     else:
         bounds = (("at least", least), ("over", over), ("at most", most))
         wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
-    shown = f"{value:g}" if isinstance(value, float) else f"{value!r}"
+    shown = f"{value:g}" if isinstance(value, float) and kind != "a whole number" else f"{value!r}"
     raise ValueError(f"{name}: got {shown}, expected {', '.join(part for part in (kind, wanted) if part)}")
 
 

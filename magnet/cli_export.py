@@ -107,6 +107,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     for note in got.notes:
         print(note)
     scene = got.scene
+    if not scene.scenes:
+        raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
     if options.on_floor:
         if options.keep_floor:
             raise CommandError("--on-floor moves people, --keep-floor leaves them: choose one")

@@ -130,6 +130,8 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
     if options.record is not None and (options.live or len(options.files) != 1):
         raise ValueError("--record continues one FILE, and is not --live")
+    if options.record is not None and options.html is not None:
+        raise ValueError("--html writes what FILE holds, --record continues it: record first, then --html its OUT.npz")
     if options.context < 0 or options.samples < 1:
         raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
 

@@ -16,6 +16,7 @@ from magnet.baselines import HoldPose, NearestNeighbour, RandomSample, RidgeRegr
 from magnet.baselines.predictor import Generators, JointBaseline, Predictor, SceneBaseline, joints_of
 from magnet.baselines.windows import moved_points
 from magnet.body import Body
+from magnet.checks import require_whole
 from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions, occupied, planning_grid
 from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
@@ -92,8 +93,11 @@ class Evaluation:
         Baselines continue what everybody did before: they are left out where the task does not give that.
 
         Raises:
-            ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
+            ValueError: no samples, no stride, the context is not a whole number of tokens, or `interval` is none of
+                its choices.
         """
+        require_whole("samples", self.samples, 1)
+        require_whole("baseline_stride", self.baseline_stride, 1)
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
         if self.context % STRIDE:
             raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")

@@ -23,6 +23,19 @@ class Float32(nn.Module):
         return super()._apply(keep, recurse)
 
 
+def require_float32_scenes(precision: str | int | None) -> None:
+    """Refuse a Trainer's precision that would convert scenes as well as networks.
+
+    Raises:
+        ValueError: one of Lightning's `-true` precisions but float32's; says what to take.
+    """
+    if str(precision).endswith("-true") and precision != "32-true":
+        raise ValueError(
+            f"trainer.precision {precision} would convert scenes too, whose positions would be rounded to centimetres "
+            "or meet float32: take bf16-mixed or 16-mixed, or 32-true"
+        )
+
+
 def dtype_of(network: nn.Module) -> Any:
     """The type of a network's weights, in which it takes its input."""
     return next(network.parameters()).dtype

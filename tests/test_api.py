@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +15,8 @@ import magnet
 from magnet.api import Model, Motion
 from magnet.body import load_body
 from magnet.denoiser.generation import SamplerOptions
-from magnet.export import save_bvh
-from magnet.motion.scene import Scene
+from magnet.export import resampled, save_bvh
+from magnet.motion.scene import Scene, concatenate, joined
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
@@ -63,6 +65,40 @@ def test_a_filled_in_agent_owes_nothing_to_its_own_motion(model: Model, duet: Sc
     assert torch.allclose(filled.T_world_root[:, :, 1], duet.T_world_root[:, :48, 1], atol=1e-5)
     other = duet.replace(T_world_root=torch.cat([duet.T_world_root[:, :, :1].flip(1), duet.T_world_root[:, :, 1:]], 2))
     assert torch.equal(model.inpaint(other, agent=0, seed=1).T_world_root, filled.T_world_root)
+
+
+def junk_of(scene: Scene, agent: int, shape: bool) -> Scene:
+    """The scene with everything of one agent replaced that is not to be read."""
+    T_world_root, body_rot, betas = scene.T_world_root.clone(), scene.body_rot.clone(), scene.betas.clone()
+    T_world_root[:, :, agent], body_rot[:, :, agent] = torch.nan, 7.0
+    if shape:
+        betas[:, agent] = torch.nan
+    return scene.replace(T_world_root=T_world_root, body_rot=body_rot, betas=betas)
+
+
+@pytest.mark.parametrize("shape", [None, torch.zeros(10), [0.5] * 10], ids=["kept", "average", "told"])
+def test_of_a_filled_in_agent_nothing_is_read_but_the_shape_that_is_kept(shape, model: Model, duet: Scene):
+    told = {} if shape is None else {"shape": shape}
+    ours, theirs = (
+        model.inpaint(scene, agent=0, seed=1, **told) for scene in (duet, junk_of(duet, 0, shape is not None))
+    )
+    assert torch.equal(ours.T_world_root, theirs.T_world_root) and torch.equal(ours.body_rot, theirs.body_rot)
+    assert torch.equal(ours.betas, theirs.betas)
+    expected = duet.betas[0, 0] if shape is None else torch.as_tensor(shape)
+    assert torch.equal(ours.betas[0, 0], expected) and torch.equal(ours.betas[0, 1], duet.betas[0, 1])
+    if shape is None:  # and it is read: it is no motion, but poses are made for it
+        other = duet.replace(betas=duet.betas + torch.tensor([[[3.0], [0.0]]]))
+        assert not torch.equal(model.inpaint(other, agent=0, seed=1).body_rot, ours.body_rot)
+
+
+def test_who_is_added_is_of_average_shape_whatever_the_empty_slot_holds(model: Model, duet: Scene):
+    betas = duet.pad_agents(3).betas.clone()
+    betas[:, 2] = torch.nan
+    for scene in (duet, duet.pad_agents(3).replace(betas=betas)):
+        added = model.inpaint(scene, agent=2, seed=1)
+        assert torch.equal(added.betas[0, 2], torch.zeros(10)) and added.T_world_root.isfinite().all()
+    with pytest.raises(ValueError, match=r"shape: got \(3,\), expected \(10,\) shape numbers"):
+        model.inpaint(duet, agent=0, shape=[0.0] * 3)
 
 
 def test_somebody_alone_is_given_a_partner(model: Model, duet: Scene):
@@ -161,7 +197,7 @@ def test_a_motion_is_put_on_the_floor_with_its_own_body(duet: Scene):
 
 
 def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
-    with pytest.raises(ValueError, match="people: got 4, the model takes 1 to 3"):
+    with pytest.raises(ValueError, match="people: got 4, expected 1 to 3"):
         model.generate(people=4)
     with pytest.raises(ValueError, match="runs at 60 fps, the model at 30"):
         model.continue_(duet.replace(fps=60.0))
@@ -173,9 +209,9 @@ def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
         model.react(duet, context=64)
     with pytest.raises(ValueError, match="needs 4 frames or more; got 0"):
         model.continue_(duet, context=0)
-    with pytest.raises(ValueError, match="samples: got 0, expected 1 or more"):
+    with pytest.raises(ValueError, match="samples: got 0, expected at least 1"):
         model.continue_(duet, samples=0)
-    with pytest.raises(ValueError, match="frames: got 0, expected 1 or more"):
+    with pytest.raises(ValueError, match="frames: got 0, expected at least 1"):
         model.continue_(duet, frames=0)
     with pytest.raises(ValueError, match="agent: got none"):
         model.inpaint(duet, agent=())
@@ -183,3 +219,56 @@ def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
         magnet.load("trio")
     with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'"):
         model.generate(frames=8).save("a.fbx")
+
+
+CARELESS = {
+    "people: got 2.0, expected a whole number": lambda model, duet: model.generate(2.0),
+    "people: got '2', expected a whole number": lambda model, duet: model.generate("2"),
+    "people: got True, expected a whole number": lambda model, duet: model.generate(True),
+    "seed: got 1.5, expected a whole number": lambda model, duet: model.generate(seed=1.5),
+    "seed: got 1180591620717411303424, expected at most": lambda model, duet: model.generate(seed=2**70),
+    "samples: got 1.5, expected a whole number": lambda model, duet: model.generate(samples=1.5),
+    "the scene: got str, expected a Scene": lambda model, duet: model.continue_("a.npz"),
+    "the scene: got list, expected a Scene": lambda model, duet: model.inpaint([duet]),
+    "the scene: got NoneType, expected a Scene": lambda model, duet: model.predict(None),
+    "past: got Tensor, expected a Scene": lambda model, duet: model.partner(duet.body_rot),
+    "frames: got NoneType, expected a Scene": lambda model, duet: model.partner(duet).answer(None),
+    "body differ: open-1 and mine": lambda model, duet: model.partner(duet).answer(duet.cut(0, 4).replace(body="mine")),
+    "context: got 16.0, expected a whole number": lambda model, duet: model.continue_(duet, context=16.0),
+    "context: got '32', expected a whole number": lambda model, duet: model.predict(duet, context="32"),
+    "context: got -4, expected at least 0": lambda model, duet: model.predict(duet, context=-4),
+    "frames: got 8.0, expected a whole number": lambda model, duet: model.predict(duet, frames=8.0),
+    "agent: got 'a', expected whole numbers": lambda model, duet: model.inpaint(duet, "a"),
+    "agent: got 0.5, expected whole numbers": lambda model, duet: model.react(duet, 0.5),
+    "target -1: the grid has agents 0 to 1": lambda model, duet: model.inpaint(duet, -1),
+    "target: got 0, expected whole numbers": lambda model, duet: model.predict(duet, "motion_control", target=0),
+    "task: got 5, expected a name: agentic": lambda model, duet: model.predict(duet, 5),
+    "task motion_control has no field blok; it has target": lambda model, duet: model.predict(
+        duet, "motion_control", blok=2
+    ),
+    "sampler: got dict, expected SamplerOptions": lambda model, duet: Model(model.denoiser, {"steps": 3}),
+    "guidance: got 'history', expected a Guidance": lambda model, duet: SamplerOptions(guidance="history"),
+    "device: got 'gpu', expected cpu": lambda model, duet: magnet.load(device="gpu"),
+    "scene: got 5, expected 0 to 0": lambda model, duet: model.generate(frames=8).show(5),
+    "player: got 'movie', expected page or film": lambda model, duet: model.generate(frames=8).show(player="movie"),
+    "fps: got nan, expected a number, over 0": lambda model, duet: model.generate(frames=8).save("a.glb", fps=math.nan),
+    "agent 0: frame 0 is not finite": lambda model, duet: Motion.of(
+        duet.replace(T_world_root=duet.T_world_root * math.nan)
+    ).save("a.glb"),
+    "fps: got inf": lambda model, duet: resampled(duet, math.inf),
+    "fps: got 0, expected over 0": lambda model, duet: duet.replace(fps=0.0),
+    "fps differ: 30.0 and 60.0": lambda model, duet: joined([duet, duet.replace(fps=60.0)]),
+    "agents differ: 2 and 3": lambda model, duet: joined([duet, duet.pad_agents(3)]),
+    "got no scenes to put together": lambda model, duet: concatenate([]),
+    "betas: got ndarray, expected a tensor": lambda model, duet: duet.replace(betas=duet.betas.numpy()),
+}
+
+
+@pytest.mark.parametrize("message", CARELESS)
+def test_a_careless_call_is_told_what_it_got_and_what_was_expected(
+    message, model: Model, duet: Scene, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        CARELESS[message](model, duet)
+    assert not list(tmp_path.iterdir())

@@ -154,3 +154,9 @@ def test_people_are_put_on_the_floor_where_one_asks_for_it(tmp_path: Path, capsy
     assert Scene.load(out).T_world_root[..., 1, 3].max() < 1.5
     assert cli.main(["export", str(high), str(out), "--on-floor", "--keep-floor"]) == 2
     assert "choose one" in capsys.readouterr().err
+
+
+def test_a_file_without_scenes_is_named(tmp_path: Path, capsys):
+    empty = random_scene(1, 8, 1, torch.Generator().manual_seed(0)).pick([]).save(tmp_path / "none.npz")
+    assert cli.main(["export", str(empty), str(tmp_path / "o.glb")]) == 2
+    assert "none.npz: holds no scenes" in capsys.readouterr().err

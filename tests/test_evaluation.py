@@ -197,3 +197,9 @@ def test_a_context_of_broken_tokens_is_refused():
     datamodule.context_frames = 15
     with pytest.raises(ValueError, match="context_frames is 15"):
         run(datamodule)
+
+
+@pytest.mark.parametrize("name", ["samples", "baseline_stride"])
+def test_no_samples_and_no_stride_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: got 0, expected at least 1"):
+        run(data(), **{name: 0})

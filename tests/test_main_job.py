@@ -52,7 +52,7 @@ def test_the_main_job_ends_with_a_table(trained, capsys):
     words = ("--task", "joint_future", "--samples", "2", "--sampler.steps", "2", "--ckpt_path", checkpoint)
     magnet("test", *words, "--out", str(out))
     printed = capsys.readouterr().out
-    assert all(method in printed for method in ("magnet", "NN", "RS", "held pose", "ground truth"))
+    assert all(method in printed for method in ("magnet", "NN", "RS", "zero velocity", "ground truth"))
     results = json.loads((out / "results.json").read_text())
     assert results["meta"]["test scenes"] == 2
     assert results["rows"]["magnet"]["mpjpe"] > 0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 
+import lightning as L
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from magnet.body import load_body
 from magnet.denoiser.generation import SamplerOptions
@@ -71,3 +73,16 @@ def test_what_keeps_its_precision_moves_with_its_model():
         ("meta", torch.float32),
         ("meta", torch.int64),
     }
+
+
+@pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true"])
+@pytest.mark.parametrize("part", ["denoiser", "tokenizer"])
+def test_a_trainer_that_would_convert_scenes_is_refused(part, precision, tmp_path):
+    """Networks may be converted, scenes may not; Lightning would do both."""
+    model = tiny_denoiser(2)
+    trainer = L.Trainer(
+        precision=precision, logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu"
+    )
+    loader = DataLoader([random_scene(1, 64, 2, torch.Generator().manual_seed(0))], batch_size=None)
+    with pytest.raises(ValueError, match=f"^trainer.precision {precision} would convert scenes too"):
+        trainer.validate(model if part == "denoiser" else model.tokenizer, loader, verbose=False)

@@ -212,7 +212,8 @@ def load_body(which: str | Path = "open") -> Body:
 
 @lru_cache(maxsize=1)
 def _open_body() -> dict:
-    with resources.as_file(resources.files("magnet.body") / "open_body.npz") as path:
+    # Lightning tests in inference mode, whose tensors no later fit could take a gradient through.
+    with torch.inference_mode(False), resources.as_file(resources.files("magnet.body") / "open_body.npz") as path:
         return _read(path)
 
 

@@ -97,4 +97,5 @@ def level(scene: Scene, body: Body | None = None) -> float:
 
 @functools.cache
 def _open_body() -> Body:
-    return load_body("open")
+    with torch.inference_mode(False):
+        return load_body("open")

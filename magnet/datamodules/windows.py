@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
+from magnet.checks import require_whole
 from magnet.datamodules.compose import place_apart
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -283,7 +284,12 @@ def all_starts(good: NDArray[np.bool_], frames: int) -> Ints:
 
 
 def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
-    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool"""
+    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool
+
+    Raises:
+        ValueError: the stride is less than a frame.
+    """
+    require_whole("stride", stride, 1)
     starts, start = [], 0
     while start + frames <= len(good):
         bad = np.flatnonzero(~good[start : start + frames])

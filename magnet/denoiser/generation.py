@@ -77,6 +77,8 @@ class SamplerOptions:
     spacing: Spacing = "even"
 
     def __post_init__(self) -> None:
+        if not isinstance(self.guidance, Guidance):
+            raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         require_choice("placement", self.placement, Placement)
         require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)

@@ -25,7 +25,7 @@ from magnet.evaluation import Evaluation
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.optim import adamw_cosine
-from magnet.precision import dtype_of
+from magnet.precision import dtype_of, require_float32_scenes
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.module import RawPose, Tokenizer
 
@@ -276,6 +276,9 @@ class Denoiser(L.LightningModule):
     stream = streaming.stream
 
     # -- training ------------------------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        require_float32_scenes(self.trainer.precision)
 
     def on_fit_start(self) -> None:
         if not self.statistics.ready:

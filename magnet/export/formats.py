@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import level
+from magnet.checks import require_number
 from magnet.export.bvh import Unit, save_bvh
 from magnet.export.cast import Style
 from magnet.export.glb import save_glb
@@ -208,6 +209,10 @@ def write(
     body = body or load_body("open")
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
+    if fps is not None:
+        require_number("fps", fps, over=0)
+    if suffix != ".npz" or smplx:
+        _require_finite(scene)
     look: dict[str, Any] = {"body": body, "style": style, "title": title}
     if suffix == ".png" or suffix in PICTURES:
         return [_save_picture(scene, path, context_frames, look, fps, progress)]
@@ -229,6 +234,15 @@ def write(
         return each[suffix](scene, path)
     places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]
     return [written for b, place in enumerate(places) for written in each[suffix](scene.pick([b]), place)]
+
+
+def _require_finite(scene: Scene) -> None:
+    """Other programs choke on NaN; only scenes of ours may hold it."""
+    finite = scene.T_world_root.flatten(3).isfinite().all(-1) & scene.body_rot.flatten(3).isfinite().all(-1)
+    bad = (~finite & scene.present[:, None]).nonzero().tolist()
+    if bad:
+        b, frame, agent = bad[0]
+        raise ValueError(f"scene {b}, agent {agent}: frame {frame} is not finite; cut such frames out, or write .npz")
 
 
 def _save_picture(

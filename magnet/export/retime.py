@@ -22,10 +22,12 @@ def resampled(scene: Scene, fps: float) -> Scene:
     Raises:
         ValueError: the rate is not positive.
     """
-    if not fps > 0:
+    if not 0 < fps < math.inf:
         raise ValueError(f"fps: got {fps:g}, expected more than 0")
     if abs(fps - scene.fps) < 1e-6 * fps:
         return scene
+    if not scene.frames:
+        return scene.replace(fps=float(fps))
     frames = math.floor((scene.frames - 1) / scene.fps * fps + 1e-6) + 1
     at = torch.arange(frames, dtype=torch.float64) * (scene.fps / fps)
     low = (at + 1e-9).floor().long().clamp(max=scene.frames - 1)

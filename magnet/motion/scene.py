@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number
 from magnet.files import load_npz
 
 BODY_JOINTS = 22
@@ -50,6 +51,10 @@ class Scene:
     given: Tensor | None = None  # (B, T, P) bool, frames that a model was given and did not make; None: unsaid
 
     def __post_init__(self) -> None:
+        for field in TENSORS:
+            value = getattr(self, field)
+            if not isinstance(value, Tensor) and not (value is None and field in ("valid", "given")):
+                raise ValueError(f"{field}: got {type(value).__name__}, expected a tensor; torch.from_numpy makes one")
         shape = self.T_world_root.shape
         if len(shape) != 5 or shape[-2:] != (4, 4):
             raise ValueError(f"T_world_root: got {tuple(shape)}, expected (B, T, P, 4, 4)")
@@ -63,6 +68,7 @@ class Scene:
             got = tuple(getattr(self, field).shape)
             if got != want:
                 raise ValueError(f"{field}: got {got}, expected {want} for {B} scenes, {T} frames, {P} agents")
+        require_number("fps", self.fps, over=0)
         for field, tensor in self.tensors().items():
             flags = field in ("present", "valid", "given")
             if (tensor.dtype == torch.bool) != flags or not (flags or tensor.is_floating_point()):
@@ -237,13 +243,10 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
     """Several batches of scenes as one batch; slots are padded to the largest group.
 
     Raises:
-        ValueError: frames, fps or body differ.
+        ValueError: there are none, or frames, fps or body differ.
     """
+    _require_alike(scenes, ("frames", "fps", "body"))
     first = scenes[0]
-    for scene in scenes[1:]:
-        for field in ("frames", "fps", "body"):
-            if getattr(scene, field) != getattr(first, field):
-                raise ValueError(f"{field} differ: {getattr(first, field)} and {getattr(scene, field)}")
     agents = max(scene.agents for scene in scenes)
     padded = [scene.pad_agents(agents) for scene in scenes]
     valid = None
@@ -265,7 +268,12 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
 
 
 def joined(pieces: Sequence[Scene]) -> Scene:
-    """Consecutive pieces of the same scenes as one; what was given is kept if all of them say it."""
+    """Consecutive pieces of the same scenes as one; what was given is kept if all of them say it.
+
+    Raises:
+        ValueError: there are none, or scenes, slots, fps or body differ.
+    """
+    _require_alike(pieces, ("scenes", "agents", "fps", "body"))
     if len(pieces) == 1:
         return pieces[0]
     valid = None
@@ -280,6 +288,16 @@ def joined(pieces: Sequence[Scene]) -> Scene:
     )
 
 
+def _require_alike(scenes: Sequence[Scene], fields: Sequence[str]) -> None:
+    if not scenes:
+        raise ValueError("got no scenes to put together, expected at least one")
+    for scene in scenes[1:]:
+        for field in fields:
+            ours, theirs = getattr(scenes[0], field), getattr(scene, field)
+            if abs(ours - theirs) > 1e-3 if field == "fps" else ours != theirs:
+                raise ValueError(f"{field} differ: {ours} and {theirs}")
+
+
 def all_valid(scene: Scene) -> Tensor:
     """(B, T) bool, True throughout."""
     return torch.ones(scene.scenes, scene.frames, dtype=torch.bool, device=scene.device)
@@ -291,6 +309,8 @@ def require_rate(scene: Scene, label: str = "the scene") -> None:
     Raises:
         ValueError: it has another; says how to bring it there.
     """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{label}: got {type(scene).__name__}, expected a Scene; magnet.read(path) reads one")
     if abs(scene.fps - FPS) > 1e-3:
         raise ValueError(
             f"{label} runs at {scene.fps:g} fps, the model at {FPS:g}: bring it there with "

@@ -129,6 +129,8 @@ def get(name: str) -> type:
         ValueError: no such task; suggests the closest name, or says why a plug-in of that name failed.
     """
     discover()
+    if not isinstance(name, str):
+        raise ValueError(f"task: got {name!r}, expected a name: {', '.join(sorted(_tasks))}")
     if name in _tasks:
         return _tasks[name].task
     if name in _failures:

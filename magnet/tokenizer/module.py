@@ -17,6 +17,7 @@ from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
 from magnet.optim import adamw_cosine
+from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
 from magnet.tokenizer.augment import drift, exchange_limbs, turn_joints
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
@@ -222,6 +223,7 @@ class Tokenizer(L.LightningModule):
     # -- training ------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
+        require_float32_scenes(self.trainer.precision)
         if self.body is None:
             from magnet.body import load_body
 

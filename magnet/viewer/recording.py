@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from magnet.checks import require_whole
 from magnet.denoiser.stream import Stream
 from magnet.files import load_npz
 from magnet.motion.scene import Scene, joined, require_rate
@@ -137,6 +138,8 @@ def record(
     if scene.scenes != 1:
         raise ValueError(f"got {scene.scenes} scenes, expected one; record each of scene.pick([b])")
     require_rate(scene)
+    require_whole("frames", frames, 1)
+    require_whole("every", every, 1)
     stream = RecordedStream(model, scene, task, context, frames, options, generator, every)
     with torch.no_grad():
         done = joined(list(stream.pieces())).to("cpu")

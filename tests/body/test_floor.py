@@ -10,7 +10,7 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.body import load_body
+from magnet.body import base, floor, load_body
 from magnet.body.floor import JUMP, lowest, off_floor, on_floor, standing
 from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.synthetic import Synthetic
@@ -146,3 +146,12 @@ def test_no_stretch_of_a_recording_is_taken_for_off_the_floor(cmu_root, takes):
             assert not away.any(), f"{name}: {float(away.abs().max()):.2f} m in {frames} frames"
             count += len(windows)
     assert count > (4_000 if takes else 100_000)
+
+
+def test_a_body_first_read_while_testing_can_be_fitted_afterwards():
+    """Lightning tests in inference mode; what is kept from there must not be of it."""
+    base._open_body.cache_clear()
+    floor._open_body.cache_clear()
+    with torch.inference_mode():
+        lowest(still([0, 0, 0], 0.93))
+    assert not load_body().J_template.is_inference() and not floor._open_body().J_shapedirs.is_inference()

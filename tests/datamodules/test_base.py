@@ -290,3 +290,9 @@ def test_a_weight_for_no_source_is_refused() -> None:
 def test_an_epoch_has_as_many_windows_as_asked_for() -> None:
     data = FakeData([random_clip(f"c{k}", 200) for k in range(5)], max_agents=4, batch_size=64, epoch_size=512)
     assert sum(batch.scenes for batch in data.train_dataloader()) == 512
+
+
+def test_windows_without_a_stride_are_refused() -> None:
+    for stride in (0, -1):
+        with pytest.raises(ValueError, match=f"stride: got {stride}, expected at least 1"):
+            FakeData([random_clip("a", 100)]).train_scenes(20, stride)

@@ -230,7 +230,7 @@ def test_only_those_who_are_given_are_asked_where_their_floor_is(model, duet):
     ("numbers", "message"),
     [
         ((-4, 16, 1), "context: got -4, expected at least 0"),
-        ((16.0, 16, 1), "context: got 16, expected a whole number"),
+        ((16.0, 16, 1), "context: got 16.0, expected a whole number"),
         ((16, -8, 1), "frames: got -8, expected at least 0"),
         ((16, 0.5, 1), "frames: got 0.5, expected a whole number"),
         ((16, 16, 0), "samples: got 0, expected at least 1"),

@@ -120,3 +120,10 @@ def test_a_page_of_any_style_is_written_without_viser_or_a_server(
     assert main(["view", str(path), "--html", str(tmp_path / "a.html"), "--style", style, "--context", "4"]) == 0
     assert f'"styles":["{style}"]' in (tmp_path / "a.html").read_text()
     assert "written:" in capsys.readouterr().out
+
+
+def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
+    path = duet.save(tmp_path / "a.npz")
+    assert main(["view", str(path), "--record", str(tmp_path / "r.npz"), "--html", str(tmp_path / "a.html")]) == 2
+    assert "record first" in capsys.readouterr().err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]

@@ -96,3 +96,10 @@ def test_the_picture_of_levels_pales_with_noise(model, start) -> None:
     assert first.shape == last.shape == (2 * 14, 8 * 14, 3)
     centre = np.s_[5:9, 7 * 14 + 5 : 7 * 14 + 9]
     assert first[centre].mean() > last[centre].mean() + 30
+
+
+def test_a_recording_of_nothing_is_refused(model, start) -> None:
+    with pytest.raises(ValueError, match="frames: got 0, expected at least 1"):
+        record(model, start, JointFuture(), 16, 0)
+    with pytest.raises(ValueError, match="every: got 0, expected at least 1"):
+        record(model, start, JointFuture(), 16, 16, every=0)
