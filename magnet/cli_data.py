@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli import CommandError, no_such
+from magnet.cli_data_list import add_list, run_list
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
 from magnet.cli_data_shown import bar, clips_by_people, file_bars, show_gaps, show_persons, show_skipped, show_splits
 
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Prepare, check, describe, fake and download data sets.
 
-  magnet data list                                   what is known, its licence, where to ask for it
+  magnet data list                                   who may use each, where to ask, what must lie where
+  magnet data list dd100                             the same of one
   magnet data fake interx OUT                        a tiny made-up download, to try everything out
   magnet data check DOWNLOAD_OR_STORE                all assertions, a summary, a picture
   magnet data prepare interx --root DOWNLOAD --out STORE --body SMPLX_NEUTRAL.npz
@@ -89,10 +91,6 @@ def show_help(given: argparse.Namespace) -> int:
 
 
 # -- options -----------------------------------------------------------------------------------
-
-
-def add_list(one: argparse.ArgumentParser) -> None:
-    """Nothing to say."""
 
 
 def add_info(one: argparse.ArgumentParser) -> None:
@@ -167,23 +165,6 @@ def needed(given: argparse.Namespace, *names: str) -> list[str]:
 
 
 # -- commands ----------------------------------------------------------------------------------
-
-
-def run_list(given: argparse.Namespace) -> int:
-    from rich.console import Console
-    from rich.text import Text
-
-    from magnet.datamodules import catalogue
-
-    console = Console(highlight=False)
-    for name, entry in catalogue.NAMES.items():
-        kind = entry.load_reader()
-        console.print(
-            Text.assemble((f"{name:<12}", "bold cyan"), kind.title, ("  " + kind.source, "dim")), soft_wrap=True
-        )
-        console.print(Text(f"{'':<12}{kind.licence}"), soft_wrap=True)
-    console.print(f"{'cmu':<12}CMU Graphics Lab Motion Capture Database: magnet data download cmu", style="dim")
-    return 0
 
 
 def run_info(given: argparse.Namespace) -> int:
@@ -374,7 +355,7 @@ def run_download(given: argparse.Namespace) -> int:
 
 
 COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int], str]] = {
-    "list": (add_list, run_list, "data sets, their licences, where to ask for them"),
+    "list": (add_list, run_list, "data sets: who may use them, where to ask, what must lie where"),
     "info": (add_info, run_info, "what a prepared store holds"),
     "check": (add_check, run_check, "run all assertions on a store or a download; a summary and a picture"),
     "fake": (add_fake, run_fake, "write a tiny made-up download in a data set's layout"),

@@ -31,12 +31,20 @@ def copy(made, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_the_list_names_every_data_set_with_its_licence_and_address(capsys):
+def test_the_list_tells_who_may_use_each_data_set_where_to_ask_and_what_must_lie_where(capsys):
     assert cli.main(["data", "list"]) == 0
     said = capsys.readouterr().out
     for name, entry in catalogue.NAMES.items():
         reader = entry.load_reader()
-        assert name in said and reader.licence in said and reader.source in said
+        assert cli.main(["data", "list", name]) == 0
+        alone = capsys.readouterr().out
+        assert alone in said and alone.startswith(f"{name}  {reader.title}\n")
+        for part in (reader.licence, reader.source, *(word for line in reader.layout for word in line)):
+            assert part in alone
+        assert f"magnet data prepare {name} --root DOWNLOAD" in alone and f"magnet data fake {name} FAKE" in alone
+    assert "synthetic has no files" in said
+    assert cli.main(["data", "list", "dd10"]) == 2
+    assert "no data set 'dd10'; did you mean dd100?" in capsys.readouterr().err
 
 
 def test_a_store_is_described(made, capsys):

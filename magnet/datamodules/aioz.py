@@ -41,6 +41,10 @@ class AIOZReader(Reader):
     source: ClassVar[str] = "https://github.com/aioz-ai/AIOZ-GDANCE"
     licence: ClassVar[str] = "non-commercial scientific research only"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("motions_smpl/NAME.pkl", "one file a sequence"),
+        ("{train,val,test}_split_sequence_names.txt", "the official lists"),
+    )
 
     def __init__(self, root: str | Path) -> None:
         super().__init__(root)

@@ -42,6 +42,9 @@ class CHI3DReader(Reader):
     source: ClassVar[str] = "http://vision.imar.ro/ci3d"
     licence: ClassVar[str] = "non-commercial research only, by form; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("chi3d/train/sXX/smplx/ACTION.json", "both people; train may lie in --root itself"),
+    )
 
     def __init__(self, root: str | Path, test_pairs: Sequence[str] = ("s03",)) -> None:
         super().__init__(root)

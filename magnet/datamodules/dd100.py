@@ -53,6 +53,12 @@ class DD100Reader(Reader):
     source: ClassVar[str] = "https://github.com/lisiyao21/Duolando"
     licence: ClassVar[str] = "NTU S-Lab License 1.0: non-commercial"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        (
+            "data/motion/smplx/all/GENRE_CHOREO_TAKE_{00,01}.npy",
+            "00 the follower, 01 the leader, such as Jive_005_001_00.npy",
+        ),
+    )
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(

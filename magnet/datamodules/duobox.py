@@ -61,6 +61,10 @@ class DuoBoxReader(Reader):
     source: ClassVar[str] = "https://github.com/zju3dv/ready_to_react"
     licence: ClassVar[str] = "by request form, no licence published: research only, no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("fbx_fit_smpl/TAKE.npy", "SMPL-X fits of both people"),
+        ("fbx_export_joints/TAKE.npy", "their skeletons, for takes without a fit"),
+    )
 
     def __init__(
         self,

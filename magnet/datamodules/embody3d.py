@@ -77,6 +77,10 @@ class Embody3DReader(Reader):
     source: ClassVar[str] = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
     licence: ClassVar[str] = "Meta's XRCIA research licence, by form; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("datasets/SECTION/CAPTURE/SUBJECT/FEATURE/CAPTURE.npy", "features smplx_mesh_* and missing"),
+        ("datasets/SECTION/dataset.json", "the list of each section, from the toolbox"),
+    )
 
     def __init__(
         self,

@@ -39,6 +39,10 @@ class Hi4DReader(Reader):
     source: ClassVar[str] = "https://yifeiyin04.github.io/Hi4D"
     licence: ClassVar[str] = "non-commercial scientific research only, by form; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("pairXX/ACTION/meta.npz", "first and last frame, genders"),
+        ("pairXX/ACTION/smpl/FRAME.npz", "one file a frame, both people"),
+    )
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(

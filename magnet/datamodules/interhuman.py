@@ -39,6 +39,10 @@ class InterHumanReader(Reader):
     source: ClassVar[str] = "https://github.com/tr3e/InterGen"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("motions/ID.pkl", "the raw motions, not motions_processed"),
+        ("split/{train,val,test,ignore_list}.txt", "the official lists"),
+    )
     shapes_of: ClassVar[tuple[str, ...]] = ("smplh", "smpl")
     version: ClassVar[int] = 2  # genders are read
 

@@ -45,6 +45,11 @@ class InterXReader(Reader):
     source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("motions/CLIP/{P1,P2}.npz", "such as G001T000A000R000/P1.npz"),
+        ("splits/{train,val,test}.txt", "the official lists"),
+        ("annots/interaction_order.pkl", "not needed, says who acts"),
+    )
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(

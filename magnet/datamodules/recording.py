@@ -107,8 +107,9 @@ class Reader(ABC):
     name: ClassVar[str]  # on the command line, such as "duobox"
     title: ClassVar[str]  # as its authors write it
     source: ClassVar[str]  # address where to ask for it
-    licence: ClassVar[str]  # in one line
+    licence: ClassVar[str]  # who may use it, in one line
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = ()  # what must lie where in `root`: pattern, what it is
     shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
 

@@ -51,6 +51,12 @@ class ReMoCapReader(Reader):
     source: ClassVar[str] = "https://github.com/anindita127/ReMoS"
     licence: ClassVar[str] = "research only, no redistribution"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "positions"
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion.bvh", "the skeleton"),
+        ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_worldpos.csv", "positions; motion_worldpose.csv will do"),
+        ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_rotations.csv", "not needed, proves joints and units"),
+        ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_offsets.pkl", "not needed, the same"),
+    )
     version: ClassVar[int] = 2  # notes in whole millimetres
 
     def __init__(

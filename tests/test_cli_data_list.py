@@ -1,0 +1,41 @@
+"""What `magnet data list` says of files is where readers look for them."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+
+from magnet.datamodules import catalogue
+
+
+def globs(pattern: str) -> list[str]:
+    """A pattern as globs: {a,b} is either, words in capitals are anything."""
+    if match := re.search(r"\{([^}]*)\}", pattern):
+        return [
+            glob
+            for one in match[1].split(",")
+            for glob in globs(pattern[: match.start()] + one + pattern[match.end() :])
+        ]
+    return [re.sub(r"XX|(?<![A-Za-z])[A-Z]{2,}(?![A-Za-z0-9])", "*", pattern)]
+
+
+def test_patterns_are_globs() -> None:
+    assert globs("{a,b}/sXX/CAPTURE/P1.npz") == ["a/s*/*/P1.npz", "b/s*/*/P1.npz"]
+
+
+@pytest.mark.parametrize("name", catalogue.NAMES)
+def test_a_download_lies_as_it_is_listed(name: str, tmp_path: Path) -> None:
+    reader = catalogue.find(name).load_reader()
+    catalogue.find(name).load_fake()(tmp_path, 4, 12)
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    listed = {glob for pattern, _ in reader.layout for glob in globs(pattern)}
+    assert listed
+    for glob in listed:
+        assert any(fnmatchcase(file, glob) for file in files), glob
+    for take in reader(tmp_path).found():
+        for path in take.files:
+            file = path.relative_to(tmp_path).as_posix()
+            assert any(fnmatchcase(file, glob) for glob in listed), file
