@@ -69,7 +69,7 @@ def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
         "joint_future, smoothing 0.01": guided(smooth=0.01),
         "joint_future, context level 30": guided(context_level=30),
         "joint_future, in strides": replace(options, rolling=0),
-        "joint_future, sampled as in the paper": replace(options, rolling=0, eta=0.0, shift=1.0, placement="integrate"),
+        "joint_future, sampled as in the paper": SamplerOptions.preset("paper", steps=options.steps),
     }
     return {name: (task, options) for name, task in plain.items()} | {
         name: (JointFuture(), changed) for name, changed in guidance.items()

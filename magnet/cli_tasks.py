@@ -135,7 +135,7 @@ class Shown:
         people: agents P.
         tokens: token steps N, of 4 frames each.
         context: token steps that are given at the start, where the task continues a recording.
-        steps: denoising steps of a token; the sampler's default is 30.
+        steps: denoising steps of a token; the sampler's default is 16.
         window: token steps that the model sees at once.
         stride: token steps finished before the window moves on.
         rolling: denoising steps between a token and the next; 0: the tokens of a stride go together. By default

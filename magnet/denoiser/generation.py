@@ -33,7 +33,8 @@ class SamplerOptions:
     `preset` gives sets of these options by name; `paper` is the paper's sampler.
 
     Args:
-        steps: denoising steps S, paper A.3; no more than pass levels that differ, which depends on `shift`.
+        steps: denoising steps S; the paper takes 30 (A.3). No more than pass levels that differ, which is a matter of
+            `spacing` and `shift`.
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
         rolling: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
             8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
@@ -48,9 +49,8 @@ class SamplerOptions:
         paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
-            `shift` and `trust` chosen on validation scenes (docs/results.md).
-        shift: over 1, more of the denoising steps at high noise levels, where what has yet to be decided is decided
-            (ours); 1 spaces them evenly, as the paper does.
+            `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
+        shift: over 1, more of even denoising steps at high noise levels; 1 leaves them even, as in the paper.
         any_floor: take people who all stand far from y = 0, where models have their floor, as they are.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
@@ -60,7 +60,7 @@ class SamplerOptions:
             with a last level near 0.
     """
 
-    steps: int = 30
+    steps: int = 16
     stride: int = 4
     rolling: int | None = None
     placement: Placement = "fuse"
@@ -69,12 +69,12 @@ class SamplerOptions:
     paste: bool = True
     blend: int = 10
     eta: float = 1.0
-    shift: float = 3.0
+    shift: float = 1.0
     any_floor: bool = False
     guidance: Guidance = field(default_factory=Guidance)
     noise_sampling: NoiseSampling = "joint"
-    solver: Solver = "ddim"
-    spacing: Spacing = "even"
+    solver: Solver = "dpmpp_2m"
+    spacing: Spacing = "log_snr"
 
     def __post_init__(self) -> None:
         if not isinstance(self.guidance, Guidance):

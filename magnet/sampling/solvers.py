@@ -12,10 +12,6 @@ from magnet.sampling.noise import LEVELS, ddim_step, half_log_snr
 
 Solver = Literal["ddim", "dpmpp_2m"]
 
-LEAN = 3.0
-"""A step of this length in `half_log_snr` counts twice the last change of the prediction; shorter ones count it
-(1 + (length / LEAN)^4) times, which is nothing for eight steps and more, and keeps variance where there are four."""
-
 
 @dataclass
 class History:
@@ -98,5 +94,5 @@ def carried_on(clean: Tensor, now: Tensor, after: Tensor, history: History) -> T
     """
     length = half_log_snr(after) - half_log_snr(now)
     since = torch.where(history.levels == LEVELS, length, half_log_snr(now) - half_log_snr(history.levels.clamp_min(0)))
-    share = (length / (2 * since) * (1 + (length / LEAN) ** 4)).clamp(max=1.0)
+    share = (length / (2 * since)).clamp(max=1.0)
     return torch.where(history.levels < 0, clean, clean + share * (clean - history.clean))

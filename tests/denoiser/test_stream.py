@@ -101,7 +101,7 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
         SamplerOptions(steps=2, stride=2, blend=17),
         SamplerOptions(steps=2, stride=2, requantise=False),
         SamplerOptions(steps=4, rolling=2),
-        SamplerOptions(steps=3, stride=2, eta=1.0, shift=3.0),
+        SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
         SamplerOptions(steps=4, rolling=2, eta=0.5),
         SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
         SamplerOptions(steps=5, rolling=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
