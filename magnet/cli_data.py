@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli import CommandError, no_such
 from magnet.cli_data_list import add_list, run_list
 from magnet.cli_data_options import all_reader_options, order_of, reader_parser
-from magnet.cli_data_shown import bar, clips_by_people, file_bars, show_gaps, show_persons, show_skipped, show_splits
+from magnet.cli_data_shown import (
+    bar,
+    clips_by_people,
+    file_bars,
+    show_gaps,
+    show_notes,
+    show_persons,
+    show_skipped,
+    show_splits,
+)
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -26,6 +35,7 @@ Prepare, check, describe, fake and download data sets.
   magnet data fake interx OUT                        a tiny made-up download, to try everything out
   magnet data check DOWNLOAD_OR_STORE                all assertions, a summary, a picture
   magnet data prepare interx --root DOWNLOAD --out STORE --body SMPLX_NEUTRAL.npz
+  magnet data prepare bvh --root FOLDER STORE        recordings of your own: docs/own.md
   magnet data info STORE                             what a store holds
   magnet data download cmu --subjects 60,61 OUT      CMU's free recordings
 """
@@ -127,7 +137,8 @@ def add_check(one: argparse.ArgumentParser) -> None:
 
 def add_prepare(one: argparse.ArgumentParser) -> None:
     one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
-    one.add_argument("--root", help="folder of the download")
+    one.add_argument("place", nargs="?", metavar="OUT", help="the same as --out")
+    one.add_argument("--root", help="folder of the download, or of your own recordings")
     one.add_argument("--out", help="folder of the store; run again to go on or to bring it up to date")
     add_work(one)
     one.add_argument("--reader.OPTION", metavar="VALUE", help="an option of the data set: prepare NAME --help")
@@ -201,8 +212,7 @@ def run_info(given: argparse.Namespace) -> int:
         ]
     )
     show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
-    for entry in m["notes"]:
-        out.print(f"note: {entry['note']} ({len(entry['takes'])} takes)", soft_wrap=True, markup=False)
+    show_notes([f"{entry['note']} ({len(entry['takes'])} takes)" for entry in m["notes"]])
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     if m.get("listed but not there"):
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
@@ -226,8 +236,7 @@ def run_check(given: argparse.Namespace) -> int:
     else:
         found, body = checked_download(given, name, path)
     show_splits(list(check.lines(found)), title=found.title)
-    for note in found.notes:
-        print(f"note: {note}")
+    show_notes(found.notes)
     show_skipped(found.skipped)
     show_gaps(found.clips_by_people())
     picture = Path(given.picture or f"{found.name}_check.png")
@@ -288,12 +297,17 @@ def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
     from magnet.datamodules.prepare import absent_note, prepare, read_splits
 
+    if given.place and given.out and given.place != given.out:
+        raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
+    given.out = given.out or given.place
     name, root, out = needed(given, "name", "root", "out")
     order = order_of(given, name, root)
     splits = read_splits(given.splits) if given.splits else None
     with bar() as tell:
         report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
     m = report.folder.manifest
+    for line in order.reader().summary():
+        print(f"note: {line}")
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))
     print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
@@ -303,6 +317,10 @@ def run_prepare(given: argparse.Namespace) -> int:
     data = catalogue.find(name).data.partition(":")[2]
     body = "" if given.body == "open" else f" --data.body_model {given.body}"
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
+    if name in catalogue.OWN:
+        print(
+            f"  magnet fit --config configs/finetune.yaml --data.path {out}{body}   # the shipped model goes on with it"
+        )
     print(f"  magnet fit --model Tokenizer --data {data} --data.path {out}{body}")
     return 0
 
@@ -320,7 +338,8 @@ def run_fake(given: argparse.Namespace) -> int:
         then = f"train on it:\n  magnet fit --model Tokenizer --data CMU --data.root {folder}"
     else:
         write = catalogue.find(name).load_fake()
-        then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE --body {folder / 'body.npz'}"
+        body = "" if name == "bvh" else f" --body {folder / 'body.npz'}"
+        then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE{body}"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
     at_least(1, takes=given.takes, frames=given.frames)

@@ -37,11 +37,15 @@ def run_list(given: argparse.Namespace) -> int:
             show(console, "what to do", catalogue.UNPREPARED[name])
         else:
             show_reader(console, name, catalogue.find(name).load_reader(), catalogue.find(name).data.partition(":")[2])
+    if not given.name:
+        show_plugins(console)
     return 0
 
 
 def show_reader(console: Console, name: str, kind: type[Reader], data: str) -> None:
     """One data set."""
+    from magnet.datamodules import catalogue
+
     console.print(f"[bold cyan]{name}[/]  {kind.title}", soft_wrap=True)
     show(console, "who may use it", kind.licence)
     show(console, "where to ask", kind.source)
@@ -51,10 +55,26 @@ def show_reader(console: Console, name: str, kind: type[Reader], data: str) -> N
     body = BODIES.get(kind.family, "")
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
     show(console, "then", f"magnet data prepare {name} --root DOWNLOAD --out STORE {body}".rstrip())
+    if name in catalogue.OWN:
+        show(console, "", "magnet fit --config configs/finetune.yaml --data.path STORE")
     show(console, "", f"magnet fit --model Tokenizer --data {data} --data.path STORE{model}")
     if body:
         show(console, "", WHERE[kind.family])
     show(console, "to try it out", f"magnet data fake {name} FAKE")
+
+
+def show_plugins(console: Console) -> None:
+    """Data sets that installed packages bring, and those that failed to load."""
+    from magnet.datamodules import plugins
+
+    found = plugins.discover()
+    for plugin in found.plugins:
+        console.print(f"[bold cyan]{plugin.name}[/]  of {plugin.origin}", soft_wrap=True)
+        show(console, "what it is", (plugin.data.__doc__ or "").strip().partition("\n")[0])
+        show(console, "then", f"magnet fit --model Tokenizer --data {plugin.name}")
+    for name, error in found.failures.items():
+        console.print(f"[bold red]{name}[/]", soft_wrap=True)
+        show(console, "failed to load", f"{type(error).__name__}: {error}")
 
 
 def show(console: Console, what: str, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
 
 SKIPPED_SHOWN = 20
 PERSONS_SHOWN = 8
+NOTES_SHOWN = 8
 
 
 def show_splits(rows: list[tuple[str, ...]], title: str | None = None) -> None:
@@ -49,6 +51,19 @@ def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
 
     for line in split_gaps(clips):
         print(f"WARNING: {line}", file=sys.stderr)
+
+
+def show_notes(notes: list[str]) -> None:
+    """Notes; of many that differ in numbers alone only the first ones."""
+    alike: dict[str, int] = {}
+    for note in notes:
+        kind = re.sub(r"[\d.]+", "#", note)
+        alike[kind] = alike.get(kind, 0) + 1
+        if alike[kind] <= NOTES_SHOWN:
+            print(f"note: {note}")
+    for kind, count in alike.items():
+        if count > NOTES_SHOWN:
+            print(f"  ... and {count - NOTES_SHOWN} more like: {kind}")
 
 
 def show_persons(groups: list[tuple[list[str], int]]) -> None:

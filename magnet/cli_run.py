@@ -23,6 +23,7 @@ from magnet.cli_layers import Layer
 from magnet.cli_parser import Parser
 from magnet.cli_stored import Arguments
 from magnet.cli_tasks import NamedTask, alias_path, aliases, task_of
+from magnet.datamodules.plugins import discover
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.presets import PRESETS
@@ -35,6 +36,7 @@ DATA = {
     "Synthetic": "magnet.datamodules.synthetic",
     "CMU": "magnet.datamodules.cmu",
     "Mixed": "magnet.datamodules.mixed",
+    "Prepared": "magnet.datamodules.prepared",
     "DuoBox": "magnet.datamodules.duobox",
     "DD100": "magnet.datamodules.dd100",
     "ReMoCap": "magnet.datamodules.remocap",
@@ -49,7 +51,6 @@ DATA = {
 
 DEFAULT_TASK = "joint_future"
 SAMPLING = ("test", "predict")
-SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
 SEED = 1111
 SILENCED = (
     ".*does not have many workers.*",
@@ -76,9 +77,10 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         MagnetCLI(command, ["--help"], None, Path(), {})
         return 0
     named_classes()
+    cli_stored.import_named(given)
     words = task_words(command, given)
     name, out = run_name(command, given.files), given.value("out")
-    checkpoint = which_checkpoint(command, given, [Path(out)] if out else [RUNS / name, RUNS])
+    checkpoint = which_checkpoint(command, given, name)
     if command == "fit":
         cli_stored.refuse_linked(given)
     layer: dict[str, Any] = {}
@@ -86,6 +88,8 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         stored = cli_stored.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
         layer = cli_stored.defaults(stored, given, command == "fit", path_of(DATA), keep_data)
+    elif command == "fit" and (start := given.option("model", "start_from")):
+        layer = cli_stored.started(start, given, MODELS, path_of(DATA))
     folder = cli_record.run_folder(RUNS / name, out)
     preset, words = sampler_words(command, words)
     settled = cli_classes.settle([Layer("", layer), *given.layers, Layer("", preset)], words)
@@ -104,7 +108,7 @@ def named_classes() -> tuple[dict[str, type], dict[str, type]]:
     def load(classes: dict[str, str]) -> dict[str, type]:
         return {name: getattr(importlib.import_module(module), name) for name, module in classes.items()}
 
-    return load(MODELS), load(DATA)
+    return load(MODELS), load(DATA) | {one.name: one.data for one in discover().plugins}
 
 
 def path_of(classes: dict[str, str]) -> str:
@@ -130,16 +134,16 @@ def run_name(command: str, files: list[str]) -> str:
     return file.parent.parent.name if file.name == "config.yaml" and (file.parent / "run.json").exists() else file.stem
 
 
-def which_checkpoint(command: str, given: Arguments, folders: list[Path]) -> Path | None:
-    """The checkpoint to start from; None for training from nothing.
+def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
+    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
 
     Raises:
         CommandError: it is not there.
     """
-    name = given.value("ckpt_path")
-    only_shown = any(flag.startswith(SHOWN) for flag in given.flags)
-    if name is None and (command == "fit" or only_shown):
+    name, out = given.value("ckpt_path"), given.value("out")
+    if name is None and (command == "fit" or given.only_shown):
         return None
+    folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
     return cli_stored.find_checkpoint(name, folders)
 
 

@@ -26,6 +26,7 @@ Spec = dict[str, Any]
 """A class and its options: {"class_path": ..., "init_args": {...}}."""
 
 CONFIG_FLAGS = ("--config", "-c")
+SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
 CONFIG_KEY = "magnet_config"
 
 
@@ -83,10 +84,23 @@ class Arguments:
             return None if flag == "null" else flag
         return next((config[key] for config in reversed(self.configs) if config.get(key) is not None), None)
 
+    @property
+    def only_shown(self) -> bool:
+        """Whether the configuration or help is asked for, and nothing is run."""
+        return any(flag.startswith(SHOWN) for flag in self.flags)
+
     def class_of(self, key: str) -> str | None:
         """The class that the user asks for under `model`, `data` or `task`."""
         named = (spec_of(config.get(key)).get("class_path") for config in reversed(self.configs))
         return class_in_flags(self.flags, key) or next((name for name in named if name), None)
+
+    def option(self, key: str, name: str) -> Any:
+        """An option of the class under `model` or `data`: by a flag, else by the last file that says something."""
+        flag = self.flag(f"{key}.{name}") or self.flag(f"{key}.init_args.{name}")
+        if flag is not None:
+            return None if flag == "null" else flag
+        parts = [config[key] for config in reversed(self.configs) if isinstance(config.get(key), dict)]
+        return next((value for part in parts if (value := (part.get("init_args") or {}).get(name)) is not None), None)
 
     def without(self, key: str) -> list[str]:
         """The flags, less one and its value."""
@@ -98,6 +112,24 @@ class Arguments:
             elif not argument.startswith(f"--{key}="):
                 kept.append(argument)
         return kept
+
+
+def import_named(given: Arguments) -> None:
+    """Import the classes that a user names by a dotted path, also out of the working directory.
+
+    Raises:
+        CommandError: such a module is there and cannot be imported.
+    """
+    from magnet.datamodules.plugins import import_local
+
+    named = [(f"--{key}", given.class_of(key)) for key in ("model", "data")]
+    named += [(layer.path or "a file", path) for layer in given.layers for path in class_paths(layer.options)]
+    for where, path in named:
+        if path and "." in path:
+            try:
+                import_local(path)
+            except ValueError as error:
+                raise CommandError(f"{where} {error}") from error
 
 
 def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:
@@ -190,6 +222,52 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
             linked_values["window_frames"] = STRIDE * model_args["window"]
         accepted = options_of(class_named(layer["data"]["class_path"]))
         layer["data"]["init_args"] |= {k: v for k, v in linked_values.items() if v is not None and k in accepted}
+    return layer
+
+
+OWN_WAY = {
+    "tokenizer", "start_from", "decoder_only", "learning_rate", "weight_decay", "warmup_steps", "compile", "seed"
+}  # fmt: skip
+"""Options of a model that one which starts from it does not take over."""
+
+
+def started(name: str, given: Arguments, models: dict[str, str], data_default: str) -> dict[str, Any]:
+    """Options of the checkpoint that training starts from (`--model.start_from`), as the lowest layer.
+
+    Sizes have to be the same, and losses and noise had better be; the data are told how many people and frames.
+
+    Args:
+        name: a shipped model's, or a path.
+        given: what the user says.
+        models: modules of our models, by the class's short name.
+        data_default: class of the data where nobody names one.
+
+    Raises:
+        CommandError: there is no such checkpoint.
+    """
+    try:
+        checkpoint = weights.read(weights.resolve(name))
+    except (OSError, ValueError) as error:
+        if given.only_shown:
+            return {}
+        said = textwrap.shorten(str(error).partition("\n")[0], 200)
+        raise CommandError(f"--model.start_from {name}: {said}") from error
+    denoiser = "tokenizer_hyper_parameters" in checkpoint
+    short = (given.class_of("model") or ("Denoiser" if denoiser else "Tokenizer")).rpartition(".")[2]
+    if short not in models:  # somebody's own model knows what it starts from
+        return {}
+    fields = "tokenizer_hyper_parameters" if denoiser and short == "Tokenizer" else "hyper_parameters"
+    stored = checkpoint.get(fields) or {}
+    path = f"{models[short]}.{short}"
+    known = options_of(class_named(path))
+    kept = {key: value for key, value in stored.items() if key in known - OWN_WAY}
+    layer = {"model": {"class_path": path, "init_args": {k: v for k, v in kept.items() if k not in LINKS.values()}}}
+    if short == "Denoiser":
+        data = given.class_of("data") or data_default
+        linked = {"max_agents": kept.get("max_agents"), "window_frames": STRIDE * kept.get("window", 0) or None}
+        accepted = options_of(class_named(data))
+        wanted = {key: value for key, value in linked.items() if value is not None and key in accepted}
+        layer["data"] = {"class_path": data, "init_args": wanted}
     return layer
 
 

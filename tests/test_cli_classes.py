@@ -15,9 +15,9 @@ import pytest
 import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
 
-from magnet import cli, cli_classes, cli_run
+from magnet import cli, cli_classes, cli_run, weights
 from magnet.cli_layers import Layer, merged, read_layers
-from magnet.cli_stored import LINKS
+from magnet.cli_stored import LINKS, OWN_WAY
 from magnet.tasks import registry
 from tests.toys import OtherData, ToyData, ToyModel
 
@@ -156,13 +156,22 @@ def test_callbacks_have_their_own_defaults(tmp_path: Path, capsys: pytest.Captur
     assert callback["init_args"] == own(ModelCheckpoint, "lightning") | kept["init_args"]
 
 
+def taken_over(name: str | None) -> dict[str, Any]:
+    """What a configuration that starts from a shipped model has from it."""
+    if name not in weights.names():
+        return {}
+    stored = weights.read(weights.resolve(name))["hyper_parameters"]
+    return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
+
+
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
 def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said: dict[str, Any] = {}
     for layer in read_layers(str(config)):
         said = merged(said, layer.options)
     got = printed(capsys, "fit", "--config", str(config))
-    model = own(MODELS[said["model"]["class_path"]]) | said["model"].get("init_args", {})
+    told = said["model"].get("init_args", {})
+    model = own(MODELS[said["model"]["class_path"]]) | taken_over(told.get("start_from")) | told
     assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
 
     def resolved(spec: dict[str, Any]) -> dict[str, Any]:

@@ -168,6 +168,7 @@ def test_latest_leads_to_the_newest_run(toy: Path) -> None:
     assert len(runs) == 2
     newest = max(runs, key=lambda run: (run / "checkpoints" / "last.ckpt").stat().st_mtime)
     assert (toy / "runs" / "salsa" / "latest").resolve() == newest.resolve()
+    go("test", "--ckpt_path", "last", "--out", "elsewhere")
     go("test", "--ckpt_path", "last")
 
 

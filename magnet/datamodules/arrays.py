@@ -31,7 +31,7 @@ def open_npy(path: Path) -> NDArray:
     Raises:
         DataError: no such file, cut short, damaged, or it holds pickled objects.
     """
-    with _reported(path, "an npy file"), regular(path).open("rb") as file:
+    with reported(path, "an npy file"), regular(path).open("rb") as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(file)
@@ -56,7 +56,7 @@ def open_npz(path: Path, keys: Sequence[str], optional: Sequence[str] = ()) -> d
         DataError: no such file, cut short, damaged, a key missing, pickled objects behind one, or an array that
             would unpack to far more than the file holds.
     """
-    with _reported(path, "an npz archive"), load_npz(path, (*keys, *optional)) as file:
+    with reported(path, "an npz archive"), load_npz(path, (*keys, *optional)) as file:
         require(path, file.files, keys)
         arrays = {key: file[key] for key in keys}
         for key in set(optional) & set(file.files):
@@ -73,7 +73,7 @@ def open_json(path: Path) -> Any:
     Raises:
         DataError: no such file, cut short or not json.
     """
-    with _reported(path, "a json file"):
+    with reported(path, "a json file"):
         return json.loads(regular(path).read_bytes())
 
 
@@ -83,12 +83,12 @@ def open_names(path: Path) -> list[str]:
     Raises:
         DataError: no such file, or it is not text.
     """
-    with _reported(path, "a list of names"):
+    with reported(path, "a list of names"):
         return [name for line in regular(path).read_text(encoding="utf-8-sig").splitlines() if (name := line.strip())]
 
 
 @contextmanager
-def _reported(path: Path, what: str) -> Iterator[None]:
+def reported(path: Path, what: str) -> Iterator[None]:
     """Turns every error of the block into a `DataError` about the file."""
     try:
         yield

@@ -39,6 +39,13 @@ def _entry(module: str, data: str) -> Entry:
     return Entry(f"{package}.{module}:{data}Reader", f"{package}.fakes.{module}:write", f"{package}.{module}:{data}")
 
 
+def _own(module: str, reader: str) -> Entry:
+    package = "magnet.datamodules"
+    return Entry(
+        f"{package}.{module}:{reader}Reader", f"{package}.fakes.{module}:write", f"{package}.prepared:Prepared"
+    )
+
+
 NAMES: dict[str, Entry] = {
     "duobox": _entry("duobox", "DuoBox"),
     "dd100": _entry("dd100", "DD100"),
@@ -49,7 +56,11 @@ NAMES: dict[str, Entry] = {
     "aioz": _entry("aioz", "AIOZ"),
     "hi4d": _entry("hi4d", "Hi4D"),
     "chi3d": _entry("chi3d", "CHI3D"),
+    "bvh": _own("bvh", "BVH"),
+    "scenes": _own("scenes", "Scenes"),
 }
+OWN = ("bvh", "scenes")
+"""Recordings of a user's own, which any folder of such files may be."""
 UNPREPARED = {
     "cmu": (
         "cmu trains without being prepared: the first magnet fit --model Tokenizer --data CMU --data.root FOLDER fits "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -181,12 +181,10 @@ def recognise(root: Path) -> str:
     Raises:
         ValueError: none does, or several do.
     """
-    found = []
-    for name, entry in catalogue.NAMES.items():
-        with suppress(ValueError, OSError):  # what this one lacks
-            found += [name] if entry.load_reader()(root).found() else []
+    found = _readable(root, [name for name in catalogue.NAMES if name not in catalogue.OWN])
     with suppress(OSError):
         found += ["cmu"] if CMU(str(root)).takes() else []
+    found = found or _readable(root, catalogue.OWN)
     if len(found) == 1:
         return found[0]
     if found:
@@ -195,6 +193,15 @@ def recognise(root: Path) -> str:
         f"{root} is neither a prepared store nor a download that is known; it holds {listing(root)}; give "
         "another folder, or say which data set it should be with --name, to be told what is missing"
     )
+
+
+def _readable(root: Path, names: Sequence[str]) -> list[str]:
+    """Those data sets whose reader finds takes."""
+    found = []
+    for name in names:
+        with suppress(ValueError, OSError):  # what this one lacks
+            found += [name] if catalogue.find(name).load_reader()(root).found() else []
+    return found
 
 
 def check_download(
@@ -223,6 +230,7 @@ def check_download(
     found = Checked(reader.name, reader.title)
     use = chosen(reader, splits, limit)
     takes = use.takes
+    found.notes += reader.summary()
     if use.left_out:
         whose = "the data set's rule" if splits is None else "the list given"
         found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")

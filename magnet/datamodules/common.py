@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import roma
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.body.family import title
 from magnet.body.fit import fit_body, floor_height
 from magnet.datamodules import check_motion
-from magnet.datamodules.recording import Axis, DataError, Recording
+from magnet.datamodules.recording import Axis, DataError, Family, Recording
 from magnet.datamodules.windows import Clip, Split
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
@@ -26,7 +27,6 @@ STEPS_VERSION = 2
 FPS = 30.0
 FLOOR_PERCENTILE = 5.0
 """Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
-Family = Literal["smplx", "smpl", "positions"]
 
 R_WORLD_FILE: dict[Axis, Tensor] = {
     "+y": torch.eye(3, dtype=torch.float64),
@@ -115,17 +115,13 @@ def to_clips(
             positions that the body does not fit within 4 cm.
     """
     steps = steps or Steps()
+    recording = of_body(recording, body, source, family)
     notes = list(recording.notes)
     for p, gender in enumerate(recording.genders):  # of a body that nobody gave
         who = recording.persons[p] if recording.persons else f"person {p}"
         notes.append(f"{who}: {gender}; the shape is used with the body model given")
     up = steps.up or recording.up
     valid = check_motion.usable(recording)
-    if recording.poses is not None and body.id.startswith("open"):
-        raise DataError(
-            f"rotations and shape numbers of {source} belong to SMPL-X's body, not to {body.id}: "
-            "give --body SMPLX_NEUTRAL.npz"
-        )
     if recording.poses is not None:
         motion = _posed(recording, valid, body)
         check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
@@ -133,15 +129,49 @@ def to_clips(
         check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
     else:
         motion, residual = _fitted(recording, valid, body, up, steps)
-        notes.append(f"body {body.id} fitted to positions: {residual}")
+        notes.append(f"body {body.id} fitted to {'skeletons' if recording.rigs else 'positions'}: {residual}")
     jumps = check_motion.jumps(motion.pelvis.numpy(), motion.valid, FPS)
     if len(jumps):
         notes.append(f"cut at {len(jumps)} jumps of more than {check_motion.JUMP:g} m between frames")
     if not steps.trust_fps:
-        check_motion.check_rate(motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.fps, FPS)
+        check_motion.check_rate(
+            motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.said_fps or recording.fps, FPS
+        )
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
     motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
     return Outcome(_cut(motion, jumps, body, name, source, split, steps.min_frames), tuple(notes))
+
+
+def of_body(recording: Recording, body: Body, source: str, family: Family) -> Recording:
+    """The recording if its shape numbers can be used with `body`.
+
+    Where files may hold anything (`family` any), rotations of SMPL's family go with the open body in its mean shape.
+
+    Raises:
+        DataError: they are another body's.
+    """
+    if recording.poses is None or recording.body == body.id:
+        return recording
+    if recording.body:
+        raise DataError(
+            f"its shape numbers belong to body {recording.body!r}, not to {body.id!r}: give that one's file with "
+            "--body, or no --body for the open one"
+        )
+    if not body.id.startswith("open"):
+        if recording.shapes_of and body.family not in ("", recording.shapes_of):
+            raise DataError(
+                f"its shape numbers are {title(recording.shapes_of)}'s by the number of joints, but body {body.id!r} "
+                f"is {title(body.family)}'s: give that one's file with --body or --bodies, or none for the open one"
+            )
+        return recording
+    if family != "any":
+        raise DataError(
+            f"rotations and shape numbers of {source} belong to SMPL-X's body, not to {body.id}: "
+            "give --body SMPLX_NEUTRAL.npz"
+        )
+    said = f"rotations of SMPL's family on body {body.id} in its mean shape: limbs are approximate without --body FILE"
+    flat = np.zeros_like(np.asarray(recording.betas))
+    return replace(recording, betas=flat, genders=(), notes=(*recording.notes, said))
 
 
 # -- resampling --------------------------------------------------------------------------------
@@ -184,17 +214,20 @@ def resample_valid(valid: NDArray[np.bool_], fps: float, target: float = FPS) ->
 
 
 def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> Motion:
-    assert recording.poses is not None and recording.transl is not None and recording.betas is not None
+    place = recording.transl if recording.pelvis is None else recording.pelvis
+    assert recording.poses is not None and place is not None and recording.betas is not None
     check_motion.check_angles(recording.poses, valid)
     poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
-    transl = check_motion.filled(np.asarray(recording.transl, dtype=np.float64), valid)
-    check_motion.check_apart(transl, valid)
+    place = check_motion.filled(np.asarray(place, dtype=np.float64), valid)
+    check_motion.check_apart(place, valid)
     betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
     quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
     rotations = roma.unitquat_to_rotmat(resample_rotations(quat, recording.fps)).float()
     rest = body.rest_joints(betas)
     # SMPL's root turns about the rest pelvis and is moved by transl after that
-    pelvis = resample_points(torch.from_numpy(transl), recording.fps) + rest[:, 0]
+    pelvis = resample_points(torch.from_numpy(place), recording.fps)
+    if recording.pelvis is None:
+        pelvis = pelvis + rest[:, 0]
     joints = body.forward_kinematics(rotations[:, :, 1:], rigid(rotations[:, :, 0], pelvis.float()), betas.float())
     return Motion(rotations, pelvis, betas, resample_valid(valid, recording.fps), joints)
 
@@ -209,19 +242,39 @@ def _fitted(recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis
     spread[:, :, list(recording.joints)] = points.numpy()
     check_motion.check_up(up, spread, good, chosen=steps.up is not None)
     spread = spread @ R_WORLD_FILE[up].numpy().T
+    if np.isfinite(spread[:, :, check_motion.WALKING]).all():
+        check_motion.check_apart(spread[:, :, 0], good)
+        check_motion.check_lengths(spread, spread[:, :, 0], good)
     if not steps.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
-        check_motion.check_rate(spread[:, :, check_motion.WALKING], good, recording.fps, FPS)  # before a fit of minutes
+        check_motion.check_rate(
+            spread[:, :, check_motion.WALKING], good, recording.said_fps or recording.fps, FPS
+        )  # before a fit of minutes
     targets = (points @ R_WORLD_FILE[up].T).float()
     try:
-        fit = fit_body(targets, recording.joints, body, valid=torch.from_numpy(good), grounded=True, fps=FPS)
+        if recording.rigs:
+            people, offs = zip(*(rig.onto(body, up, FPS) for rig in recording.rigs), strict=True)
+            scene = _side_by_side(people)
+            residual = torch.stack(offs, dim=1)
+        else:
+            fit = fit_body(targets, recording.joints, body, valid=torch.from_numpy(good), grounded=True, fps=FPS)
+            scene, residual = fit.scene, fit.residual
     except ValueError as error:
         raise DataError(str(error)) from error
-    scene = fit.scene
     rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
-    off = 100 * fit.residual.numpy()[good]
+    off = 100 * residual.numpy()[good]
     said = f"mean residual {off.mean():.1f} cm, 95 % below {np.percentile(off, 95):.1f} cm"
     pelvis = scene.T_world_root[0, :, :, :3, 3].double()
     return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0]), said
+
+
+def _side_by_side(people: Sequence[Scene]) -> Scene:
+    return people[0].replace(
+        body_rot=torch.cat([person.body_rot for person in people], dim=2),
+        T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
+        betas=torch.cat([person.betas for person in people], dim=1),
+        present=torch.cat([person.present for person in people], dim=1),
+        valid=None,
+    )
 
 
 # -- cutting -----------------------------------------------------------------------------------

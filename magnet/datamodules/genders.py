@@ -86,7 +86,7 @@ def one_body(recording: Recording, bodies: Mapping[Gender, Body], body: Body) ->
     Raises:
         DataError: a gender without a body, or joints at rest further off than 4 cm.
     """
-    if recording.poses is None or recording.transl is None or recording.betas is None or not bodies:
+    if recording.poses is None or recording.transl is None or recording.betas is None or not bodies or recording.body:
         return recording
     genders = recording.genders or ("neutral",) * len(recording.betas)
     alike = body.family in ("", *(one.family for one in bodies.values()))
@@ -110,7 +110,7 @@ def one_body(recording: Recording, bodies: Mapping[Gender, Body], body: Body) ->
         betas[p] = found[0].numpy()
         if worst:
             notes.append(f"{gender} shapes expressed in body {body.id}: joints at rest within {_whole_mm(worst)} mm")
-    return replace(recording, transl=transl, betas=betas, notes=tuple(dict.fromkeys(notes)), genders=())
+    return replace(recording, transl=transl, betas=betas, notes=tuple(dict.fromkeys(notes)), genders=(), shapes_of="")
 
 
 def _whole_mm(metres: float) -> int:

@@ -93,7 +93,7 @@ class Order:
                 get it.
         """
         kind = catalogue.find(self.name).load_reader()
-        if self.body_file == "open" and kind.family != "positions":
+        if self.body_file == "open" and kind.family not in ("positions", "any"):
             raise ValueError(
                 f"{kind.title} holds shape numbers of {kind.family.upper()}: give the body's file with --body FILE, "
                 f"from {BODY_FROM[kind.family]}; `magnet data fake` writes a made-up body.npz beside its files"

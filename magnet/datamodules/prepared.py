@@ -22,6 +22,7 @@ class Prepared(MotionDataModule):
 
     Args:
         path: the store's folder, as `magnet data prepare` wrote it.
+        root: another name of `path`, as the folders of other data sets are called.
         spread: let each process read a length of its own, where there are enough clips; False: all draw from all.
         roles: words such as leader and follower; people whose names in the store hold the first stand in the first
             slots, and so on, others after them in the order of the recording. To be seen with `shuffle_agents` off.
@@ -41,6 +42,7 @@ class Prepared(MotionDataModule):
     def __init__(
         self,
         path: str = "",
+        root: str = "",
         spread: bool = True,
         roles: Sequence[str] = (),
         device_resident: bool = False,
@@ -49,7 +51,9 @@ class Prepared(MotionDataModule):
         **kwargs: Any,
     ) -> None:
         super().__init__(device_resident=device_resident, body_model=body_model, max_agents=max_agents, **kwargs)
-        self.path, self.spread, self.roles = path, spread, tuple(roles)
+        if path and root and path != root:
+            raise ValueError(f"path {path} and root {root} are two names of one thing, the store's folder; give one")
+        self.path, self.spread, self.roles = path or root, spread, tuple(roles)
 
     @property
     def maps_files(self) -> bool:  # type: ignore[override]

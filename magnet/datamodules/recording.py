@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 from magnet.datamodules.windows import Split
 from magnet.errors import DataError as DataError
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from magnet.body import Body
+    from magnet.motion.scene import Scene
+
 Floats = NDArray[np.floating]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Family = Literal["smplx", "smpl", "positions", "any"]
+"""What files hold: shape numbers of SMPL-X or SMPL, positions that a body is fitted to, or this and that."""
 Gender = Literal["neutral", "male", "female"]
 GENDERS: tuple[Gender, ...] = get_args(Gender)
 
@@ -39,6 +47,18 @@ class Take:
     also: tuple[Path, ...] = ()
 
 
+class Rig(Protocol):
+    """One person's skeleton, which knows how it is brought onto a body."""
+
+    def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
+        """The person on `body`, y up, at `fps`: a scene with B = P = 1, and how far joints are off, (T,) metres.
+
+        Raises:
+            ValueError: the body does not fit.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Recording:
     """One take of P people at its native rate, axes and units already in metres and radians.
@@ -55,17 +75,24 @@ class Recording:
     poses: Floats | None = None  # (T, P, 22, 3) axis-angle, pelvis first
     transl: Floats | None = None  # (T, P, 3) SMPL's transl, not the pelvis
     betas: Floats | None = None  # (P, 10)
+    pelvis: Floats | None = None  # (T, P, 3) the pelvis joint itself, in place of `transl`
+    body: str = ""  # id of the body that `betas` belong to; "": SMPL's family, which the user names
+    shapes_of: str = ""  # family of bodies (`magnet.body.family`) that `betas` belong to, where only the files tell it
     positions: Floats | None = None  # (T, P, M, 3) world
     joints: tuple[int, ...] = ()  # (M,) which of the 22 joints `positions` are of
     valid: NDArray[np.bool_] | None = None  # (T, P), False where tracking failed
     persons: tuple[str, ...] = ()  # names or roles, such as "leader", which a store keeps
     notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt
     genders: tuple[Gender, ...] = ()  # (P,) of the body that each one's `betas` belong to; (): not known
+    rigs: tuple[Rig, ...] = ()  # (P,) skeletons with rotations, which say more of a body than `positions`
+    said_fps: float | None = None  # of the files, where `fps` is another because motion was resampled on the way
 
     def __post_init__(self) -> None:
-        if self.poses is not None and self.transl is not None and self.betas is not None:
+        place = self.transl if self.pelvis is None else self.pelvis
+        if self.poses is not None and place is not None and self.betas is not None:
             T, P = self.poses.shape[:2]
-            expected = {"poses": (T, P, 22, 3), "transl": (T, P, 3), "betas": (P, 10)}
+            expected = {"poses": (T, P, 22, 3), "betas": (P, 10)}
+            expected["transl" if self.pelvis is None else "pelvis"] = (T, P, 3)
         elif self.positions is not None and self.joints:
             T, P = self.positions.shape[:2]
             expected = {"positions": (T, P, len(self.joints), 3)}
@@ -76,9 +103,11 @@ class Recording:
         for name, want in expected.items():
             if (got := np.shape(getattr(self, name))) != want:
                 raise DataError(f"{name}: got {got}, expected {want} for {T} frames of {P} people")
-        for name, words in {"persons": self.persons, "genders": self.genders}.items():
+        for name, words in {"persons": self.persons, "genders": self.genders, "rigs": self.rigs}.items():
             if words and len(words) != P:
-                raise DataError(f"{name}: got {len(words)} ({', '.join(words)}), expected one for each of {P} people")
+                raise DataError(
+                    f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} people"
+                )
         if strange := [gender for gender in self.genders if gender not in GENDERS]:
             raise DataError(f"genders: got {strange[0]!r}, expected one of {', '.join(GENDERS)}")
         if not T or not P:
@@ -108,7 +137,7 @@ class Reader(ABC):
     title: ClassVar[str]  # as its authors write it
     source: ClassVar[str]  # address where to ask for it
     licence: ClassVar[str]  # who may use it, in one line
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
+    family: ClassVar[Family] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = ()  # what must lie where in `root`: pattern, what it is
     shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
@@ -134,6 +163,10 @@ class Reader(ABC):
         """All takes with their official splits."""
         found, splits = self.found(), self.official()
         return found if splits is None else [replace(take, split=splits.get(take.group)) for take in found]
+
+    def summary(self) -> list[str]:
+        """What was found by names alone that a user should see; of data sets with a fixed layout nothing."""
+        return []
 
     @abstractmethod
     def read(self, take: Take) -> Recording:

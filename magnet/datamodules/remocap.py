@@ -72,7 +72,7 @@ class ReMoCapReader(Reader):
         self.scale, self.paper = scale, split == "paper"
         self.halves = first_folder(self.root, PLACES, "train/*") or first_folder(self.root, PLACES, "test/*")
         self.fits = None if fits is None else Path(fits)
-        if self.fits is None and self.halves is None and any(_number(p) for p in _fit_files(self.root)):
+        if self.fits is None and self.halves is None and any(path.stem.isdigit() for path in _fit_files(self.root)):
             self.fits = self.root
         if self.fits is not None and not _fit_files(self.fits):
             raise DataError(f"ReMoCap: no fits such as 16.npz in {self.fits}; give their folder")

@@ -14,6 +14,7 @@ from torch import Tensor
 from magnet import weights
 from magnet.body import Body, load_body
 from magnet.checks import require_number
+from magnet.denoiser import starting
 from magnet.denoiser import stream as streaming
 from magnet.denoiser.levels import NoiseLevels
 from magnet.denoiser.losses import Weighting
@@ -38,8 +39,9 @@ class Denoiser(L.LightningModule):
     Holds the frozen tokenizer it was trained with, so one checkpoint is all that a user needs.
 
     Args:
-        tokenizer: checkpoint of a trained tokenizer. `raw` uses plain poses instead (ablation, paper Table 5).
-            A checkpoint of this module brings its own, and this is then not read.
+        tokenizer: checkpoint of a trained tokenizer, or of a denoiser with one, or the name of a shipped model such as
+            `duet`. `raw` uses plain poses instead (ablation, paper Table 5). A checkpoint of this module brings its
+            own, and this is then not read.
         max_agents: agent slots P; smaller scenes leave slots empty. Linked to the data's.
         window: token steps that the model sees at once; 16 tokens are 64 frames. Linked to the data's.
         width: hidden size d, paper Table A.2.
@@ -78,7 +80,8 @@ class Denoiser(L.LightningModule):
         motion_weight: adds the error of decoded joints' velocities in m/s (ours).
         partner_weight: adds the distance of the partners' decoded joints, as each sees them, in metres (ours).
         decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these three.
-        start_from: checkpoint of a denoiser whose weights training starts from, where they fit.
+        start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
+            starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalised.
         std_floor: smallest standard deviation used for z-scores.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -141,8 +144,10 @@ class Denoiser(L.LightningModule):
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
-        elif tokenizer is not None and Path(tokenizer).exists():
+        elif tokenizer is not None and weights.named(tokenizer).exists():
             self.build(Tokenizer.load(tokenizer))
+        elif tokenizer is None and start_from is not None and weights.named(start_from).exists():
+            self.build(starting.tokenizer_of(start_from))
 
     # -- parts ---------------------------------------------------------------------------------
 
@@ -179,11 +184,13 @@ class Denoiser(L.LightningModule):
 
     def require_tokenizer(self) -> None:
         if not self.built:
-            path = self.hparams["tokenizer"]
-            given = "not given" if path is None else f"{path!r}, which is no file"
+            name = "tokenizer" if self.hparams["tokenizer"] or not self.hparams["start_from"] else "start_from"
+            path = self.hparams[name]
+            given = "not given" if path is None else f"{path!r}, which is no file and no shipped model"
             raise ValueError(
-                f"the denoiser has no tokenizer: --model.tokenizer is {given}. "
-                "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint"
+                f"the denoiser has no tokenizer: --model.{name} is {given}. "
+                "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint, or go "
+                "on from the shipped model: --model.start_from duet"
             )
 
     def train(self, mode: bool = True) -> Denoiser:
@@ -222,7 +229,7 @@ class Denoiser(L.LightningModule):
             raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
         fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these
         stored = {name: value for name, value in checkpoint["hyper_parameters"].items() if name in fields}
-        model = cls(**{**stored, "tokenizer": None})
+        model = cls(**{**stored, "tokenizer": None, "start_from": None})
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
         return model.eval()
@@ -282,27 +289,13 @@ class Denoiser(L.LightningModule):
 
     def on_fit_start(self) -> None:
         if not self.statistics.ready:
-            self._fit_statistics()
             if self.hparams["start_from"]:
-                self._start_from(self.hparams["start_from"])
+                starting.start_from(self, self.hparams["start_from"])
+            if not self.statistics.ready:
+                self._fit_statistics()
         if self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
-
-    def _start_from(self, path: str) -> None:
-        """Take over another denoiser's transformer; tokens are normalised anew."""
-        prefix = "transformer."
-        stored = {
-            name.removeprefix(prefix): value
-            for name, value in weights.read(weights.resolve(path))["state_dict"].items()
-            if name.startswith(prefix)
-        }
-        try:
-            self.transformer.load_state_dict(stored)
-        except RuntimeError as error:
-            raise ValueError(
-                f"start_from: {path} does not fit this model: {str(error).splitlines()[1].strip()}"
-            ) from error
 
     @torch.no_grad()
     def _fit_statistics(self) -> None:

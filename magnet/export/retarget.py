@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +116,7 @@ def load_bvh(
         found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
         raise ValueError(f"frame rates differ: {found}; bring all to one with --fps 30 (fps=30)")
     skeletons = [understood(file, unit, up, joints) for file in files]
-    read = [_exact(skeleton, body) or _fitted(skeleton, body) for skeleton in skeletons]
+    read = [onto(skeleton, body) for skeleton in skeletons]
     labels = [str(path) for path in each]
     scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
     floor = 0.0
@@ -125,6 +126,21 @@ def load_bvh(
         T_world_root[..., 1, 3] -= floor
         scene = scene.replace(T_world_root=T_world_root)
     return Imported(scene.replace(names=(each[0].stem,)), tuple(source for _, source in read), floor)
+
+
+def onto(
+    skeleton: Skeleton, body: Body, refuse_above: float = REFUSED_FIT, most_shape: float | None = None
+) -> tuple[Scene, Source]:
+    """One person on a body, and how the file was understood.
+
+    Args:
+        refuse_above: mean distance of limb joints in metres that is no fit.
+        most_shape: bound of fitted shape numbers; None: whatever lies nearest to the bones' lengths.
+
+    Raises:
+        ValueError: no fit.
+    """
+    return _exact(skeleton, body) or _fitted(skeleton, body, refuse_above, most_shape)
 
 
 # -- a skeleton of the body's own --------------------------------------------------------------
@@ -138,7 +154,9 @@ def _exact(skeleton: Skeleton, body: Body) -> tuple[Scene, Source] | None:
     number = [file.names.index(name) for name in JOINT_NAMES]
     if any(file.parents[number[j]] != number[PARENTS[j]] for j in range(1, BODY_JOINTS)):
         return None
-    Q = skeleton.R_rest_ours
+    Q = np.round(skeleton.R_rest_ours)  # ours rest along the axes, however far a shape leans
+    if np.linalg.det(Q) != 1.0:
+        return None
     offsets = torch.from_numpy(skeleton.metres * file.offsets[number] @ Q)
     betas, off = shape_of(offsets, body)
     slides = float(np.abs(file.place[:, number[1:]] - file.offsets[number[1:]]).max()) * skeleton.metres
@@ -189,23 +207,28 @@ def _source(
 # -- any other skeleton ------------------------------------------------------------------------
 
 
-def _fitted(skeleton: Skeleton, body: Body) -> tuple[Scene, Source]:
+def _fitted(skeleton: Skeleton, body: Body, refuse_above: float, most_shape: float | None) -> tuple[Scene, Source]:
     ours = skeleton.naming.joints
     wanted = {j: w for left, w in TARGETS.items() for j in ((left,) if left == NECK else (left, left + 1))}
     weights = {j: w for j, w in wanted.items() if j in ours}
     joints = sorted(weights)
     targets = torch.from_numpy(skeleton.at[:, [ours[j] for j in joints]])[:, None]
     rotations, used = hints(skeleton, body.rest_joints(torch.zeros(10)).double())
+    fitted = partial(
+        fit_body,
+        targets,
+        joints,
+        body,
+        rotations=rotations[:, None],
+        weights=torch.tensor([weights[j] for j in joints]),
+        fps=skeleton.file.fps,
+    )
     try:
-        fit = fit_body(
-            targets,
-            joints,
-            body,
-            rotations=rotations[:, None],
-            weights=torch.tensor([weights[j] for j in joints]),
-            fps=skeleton.file.fps,
-            refuse_above=REFUSED_FIT,
-        )
+        fit = fitted(refuse_above=refuse_above if most_shape is None else math.inf)
+        if most_shape is not None:
+            betas = fit.scene.betas[0].clamp(-most_shape, most_shape)
+            if not torch.equal(betas, fit.scene.betas[0]) or float(fit.residual.mean()) > refuse_above:
+                fit = fitted(betas=betas, refuse_above=refuse_above)
     except ValueError as error:
         raise ValueError(f"{skeleton.file.path}: {error}") from error
     limbs = [joint for joint in joints if joint != NECK]

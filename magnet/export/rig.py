@@ -59,7 +59,7 @@ def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, 
     if naming.missing:
         raise ValueError(
             f"{file.path}: cannot tell which joint is {', '.join(naming.missing)}; it has {', '.join(file.names)}. "
-            f"Name them: --joint {naming.missing[0]}=ITS_NAME (joints={{...}})"
+            f"Name them: --joint {naming.missing[0]}=ITS_NAME (joints={{...}}; of magnet data: --reader.joints FILE)"
         )
     ours = naming.joints
     rest = file.rest()
@@ -68,7 +68,8 @@ def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, 
         fitting = [name for name, metres in UNITS.items() if SHORTEST_LEG <= leg * metres <= LONGEST_LEG]
         if not fitting:
             raise ValueError(
-                f"{file.path}: legs are {leg:.3g} long, which fits no unit of length; say --in-unit m or cm (unit=...)"
+                f"{file.path}: legs are {leg:.3g} long, which fits no unit of length; say --in-unit m or cm (unit=...; "
+                "of magnet data: --reader.unit)"
             )
         unit = fitting[0]
     turned, at = file.world()

@@ -16,18 +16,22 @@ SHAPING = ("latent", "hidden", "codes", "levels", "depth", "causal")
 """Fields that decide the shape of the weights, or what they mean."""
 
 
-def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Fields and weights of the tokenizer in a tokenizer's checkpoint, or in that of a denoiser.
+def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Fields and weights of the tokenizer in a tokenizer's checkpoint, or in that of a denoiser, a shipped one by name.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or holds no tokenizer.
     """
-    if not path.is_file():
+    path = weights.named(path)
+    if not path.exists():
         raise FileNotFoundError(f"{path}: no such tokenizer checkpoint; train one with `magnet fit`")
     weights.verify(path)
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+        if path.is_dir():
+            checkpoint = weights.read(path)
+        else:
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
         fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
     except Exception as error:  # whatever a damaged or foreign file makes torch raise
         reason = str(error).strip().split("\n")[0]

@@ -64,8 +64,8 @@ class Tokenizer(L.LightningModule):
         exchange_limbs: share of limbs that in training move as somebody else's of the batch do (ours).
         turn_joints: radians by which joints are turned at random in training (ours); with exchanged limbs it
             keeps a small data set from being learnt by heart.
-        start_from: checkpoint of a tokenizer whose encoder and decoder training starts from; codes start anew
-            where there is another number of them.
+        start_from: checkpoint of a tokenizer, or of a denoiser with one, or the name of a shipped model such as `duet`,
+            whose encoder and decoder training starts from; codes start anew where there is another number of them.
         decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
             trained on them takes the new decoder as it is.
         std_floor: smallest standard deviation used for z-scores of poses and steps.
@@ -237,7 +237,7 @@ class Tokenizer(L.LightningModule):
 
     def on_fit_start(self) -> None:
         if self.hparams["start_from"] and not self._prepared:
-            self._start_from(Path(self.hparams["start_from"]))
+            self._start_from(self.hparams["start_from"])
         if self.hparams["decoder_only"]:
             if not self._prepared:
                 raise ValueError("decoder_only: there are no codes to decode yet; give start_from a trained tokenizer")
@@ -253,7 +253,7 @@ class Tokenizer(L.LightningModule):
         if not self._prepared:
             self.prepare(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
-    def _start_from(self, path: Path) -> None:
+    def _start_from(self, path: str | Path) -> None:
         """Take over another tokenizer's networks and statistics, and its codes where there are as many."""
         _, state = read_checkpoint(path)
         mine = self.state_dict()
@@ -375,13 +375,13 @@ class Tokenizer(L.LightningModule):
 
     @classmethod
     def load(cls, path: str | Path) -> Tokenizer:
-        """A trained tokenizer from its checkpoint, or from that of a denoiser that holds one; weights only.
+        """A trained tokenizer from its checkpoint, or from that of a denoiser that holds one, a shipped one by name.
 
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: the file is no such checkpoint, or a weight's shape does not fit its fields; says which.
         """
-        fields, state = read_checkpoint(Path(path))
+        fields, state = read_checkpoint(path)
         fields = {name: value for name, value in fields.items() if name in _fields()}
         tokenizer = cls(**fields)
         expected = tokenizer.state_dict()

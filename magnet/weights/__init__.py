@@ -35,18 +35,19 @@ def names() -> list[str]:
     return sorted(path.parent.name for path in FOLDER.glob("*/config.json"))
 
 
+def named(name_or_path: str | Path) -> Path:
+    """The folder of a shipped model where there is one of that name, else the path as it is."""
+    shipped = FOLDER / str(name_or_path)
+    return shipped if (shipped / "config.json").exists() else Path(name_or_path)
+
+
 def resolve(name_or_path: str | Path | None = None) -> Path:
     """The checkpoint that a name or path means; None is the model that comes with the package.
 
     Raises:
         ValueError: neither a model of the package nor a file.
     """
-    if name_or_path is None:
-        name_or_path = DEFAULT
-    shipped = FOLDER / str(name_or_path)
-    if (shipped / "config.json").exists():
-        return shipped
-    path = Path(name_or_path)
+    path = named(DEFAULT if name_or_path is None else name_or_path)
     if path.exists():
         return path
     there = ", ".join(names()) or "none"

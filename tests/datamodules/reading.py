@@ -26,8 +26,9 @@ def fake_of(name: str) -> ModuleType:
 
 
 def world_joints(recording: Recording, family: str) -> NDArray:
-    """Joints (T, P, 22, 3) by a plain loop over the made-up body: pelvis = transl + J0, then bone by bone."""
-    poses, transl, betas = (np.asarray(a, np.float64) for a in (recording.poses, recording.transl, recording.betas))
+    """Joints (T, P, 22, 3) by a plain loop over the made-up body: pelvis (or transl + J0), then bone by bone."""
+    place = recording.transl if recording.pelvis is None else recording.pelvis
+    poses, place, betas = (np.asarray(a, np.float64) for a in (recording.poses, place, recording.betas))
     rest = rest_joints(betas, "smpl" if family == "smpl" else "smplx")
     joints = np.zeros(poses.shape)
     for p in range(poses.shape[1]):
@@ -35,9 +36,10 @@ def world_joints(recording: Recording, family: str) -> NDArray:
         for j, parent in enumerate(PARENTS):
             local = Rotation.from_rotvec(poses[:, p, j])
             turn.append(local if parent < 0 else turn[parent] * local)
-            above = transl[:, p] if parent < 0 else joints[:, p, parent]
-            bone = rest[p, j] - (0 if parent < 0 else rest[p, parent])
-            joints[:, p, j] = above + (np.tile(bone, (len(poses), 1)) if parent < 0 else turn[parent].apply(bone))
+            if parent < 0:
+                joints[:, p, j] = place[:, p] + (rest[p, j] if recording.pelvis is None else 0.0)
+            else:
+                joints[:, p, j] = joints[:, p, parent] + turn[parent].apply(rest[p, j] - rest[p, parent])
     return joints
 
 

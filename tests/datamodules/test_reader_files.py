@@ -86,7 +86,9 @@ def test_no_option_of_free_text_hides_a_path(name: str) -> None:
     hints = get_type_hints(reader.__init__)
     for option in inspect.signature(reader).parameters:
         kinds = get_args(hints[option]) if get_origin(hints[option]) is types.UnionType else (hints[option],)
-        assert str not in kinds or option == "root", f"{option}: annotate it as Path, so that its content counts"
+        assert str not in kinds or option in ("root", "pattern"), (
+            f"{option}: annotate it as Path, so that its content counts"
+        )
 
 
 def test_a_folder_counts_by_its_name_and_content_wherever_it_lies(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules.catalogue import NAMES, OWN
 from magnet.datamodules.common import Steps, times
 from magnet.datamodules.draws import whole_clips
 from magnet.datamodules.fakes import remocap as fake_remocap
@@ -29,8 +29,8 @@ from magnet.datamodules.windows import Split
 from .made_scenes import FITTED, FORMS, MILLIMETRE, joints_at_30_fps, placed, random_scene, scene_of, written
 from .reading import fake_of, world_joints
 
-TAKES = {"duobox": 1, "remocap": 2}
-"""Of a download, where one take has all splits or takes long to fit; else 3."""
+TAKES = {"duobox": 1, "remocap": 2, "bvh": 4, "scenes": 4}
+"""Of a download, where one take has all splits, takes long to fit, or fewer are split in time; else 3."""
 
 
 GENDERS = {
@@ -164,6 +164,8 @@ WRONG: dict[str, tuple[float, float, Change, str]] = {
     "30 for 120 fps": (8.0, 0.25, lambda shown: shown, r"too fast for people; perhaps 30 .* called 120 \(--trust_fps"),
 }
 """Seconds of a take at the declared rate, true rate over the declared one, what is done to it, what must be said."""
+FOUND = ("another axis up", "up is down")
+"""What no file of a user's own declares: it is found in the motion, and no mistake."""
 SAID = {
     ("remocap", "mm for m"): r"trunks are .* expected 0\.2 to 0\.9 m: positions look like millimetres",
     ("chi3d", "degrees"): r"no up axis stands out",  # matrices have no unit: what degrees make of them turns anywhere
@@ -198,6 +200,9 @@ def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
             continue
         kind = asked[take.name.removesuffix("_tr0")]
         error = convert(reader, take, body, order.steps).error
+        if name in OWN and kind in FOUND:
+            assert error is None, f"{kind}: {error}"
+            continue
         assert error is not None, f"{kind}: {take.name} was taken"
         assert re.search(SAID.get((form, kind), WRONG[kind][3]), error), f"{kind}: {error}"
 

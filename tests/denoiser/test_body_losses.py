@@ -3,6 +3,7 @@ import torch
 
 from magnet.body import load_body
 from magnet.denoiser.body_losses import BODY_LOSSES, body_losses, surest
+from magnet.denoiser.starting import start_from
 from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, scene_transforms
@@ -99,11 +100,11 @@ def test_a_denoiser_starts_from_anothers_weights(tmp_path):
     checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
     first.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, tmp_path / "first.ckpt")
-    second._start_from(str(tmp_path / "first.ckpt"))
+    start_from(second, tmp_path / "first.ckpt")
     for name, value in second.transformer.state_dict().items():
         assert torch.equal(value, first.transformer.state_dict()[name])
     with pytest.raises(ValueError, match=r"start_from: .* does not fit this model: size mismatch"):
-        tiny_denoiser(width=64)._start_from(str(tmp_path / "first.ckpt"))
+        start_from(tiny_denoiser(width=64), tmp_path / "first.ckpt")
 
 
 def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, monkeypatch):

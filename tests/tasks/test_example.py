@@ -56,6 +56,14 @@ def test_its_fields_are_options_as_ours_are(installed: Path, tmp_path: Path):
     assert "target: 1" in config and "ending: 2" in config
 
 
+def test_its_data_set_is_listed_and_its_fields_are_options(installed: Path, tmp_path: Path):
+    listed = run("magnet", "data", "list", installed=installed, cwd=tmp_path)
+    assert "Strolls  of magnet-duel 0.1.0" in listed and "--data Strolls" in listed
+    command = ("magnet", "fit", "--model", "Tokenizer", "--data", "Strolls", "--data.takes", "3", "--print_config")
+    config = run(*command, installed=installed, cwd=tmp_path)
+    assert "magnet_duel.strolls.Strolls" in config and "takes: 3" in config
+
+
 def test_its_own_tests_pass(installed: Path, tmp_path: Path):
     tests = shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
     said = run("pytest", "-q", "-p", "no:cacheprovider", str(tests), installed=installed, cwd=tmp_path)

@@ -1,6 +1,7 @@
 import pytest
 import torch
 from magnet_duel import Duel
+from magnet_duel.strolls import Strolls
 
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -22,6 +23,13 @@ def test_others_and_the_ending_come_back_as_they_were():
     assert torch.equal(sampled.T_world_root[:, :, 0], scene.T_world_root[:, :, 0])
     assert torch.equal(sampled.T_world_root[:, 44:], scene.T_world_root[:, 44:])
     assert not torch.equal(sampled.T_world_root[:, 8:44, 1], scene.T_world_root[:, 8:44, 1])
+
+
+def test_its_data_set_gives_training_batches():
+    data = Strolls(takes=2, frames=128, batch_size=4, epoch_size=4, max_agents=3)
+    (batch,) = data.train_dataloader()
+    assert tuple(batch.T_world_root.shape) == (4, 64, 3, 4, 4)
+    assert {clip.split for split in ("train", "val", "test") for clip in data.clips(split)} == {"train", "val", "test"}
 
 
 def test_a_duel_needs_two():

@@ -1,0 +1,204 @@
+"""A user's own BVH files of any skeleton: one person a file, brought onto the body by its joints' names."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+
+from magnet.body import Body
+from magnet.body.base import JOINT_NAMES
+from magnet.datamodules.common import resample_points, resample_rotations
+from magnet.datamodules.own import OwnReader
+from magnet.datamodules.own_files import Seat
+from magnet.datamodules.recording import Axis, DataError, Family, Recording
+from magnet.export.bvh_read import Bvh, read_bvh
+from magnet.export.retarget import TARGETS, onto
+from magnet.export.rig import UP, Skeleton, understood
+from magnet.motion.scene import Scene
+
+Unit = Literal["m", "cm", "mm", "inch", "foot"]
+PELVIS, NECK, HEAD = 0, 12, 15
+LIMBS = sorted({joint + side for joint in TARGETS if joint != NECK for side in (0, 1)})
+MOST_SHAPE = 5.0
+"""Bound of shape numbers: odd proportions are better left as a residual than made a body that nobody has."""
+SHOWN = 12
+
+
+@dataclass(frozen=True)
+class BvhTrack:
+    """One person's file: a skeleton with its motion, and how it is to be understood."""
+
+    file: Bvh
+    unit: Unit | None
+    joints: dict[str, str]
+    worst: float
+    said_fps: float
+
+    @property
+    def fps(self) -> float:
+        return self.file.fps
+
+    @property
+    def frames(self) -> int:
+        return self.file.frames
+
+    def cut(self, start: int, stop: int) -> BvhTrack:
+        part = slice(start, stop)
+        return replace(self, file=replace(self.file, place=self.file.place[part], local=self.file.local[part]))
+
+    def resampled(self, fps: float) -> BvhTrack:
+        """Rotations relative to the parent by slerp, positions by straight lines."""
+        if self.fps == fps:
+            return self
+        quat = roma.rotmat_to_unitquat(torch.from_numpy(self.file.local))
+        local = roma.unitquat_to_rotmat(resample_rotations(quat, self.fps, fps)).numpy()
+        place = resample_points(torch.from_numpy(self.file.place), self.fps, fps).numpy()
+        return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
+
+    def skeleton(self, up: str | None = None) -> Skeleton:
+        """Which joint is which, in what unit; y up as `up` or the motion says.
+
+        Raises:
+            DataError: names, legs or the rest pose do not tell.
+        """
+        try:
+            return understood(self.file, self.unit, up, self.joints)
+        except ValueError as error:
+            raise DataError(str(error)) from error
+
+    def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
+        """The person on `body`; fitted, unless the skeleton is the body's own."""
+        skeleton = self.resampled(fps).skeleton(up.lstrip("+"))
+        scene, _ = onto(skeleton, body, self.worst, MOST_SHAPE)
+        joints, theirs = _limbs(skeleton)
+        off = body.joints(scene)[0, :, 0, joints] - torch.from_numpy(skeleton.at[:, theirs]).float()
+        return scene, off.norm(dim=-1).mean(dim=-1)
+
+
+def _limbs(skeleton: Skeleton) -> tuple[list[int], list[int]]:
+    """Our limb joints that a skeleton has, and their numbers there."""
+    ours = skeleton.naming.joints
+    there = [joint for joint in LIMBS if joint in ours]
+    return there, [ours[joint] for joint in there]
+
+
+class BVHReader(OwnReader[BvhTrack]):
+    """A folder of BVH files, one person each; who belongs together is told by names, a pattern or a table.
+
+    Units, up axis and which joint is which are found in each file, as `magnet export` finds them.
+
+    Args:
+        root: the folder.
+        unit: of lengths, where legs do not tell it.
+        joints: file of lines `OUR_NAME THEIR_NAME`, such as `left_hip Bone12`, for joints that no naming scheme knows.
+        worst_fit: metres that limb joints may be off on average when the body is fitted; takes above are refused.
+        **kwargs: as for OwnReader.
+
+    Raises:
+        DataError: no BVH files; says what was found.
+        ValueError: a line of `joints` that is no pair of names, or a pattern that is none.
+    """
+
+    name: ClassVar[str] = "bvh"
+    title: ClassVar[str] = "BVH files"
+    family: ClassVar[Family] = "positions"
+    suffixes: ClassVar[tuple[str, ...]] = (".bvh",)
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("NAME_{A,B}.bvh", "a person each, of any skeleton; other ways to say who is together are in docs/own.md"),
+    )
+
+    def __init__(
+        self,
+        root: str | Path,
+        pattern: str | None = None,
+        table: Path | None = None,
+        split: Literal["scenes", "time"] | None = None,
+        unit: Unit | None = None,
+        joints: Path | None = None,
+        worst_fit: float = 0.04,
+    ) -> None:
+        super().__init__(root, pattern, table, split)
+        self.unit, self.worst_fit = unit, worst_fit
+        self.joints = {} if joints is None else read_joints(Path(joints))
+
+    def open(self, seat: Seat, alone: bool) -> tuple[list[BvhTrack], list[str]]:
+        """The person of a file."""
+        try:
+            file = read_bvh(seat.file)
+        except (ValueError, OSError) as error:
+            raise DataError(str(error)) from error
+        return [BvhTrack(file, self.unit, self.joints, self.worst_fit, file.fps)], []
+
+    def recording(
+        self, where: str, tracks: Sequence[BvhTrack], names: Sequence[str], notes: Sequence[str]
+    ) -> Recording:
+        """Skeletons, and of their joints those that say whether axis, unit and rate can be right."""
+        skeletons = [track.skeleton() for track in tracks]
+        ours = [skeleton.naming.joints | {PELVIS: skeleton.chain[0]} for skeleton in skeletons]
+        wanted = {PELVIS, HEAD, *LIMBS}
+        joints = sorted(wanted.intersection(*ours))
+        axes: Counter[Axis] = Counter(_axis(skeleton.up) for skeleton in skeletons)
+        said = dict.fromkeys(_said(track, skeleton) for track, skeleton in zip(tracks, skeletons, strict=True))
+        places = [
+            skeleton.at[:, [numbers[joint] for joint in joints]] @ UP[skeleton.up]  # back to the file's axes
+            for skeleton, numbers in zip(skeletons, ours, strict=True)
+        ]
+        return Recording(
+            fps=tracks[0].fps,
+            up=axes.most_common(1)[0][0],
+            positions=np.stack(places, axis=1),
+            joints=tuple(joints),
+            persons=tuple(name or track.file.path.stem for name, track in zip(names, tracks, strict=True)),
+            notes=(*notes, *said),
+            rigs=tuple(tracks),
+            said_fps=tracks[0].said_fps,
+        )
+
+
+def _axis(up: str) -> Axis:
+    return up if up.startswith("-") else f"+{up}"  # type: ignore[return-value]
+
+
+def _said(track: BvhTrack, skeleton: Skeleton) -> str:
+    """How a file was understood, in words that files of one kind share."""
+    naming, names = skeleton.naming, skeleton.file.names
+    used = {*naming.joints.values(), *skeleton.chain}
+    rest = [name for number, name in enumerate(names) if number not in used]
+    more = f", ... {len(rest)} in all" if len(rest) > SHOWN else ""
+    unused = f"; not used: {', '.join(rest[:SHOWN])}{more}" if rest else ""
+    return (
+        f"names of {naming.scheme}, {len(naming.joints)} joints; {skeleton.unit}, {_axis(skeleton.up)} up, "
+        f"{track.said_fps:g} fps{unused}"
+    )
+
+
+def read_joints(path: Path) -> dict[str, str]:
+    """Lines `OUR_NAME THEIR_NAME`; theirs may hold spaces. A # begins a comment.
+
+    Raises:
+        ValueError: no such file, or a line that is no pair, or not of our joints; names it.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read as lines OUR_NAME THEIR_NAME ({error})") from error
+    found: dict[str, str] = {}
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].replace("=", " ").split(maxsplit=1)
+        if not words:
+            continue
+        if len(words) != 2 or words[0] not in JOINT_NAMES or words[0] in found:
+            raise ValueError(
+                f"{path}, line {number}: got {line.strip()!r}, expected OUR_NAME THEIR_NAME, ours once and of "
+                f"{', '.join(JOINT_NAMES)}"
+            )
+        found[words[0]] = words[1].strip()
+    return found

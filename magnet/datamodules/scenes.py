@@ -1,0 +1,364 @@
+"""A user's own scenes: SMPL-X npz as AMASS has them, SMPL and SMPL-X pickles, and the scenes that magnet writes."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from magnet.datamodules.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
+from magnet.datamodules.common import resample_points, resample_rotations, resample_valid
+from magnet.datamodules.fields import gender_of, mapping, shape_numbers
+from magnet.datamodules.own import OwnReader
+from magnet.datamodules.own_files import Group, Seat
+from magnet.datamodules.recording import Axis, DataError, Family, Gender, Recording
+from magnet.datamodules.unpickle import load_pickle
+from magnet.motion.scene import Scene
+
+WIDTH = 66
+"""Numbers of the pelvis and 21 body joints."""
+FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
+"""Whose shape numbers go with so many rotation numbers a frame; 66, the body's alone, may be anybody's."""
+WHOLE = ("poses", "pose", "smpl_poses", "fullpose", "full_pose")
+ORIENT, BODY = ("root_orient", "global_orient", "poses_root"), ("pose_body", "body_pose", "poses_body")
+PLACE = ("trans", "transl", "smpl_trans", "translation")
+RATE = ("mocap_frame_rate", "mocap_framerate", "fps", "framerate", "frame_rate")
+SHAPE = ("betas", "shape", "beta")
+INSIDE = ("smplx", "smpl", "smplh", "person", "data")
+"""Keys that files may have for the same thing."""
+OPTIONAL = ("gender", "smpl_scaling", "body", "valid")
+
+
+@dataclass(frozen=True)
+class PosedTrack:
+    """One person: T frames of rotations, and where the pelvis or SMPL's translation is."""
+
+    fps: float
+    poses: Doubles  # (T, 22, 3) axis-angle, the pelvis's in the world
+    place: Doubles  # (T, 3)
+    betas: Doubles  # (10,)
+    valid: NDArray[np.bool_]  # (T,)
+    shapes_of: str = ""  # family of bodies that `betas` are of, where the file tells
+    body: str = ""  # id of the very body, where the file says it
+    at_pelvis: bool = False  # `place` is the pelvis itself
+    gender: Gender | None = None
+    name: str = ""
+    said_fps: float | None = None
+
+    @property
+    def frames(self) -> int:
+        return len(self.poses)
+
+    def cut(self, start: int, stop: int) -> PosedTrack:
+        part = slice(start, stop)
+        return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part])
+
+    def resampled(self, fps: float) -> PosedTrack:
+        if fps == self.fps:
+            return self
+        quat = resample_rotations(roma.rotvec_to_unitquat(torch.from_numpy(self.poses)), self.fps, fps)
+        return replace(
+            self,
+            fps=fps,
+            said_fps=self.said_fps or self.fps,
+            poses=roma.unitquat_to_rotvec(quat).numpy(),
+            place=resample_points(torch.from_numpy(self.place), self.fps, fps).numpy(),
+            valid=resample_valid(self.valid[:, None], self.fps, fps)[:, 0],
+        )
+
+
+class ScenesReader(OwnReader[PosedTrack]):
+    """A folder of npz and pkl files of SMPL's family, one person or several each, or of scenes that magnet wrote.
+
+    Keys are found by the names in use (poses or root_orient and pose_body, trans or transl, betas, mocap_frame_rate or
+    fps); pickles are read without running anything in them. SMPL's two hand joints are left out, SMPL-X's fingers and
+    face too.
+
+    Args:
+        root: the folder.
+        fps: of files that do not say it.
+        **kwargs: as for OwnReader.
+
+    Raises:
+        DataError: no such files; says what was found.
+        ValueError: a pattern that is none, or a frame rate that is not positive.
+    """
+
+    name: ClassVar[str] = "scenes"
+    title: ClassVar[str] = "Scenes of SMPL's family"
+    family: ClassVar[Family] = "any"
+    suffixes: ClassVar[tuple[str, ...]] = (".npz", ".pkl")
+    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("NAME_{A,B}.npz", "a person each, of SMPL's family; other ways to say who is together are in docs/own.md"),
+        ("NAME.pkl", "the same of one or several people, such as {person1: {poses, trans, betas}}"),
+        ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
+    )
+    one_person_a_file: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        root: str | Path,
+        pattern: str | None = None,
+        table: Path | None = None,
+        split: Literal["scenes", "time"] | None = None,
+        fps: float | None = None,
+    ) -> None:
+        super().__init__(root, pattern, table, split)
+        if fps is not None and not fps > 0:
+            raise ValueError(f"fps: got {fps:g}, expected more than 0")
+        self.fps = fps
+
+    def scenes(self) -> dict[str, Group]:
+        """All but body files, which may lie beside them."""
+        return {scene: group for scene, group in self.groups.items() if not _is_body(group.seats[0].file)}
+
+    def open(self, seat: Seat, alone: bool) -> tuple[list[PosedTrack], list[str]]:
+        """The people in a file."""
+        path = seat.file
+        if path.suffix.lower() == ".pkl":
+            held: Any = load_pickle(path)
+        else:
+            keys = _keys(path)
+            if "meta" in keys:
+                return _ours(path), []
+            held = open_npz(path, (), tuple(keys))
+        people = list(_people(path, held))
+        notes: list[str] = []
+        tracks = [track for where, one in people for track in self._tracks(where, one, notes)]
+        if len(people) > 1:
+            one_length(path, {where: track.frames for (where, _), track in zip(people, tracks, strict=True)})
+        if len(tracks) > 1 and not alone:
+            raise DataError(
+                f"{path}: holds {len(tracks)} people, but other files belong to its scene, too; of several files each "
+                "holds one person: rename it, or put it elsewhere"
+            )
+        return tracks, notes
+
+    def _tracks(self, where: str, held: Mapping[str, Any], notes: list[str]) -> Iterator[PosedTrack]:
+        """One person, or several along the first axis."""
+        poses, width = _poses(where, held)
+        rate = _first(where, held, RATE, None)
+        if rate is None and self.fps is None:
+            raise DataError(f"{where}: says no frame rate ({', '.join(RATE)}); give --reader.fps, such as 30")
+        fps = float(self.fps if rate is None else floats(f"{where}: frame rate", np.ravel(rate)[:1], (1,))[0])  # type: ignore[arg-type]
+        several = poses.ndim == 3
+        place = _first(where, held, PLACE)
+        one_length(
+            where, {"rotations": poses.shape[-2], "translations": np.shape(place)[-2] if np.ndim(place) > 1 else 0}
+        )
+        places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3))
+        if "smpl_scaling" in held:  # AIST++: its translations are to be divided by it
+            places = places / floats(f"{where}: smpl_scaling", np.ravel(held["smpl_scaling"])[:1], (1,))
+        betas = _first(where, held, SHAPE, None)
+        if not several:
+            poses, places, betas = poses[None], places[None], None if betas is None else [betas]
+        if betas is None:
+            notes.append("no shape numbers: everybody has the body's mean shape")
+        elif len(betas) != len(poses):
+            raise DataError(f"{where}: shape numbers of {len(betas)} people for {len(poses)}; {AGAIN}")
+        for p in range(len(poses)):
+            shape, said = (np.zeros(10), ()) if betas is None else shape_numbers(where, {"betas": np.asarray(betas[p])})
+            notes.extend(said)
+            yield PosedTrack(
+                fps=fps,
+                poses=poses[p, :, :WIDTH].reshape(-1, 22, 3),
+                place=places[p],
+                betas=shape,
+                shapes_of="" if betas is None else FAMILIES.get(width, ""),
+                body=str(held.get("body", "")),
+                valid=np.ones(poses.shape[1], dtype=bool),
+                gender=gender_of(_one_of(held.get("gender"), p)),
+            )
+
+    def recording(
+        self, where: str, tracks: Sequence[PosedTrack], names: Sequence[str], notes: Sequence[str]
+    ) -> Recording:
+        """Rotations and translations, the up axis by where people stand."""
+        kinds = {(track.body, track.at_pelvis) for track in tracks}
+        if len(kinds) > 1:
+            bodies = {track.body for track in tracks}
+            raise DataError(
+                f"{self.root / where}: people of different bodies: {', '.join(sorted(b or 'SMPL' for b in bodies))}"
+            )
+        ((body, at_pelvis),) = kinds
+        poses = np.stack([track.poses for track in tracks], axis=1)
+        place = np.stack([track.place for track in tracks], axis=1)
+        genders = tuple(track.gender or "neutral" for track in tracks) if any(track.gender for track in tracks) else ()
+        return Recording(
+            fps=tracks[0].fps,
+            up="+y" if body else _standing(poses[:, :, 0]),
+            poses=poses,
+            transl=None if at_pelvis else place,
+            pelvis=place if at_pelvis else None,
+            body=body,
+            shapes_of=max(track.shapes_of for track in tracks),
+            betas=np.stack([track.betas for track in tracks]),
+            valid=np.stack([track.valid for track in tracks], axis=1),
+            persons=tuple(
+                n or track.name or f"person {p + 1}" for p, (n, track) in enumerate(zip(names, tracks, strict=True))
+            ),
+            notes=tuple(dict.fromkeys(notes)),
+            genders=genders,
+            said_fps=tracks[0].said_fps,
+        )
+
+
+# -- files -------------------------------------------------------------------------------------
+
+
+def _keys(path: Path) -> list[str]:
+    with reported(path, "an npz archive"), zipfile.ZipFile(path) as file:
+        return [name.removesuffix(".npy") for name in file.namelist()]
+
+
+def _is_body(path: Path) -> bool:
+    """Whether a file is a body model, which has a template."""
+    try:
+        return path.suffix.lower() == ".npz" and "v_template" in _keys(path)
+    except DataError:
+        return False  # damaged: said when it is read
+
+
+def _ours(path: Path) -> list[PosedTrack]:
+    """People of a scene that magnet wrote."""
+    with reported(path, "a scene of magnet's"):
+        scene = Scene.load(path)
+    if scene.scenes != 1:
+        raise DataError(
+            f"{path}: holds {scene.scenes} scenes, expected one; write each to a file: magnet export {path.name} "
+            f"one.npz --scene 0"
+        )
+    valid = np.ones(scene.frames, dtype=bool) if scene.valid is None else scene.valid[0].numpy()
+    if not all(tensor.isfinite().all() for tensor in (scene.body_rot, scene.T_world_root, scene.betas)):
+        raise DataError(f"{path}: holds NaN or infinity; {AGAIN}")
+    tracks = []
+    for p in scene.present[0].nonzero()[:, 0].tolist():
+        rotations = torch.cat([scene.T_world_root[0, :, p, None, :3, :3], scene.body_rot[0, :, p]], dim=1).double()
+        tracks.append(
+            PosedTrack(
+                fps=scene.fps,
+                poses=roma.rotmat_to_rotvec(rotations).numpy(),
+                place=scene.T_world_root[0, :, p, :3, 3].double().numpy(),
+                betas=scene.betas[0, p].double().numpy(),
+                valid=valid,
+                body=scene.body,
+                at_pelvis=True,
+            )
+        )
+    if not tracks:
+        raise DataError(f"{path}: nobody is present in it; {AGAIN}")
+    return tracks
+
+
+def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Each person's arrays in a file: it holds one's, a list of people's, or a dict of them by name."""
+    if isinstance(held, np.ndarray) and held.dtype == object:
+        held = held.item() if held.ndim == 0 else held.tolist()
+    if isinstance(held, list | tuple):
+        held = {f"person{p + 1}": one for p, one in enumerate(held)}
+    held = mapping(path, held)
+    if any(key in held for key in (*WHOLE, *ORIENT)):
+        yield str(path), held
+        return
+    shared = {key: value for key, value in held.items() if key in (*RATE, *OPTIONAL)}
+    inside = {key: value for key, value in held.items() if isinstance(value, Mapping) and _posed(value)}
+    if not inside:
+        has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
+        raise DataError(
+            f"{path}: has neither {WHOLE[0]} nor {ORIENT[0]} and {BODY[0]}, alone or for each person; it has {has}; "
+            f"save motion of SMPL's family with these keys, {PLACE[0]}, betas and {RATE[0]}"
+        )
+    for key, value in inside.items():
+        yield f"{path}, {key}", {**shared, **mapping(f"{path}, {key}", value)}
+
+
+def _posed(held: Mapping[str, Any]) -> bool:
+    return any(key in held for key in (*WHOLE, *ORIENT))
+
+
+def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise: Any) -> Any:
+    """What the first of several keys holds.
+
+    Raises:
+        DataError: none is there, and there is nothing to take otherwise.
+    """
+    for key in keys:
+        if held.get(key) is not None:
+            return held[key]
+    if otherwise:
+        return otherwise[0]
+    has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
+    raise DataError(f"{where}: lacks {' or '.join(keys[:2])}; it has {has}; {AGAIN}")
+
+
+def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
+    """Axis-angle numbers a frame, (T, D) or (P, T, D), D at least 66; and how many the file has."""
+    if any(key in held for key in WHOLE):
+        whole = _flat(where, _first(where, held, WHOLE), WIDTH)
+    else:
+        orient = _flat(where, _first(where, held, ORIENT), 3, joints=1)
+        body = _flat(where, _first(where, held, BODY), WIDTH - 3)
+        one_length(where, {"root": orient.shape[-2], "body": body.shape[-2]})
+        if orient.shape[:-1] != body.shape[:-1]:
+            raise DataError(
+                f"{where}: root {orient.shape} and body {body.shape} are of unequal numbers of people; {AGAIN}"
+            )
+        whole = np.concatenate([orient, body], axis=-1)
+    return whole, whole.shape[-1]
+
+
+def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doubles:
+    """Rotations as axis-angle numbers: (..., J, 3, 3) matrices, (..., J, 3) vectors or flat already -> (..., 3 J)
+
+    Args:
+        where: for messages.
+        value: as the file has it.
+        least: numbers a frame.
+        joints: J, where (people, frames, 3) would look like it.
+
+    Raises:
+        DataError: no numbers, another shape, no frames, NaN, or matrices that are no rotations.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf" or array.ndim < 2:
+        raise DataError(f"{where}: rotations hold {array.dtype} {array.shape}, expected numbers a frame; {AGAIN}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = array.astype(np.float64)
+    if array.ndim >= 4 and array.shape[-2:] == (3, 3):
+        if not np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2):
+            raise DataError(f"{where}: matrices that are no rotations; {AGAIN}")
+        array = roma.rotmat_to_rotvec(torch.from_numpy(array)).numpy()
+    if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):
+        array = array.reshape(*array.shape[:-2], -1)
+    if array.ndim not in (2, 3) or array.shape[-1] < least or 0 in array.shape:
+        none = "; it has no frames" if 0 in array.shape else ""
+        raise DataError(
+            f"{where}: rotations: got shape {np.shape(value)}, expected (frames, {least} or more) in axis-angle, or "
+            f"people first{none}; {AGAIN}"
+        )
+    if not np.isfinite(array).all():
+        raise DataError(f"{where}: rotations hold NaN or infinity; {AGAIN}")
+    return array
+
+
+def _one_of(value: Any, person: int) -> Any:
+    """What a file says of a person: of one, or of all."""
+    return (
+        value[person]
+        if isinstance(value, list | tuple | np.ndarray) and np.ndim(value) == 1 and len(value) > person
+        else value
+    )
+
+
+def _standing(root: Doubles) -> Axis:
+    """The axis of the file's world along which pelvises stand. (T, P, 3) axis-angle -> +x ... -z"""
+    up = roma.rotvec_to_rotmat(torch.from_numpy(root))[..., 1].mean(dim=(0, 1))
+    axis = int(up.abs().argmax())
+    return ("-" if up[axis] < 0 else "+") + "xyz"[axis]  # type: ignore[return-value]

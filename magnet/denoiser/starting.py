@@ -1,0 +1,71 @@
+"""Training that starts from another denoiser: its transformer, and its tokenizer where none is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from magnet import weights
+from magnet.tokenizer.module import RawPose, Tokenizer
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+
+def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
+    """The tokenizer inside a denoiser's checkpoint, or inside a shipped model by name.
+
+    Raises:
+        ValueError: no denoiser's checkpoint.
+    """
+    checkpoint = denoiser_of(path)
+    if checkpoint["tokenizer_hyper_parameters"] is not None:
+        return Tokenizer.load(path)
+    raw = RawPose()
+    raw.load_state_dict(_part(checkpoint["state_dict"], "tokenizer."))
+    return raw
+
+
+def denoiser_of(path: str | Path) -> dict[str, Any]:
+    """A denoiser's checkpoint.
+
+    Raises:
+        ValueError: no such checkpoint, or another model's.
+    """
+    checkpoint = weights.read(weights.resolve(path))
+    if "tokenizer_hyper_parameters" not in checkpoint:
+        raise ValueError(
+            f"start_from: {path} is not a denoiser's checkpoint, for it carries no tokenizer; a tokenizer's is given "
+            "with --model.tokenizer"
+        )
+    return checkpoint
+
+
+def start_from(model: Denoiser, path: str | Path) -> None:
+    """Take over another denoiser's transformer, and how tokens are normalised where both tokenizers are the same.
+
+    With another tokenizer latents mean something else, and `model.statistics` is left to be fitted anew.
+
+    Raises:
+        ValueError: the checkpoint is of a model of other sizes.
+    """
+    state = denoiser_of(path)["state_dict"]
+    try:
+        model.transformer.load_state_dict(_part(state, "transformer."))
+    except RuntimeError as error:
+        reason = str(error).splitlines()[1].strip()
+        raise ValueError(
+            f"start_from: {path} does not fit this model: {reason}; sizes, --data.max_agents and --data.window_frames "
+            "must be those of that checkpoint"
+        ) from error
+    theirs, mine = _part(state, "tokenizer."), model.tokenizer.state_dict()
+    same = theirs.keys() == mine.keys() and all(torch.equal(value, mine[name].cpu()) for name, value in theirs.items())
+    if same:
+        model.statistics.load_state_dict(_part(state, "statistics."))
+
+
+def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

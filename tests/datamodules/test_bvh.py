@@ -1,0 +1,173 @@
+"""BVH files of a user's own: what they are taken for, who is beside whom and when, how they are split."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import load_body
+from magnet.datamodules.bvh import BVHReader, read_joints
+from magnet.datamodules.common import Steps, to_clips
+from magnet.datamodules.fakes.bvh import named, write_scenes
+from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+from magnet.datamodules.own import FEW
+from magnet.datamodules.prepare_takes import convert
+from magnet.datamodules.recording import DataError, Reader
+from magnet.export.bvh import save_bvh
+from magnet.synthesis import synthesize
+
+TAKES, FRAMES = 4, 12
+
+
+def written(root: Path, **scenes: FakeMotion) -> Path:
+    root.mkdir(exist_ok=True)
+    write_scenes(root, scenes)
+    return root
+
+
+def walk(frames: int = 48, fps: float = 120.0, seed: int = 0) -> FakeMotion:
+    return turned(people(frames, 2, fps, seed), "+z")
+
+
+def whole(reader: Reader, name: str = "walk"):
+    return reader.read(next(take for take in reader.found() if take.name == name))
+
+
+def test_what_a_file_means_is_said_in_its_notes(made: Path) -> None:
+    reader = BVHReader(made)
+    (note,) = reader.read(reader.takes()[0]).notes
+    assert note == "names of 3ds Max Biped, Unreal, Rigify, 18 joints; cm, +z up, 120 fps"
+    assert reader.summary() == ["4 scenes of 2 files: walk1 (A, B), walk2 (A, B), walk3 (A, B), walk4 (A, B)"]
+
+
+def test_a_skeleton_of_the_bodys_own_comes_back_exactly(tmp_path: Path) -> None:
+    body = load_body()
+    scene = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), body).scene.cut(0, 64)
+    save_bvh(scene, tmp_path / "walk.bvh", body, unit="cm")
+    reader = BVHReader(tmp_path, pattern="{scene}_{person}")
+    made = to_clips(whole(reader), body, "walk", "bvh", "train", "positions", Steps(trust_fps=True))
+    (clip,) = made.clips
+    found, wanted = body.joints(clip.scene)[0], body.joints(scene)[0]
+    shift = (found - wanted)[0, 0, 0]
+    assert (found - wanted - shift).norm(dim=-1).max() < 2e-4
+    assert "mean residual 0.0 cm" in made.notes[-1]
+
+
+# -- who and when ------------------------------------------------------------------------------
+
+
+def test_a_start_in_the_table_puts_people_beside_each_other_in_time(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", walk=walk())
+    (root / "people.csv").write_text("scene,person,file,role,start\nduo,a,walk_A.bvh,,0\nduo,b,walk_B.bvh,,0.1\n")
+    reader = BVHReader(root)
+    found, true = whole(reader, "duo"), walk()
+    assert (found.frames, found.persons) == (36, ("a", "b"))  # 12 frames at 120 fps later, to the end of the first
+    joints = list(found.joints)
+    np.testing.assert_allclose(found.positions[:, 0], true.positions[12:48, 0][:, joints], atol=1e-5)
+    np.testing.assert_allclose(found.positions[:, 1], true.positions[:36, 1][:, joints], atol=1e-5)
+    assert "unequal numbers of frames (a 36, b 48), cut to the shortest" in found.notes
+    (root / "people.csv").write_text("scene,file,start\nduo,walk_A.bvh,\nduo,walk_B.bvh,9\n")
+    with pytest.raises(DataError, match=r"walk_A\.bvh: people of duo never overlap.*mend the starts"):
+        whole(BVHReader(root), "duo")
+
+
+def test_files_of_different_rates_are_brought_together(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", walk=walk(48), slow=walk(24, 60.0))
+    (root / "slow_B.bvh").rename(root / "walk_B.bvh")
+    found, true = whole(BVHReader(root)), walk(45)
+    assert (found.fps, found.frames) == (30.0, 12)
+    np.testing.assert_allclose(found.positions, true.positions[::4][:, :, list(found.joints)], atol=2e-3)
+    assert "files of 60 and 120 frames a second, all brought to 30" in found.notes
+
+
+def test_people_alone_are_pointed_to_how_they_could_be_together(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", walk=walk(8))
+    (root / "walk_A.bvh").rename(root / "anna.bvh")
+    (root / "walk_B.bvh").rename(root / "ben_B.bvh")
+    reader = BVHReader(root)
+    assert any("no names tell who was recorded together" in line and "docs/own.md" in line for line in reader.summary())
+    assert "named like one of several people, but no other file goes with it" in whole(reader, "ben_B").notes
+    assert [take.name for take in BVHReader(root, pattern="{scene}n*_{person}").found()] == ["be"]
+
+
+# -- splits ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenes", [1, 2, 3])
+def test_few_scenes_are_split_in_time_and_no_frame_is_in_two_parts(scenes: int, tmp_path: Path) -> None:
+    assert scenes < FEW
+    root = written(tmp_path / "dl", **{f"walk{k}": walk(40 + k, seed=k) for k in range(scenes)})
+    reader = BVHReader(root)
+    for k in range(scenes):
+        parts = [reader.read(take) for take in reader.takes() if take.name.startswith(f"walk{k} ")]
+        joined = np.concatenate([part.positions for part in parts])
+        np.testing.assert_array_equal(joined, whole(reader, f"walk{k}").positions)
+        assert len(parts[0].positions) > len(joined) / 2
+    assert any("split in time" in line for line in reader.summary())
+
+
+@pytest.mark.parametrize("scenes", range(1, 8))
+def test_whole_scenes_leave_no_split_empty(scenes: int, tmp_path: Path) -> None:
+    for k in range(scenes):
+        (tmp_path / f"x{k}_A.bvh").touch()
+        (tmp_path / f"x{k}_B.bvh").touch()
+    reader = BVHReader(tmp_path, split="scenes")
+    splits = [take.split for take in reader.takes()]
+    assert set(splits) == set(("train", "test", "val")[:scenes])
+    assert splits.count("train") >= max(1, scenes // 2 - 1)
+
+
+# -- what is found in a file, and what a user knows better -------------------------------------
+
+
+def renamed(root: Path, change) -> None:
+    for path in root.glob("*.bvh"):
+        path.write_text(re.sub(r"(ROOT|JOINT) (\w+)", lambda match: f"{match[1]} {change(match[2])}", path.read_text()))
+
+
+def test_names_that_nobody_knows_are_mapped_by_a_file(tmp_path: Path) -> None:
+    from magnet.body.base import JOINT_NAMES
+
+    root = written(tmp_path / "dl", walk=walk(8))
+    bones = {named(joint): f"Bone{k}" for k, joint in enumerate(JOINT_NAMES)}
+    renamed(root, bones.__getitem__)
+    with pytest.raises(DataError, match=r"walk_A\.bvh: cannot tell which joint is left_hip.*--reader\.joints FILE"):
+        whole(BVHReader(root))
+    (tmp_path / "map.txt").write_text(
+        "".join(f"{joint} Bone{k}  # ours, theirs\n" for k, joint in enumerate(JOINT_NAMES))
+    )
+    found, true = whole(BVHReader(root, joints=tmp_path / "map.txt")), walk(8)
+    np.testing.assert_allclose(found.positions, true.positions[:, :, list(found.joints)], atol=1e-5)
+
+
+@pytest.mark.parametrize("line", ["left_hip", "hip Bone1", "left_hip A\nleft_hip B"])
+def test_a_line_that_maps_nothing_is_named(line: str, tmp_path: Path) -> None:
+    (tmp_path / "map.txt").write_text(line)
+    with pytest.raises(ValueError, match=r"map\.txt, line \d: got .*expected OUR_NAME THEIR_NAME"):
+        read_joints(tmp_path / "map.txt")
+
+
+def test_an_axis_that_the_user_says_is_held_against_the_motion(tmp_path: Path) -> None:
+    reader = BVHReader(written(tmp_path / "dl", walk=walk(8)))
+    error = convert(reader, reader.found()[0], load_body(), Steps(min_frames=1, up="+y")).error
+    assert error and "declared up axis is +y, but people stand along +z" in error
+
+
+def test_proportions_that_are_nobodys_are_refused_unless_they_are_asked_for(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", walk=walk(48))
+    for path in root.glob("*.bvh"):  # hands at the end of arms thrice as long
+        lines = path.read_text().splitlines()
+        for k, line in enumerate(lines):
+            if re.search(r"JOINT (lowerarm|hand)_", line):
+                words = lines[k + 2].split()
+                lines[k + 2] = " ".join([words[0], *(str(3 * float(x)) for x in words[1:])])
+        path.write_text("\n".join(lines) + "\n")
+    reader = BVHReader(root)
+    error = convert(reader, reader.found()[0], load_body(), Steps(min_frames=1)).error
+    assert error and re.search(r"mean error of [\d.]+ cm, expected at most 4\.0 cm; worst is \w+", error)
+    kept = BVHReader(root, worst_fit=0.3)
+    assert convert(kept, kept.found()[0], load_body(), Steps(min_frames=1, trust_fps=True)).error is None

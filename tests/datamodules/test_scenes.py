@@ -1,0 +1,197 @@
+"""A user's npz and pkl files of SMPL's family, and magnet's own scenes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from magnet.body import load_body
+from magnet.datamodules.common import Steps, to_clips
+from magnet.datamodules.fakes.motion import made_up_body, people
+from magnet.datamodules.prepare import prepare
+from magnet.datamodules.prepare_takes import Order
+from magnet.datamodules.recording import DataError
+from magnet.datamodules.scenes import ScenesReader
+from magnet.export.npz import save_smplx
+from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
+
+from .reading import Foreign, world_joints
+
+TRUE = people(40, 2, 30.0, 3)
+
+
+def plain(p: int) -> dict[str, Any]:
+    """One person as AMASS has them."""
+    poses = np.concatenate([TRUE.poses[:, p].reshape(-1, 66), np.zeros((TRUE.frames, 99))], axis=1)
+    return {"poses": poses, "trans": TRUE.transl[:, p], "betas": TRUE.betas[p], "mocap_framerate": 30.0}
+
+
+def apart(p: int) -> dict[str, Any]:
+    """Root and body by themselves, as joints."""
+    shown = TRUE.poses[:, p]
+    return {"global_orient": shown[:, :1], "body_pose": shown[:, 1:], "transl": TRUE.transl[:, p],
+            "betas": np.tile(TRUE.betas[p], (TRUE.frames, 1)), "fps": 30}  # fmt: skip
+
+
+def matrices(p: int) -> dict[str, Any]:
+    turned = Rotation.from_rotvec(TRUE.poses[:, p].reshape(-1, 3)).as_matrix().reshape(-1, 22, 3, 3)
+    return {**apart(p), "global_orient": turned[:, :1], "body_pose": turned[:, 1:]}
+
+
+def scaled(p: int) -> dict[str, Any]:
+    """As AIST++ has them."""
+    poses = np.concatenate([TRUE.poses[:, p].reshape(-1, 66), np.zeros((TRUE.frames, 6))], axis=1)
+    return {"smpl_poses": poses, "smpl_trans": 93.0 * TRUE.transl[:, p], "smpl_scaling": np.array([93.0]),
+            "betas": TRUE.betas[p], "fps": 30.0}  # fmt: skip
+
+
+def everybody(_: int) -> dict[str, Any]:
+    """Both in one file, people first."""
+    whole = [plain(0), plain(1)]
+    return {key: np.stack([one[key] for one in whole]) for key in ("poses", "trans", "betas")} | {"fps": 30.0}
+
+
+FORMS: dict[str, tuple[str, Callable[[int], Any], tuple[int, ...]]] = {
+    "npz, a person each": ("npz", plain, (0, 1)),
+    "npz, joints apart": ("npz", apart, (0, 1)),
+    "npz, matrices": ("npz", matrices, (0, 1)),
+    "npz, scaled": ("npz", scaled, (0, 1)),
+    "npz, people first": ("npz", everybody, (0,)),
+    "pkl, a person each": ("pkl", matrices, (0, 1)),
+    "pkl, by name": ("pkl", lambda _: {"anna": apart(0), "ben": plain(1), "fps": 30}, (0,)),
+    "pkl, a list": ("pkl", lambda _: [apart(0), plain(1)], (0,)),
+    "pkl, inside": ("pkl", lambda p: {"smpl": scaled(p), "notes": "x"}, (0, 1)),
+}
+
+
+def made() -> Scene:
+    """A scene of the open body's."""
+    return synthesize("follow", 2, 120, torch.Generator().manual_seed(1), load_body()).scene.cut(0, 40)
+
+
+def write(path: Path, held: Any) -> None:
+    if path.suffix == ".pkl":
+        path.write_bytes(pickle.dumps(held))
+    else:
+        np.savez(path, **held)
+
+
+def read(root: Path, **options: Any):
+    reader = ScenesReader(root, **options)
+    return reader.read(reader.found()[0])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_shows_the_same_joints(form: str, tmp_path: Path) -> None:
+    suffix, held, files = FORMS[form]
+    for p in files:
+        write(tmp_path / f"walk_{'AB'[p]}.{suffix}", held(p))
+    found = read(tmp_path)
+    assert (found.fps, found.up, found.frames, len(found.persons)) == (30.0, "+y", TRUE.frames, 2)
+    np.testing.assert_allclose(world_joints(found, "smplx"), TRUE.positions, atol=1e-5)
+
+
+def test_both_kinds_of_npz_that_magnet_writes_come_back(tmp_path: Path) -> None:
+    body = load_body()
+    scene = made()
+    wanted = body.joints(scene)[0]
+    for kind in ("scene", "smplx"):
+        (tmp_path / kind).mkdir()
+        if kind == "scene":
+            scene.save(tmp_path / kind / "walk.npz")
+        else:
+            save_smplx(scene, tmp_path / kind / "walk.npz", body)
+        found = read(tmp_path / kind)
+        clips = to_clips(found, body, "walk", "scenes", "train", "any", Steps(trust_fps=True))
+        joints = body.joints(clips.clips[0].scene)[0]
+        assert (joints - wanted - (joints - wanted)[0, 0, 0]).norm(dim=-1).max() < 2e-4, kind
+
+
+def test_without_a_body_file_the_open_body_dances_in_its_mean_shape_and_a_note_says_so(tmp_path: Path) -> None:
+    for p in (0, 1):
+        write(tmp_path / f"walk_{'AB'[p]}.npz", plain(p) | {"gender": "female"})
+    clips = to_clips(read(tmp_path), load_body(), "walk", "scenes", "train", "any", Steps())
+    assert not clips.clips[0].scene.betas.any()
+    assert any("in its mean shape: limbs are approximate without --body FILE" in note for note in clips.notes)
+    assert not any("female" in note for note in clips.notes)
+
+
+def damaged(change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    held = plain(0)
+    change(held)
+    return held
+
+
+REFUSED: dict[str, tuple[Any, str]] = {
+    "rate": (damaged(lambda h: h.pop("mocap_framerate")), r"says no frame rate .*give --reader\.fps, such as 30"),
+    "keys": ({"joints": np.zeros((3, 3))}, r"has neither poses nor root_orient and pose_body.*it has joints"),
+    "place": (damaged(lambda h: h.pop("trans")), r"lacks trans or transl; it has betas, mocap_framerate, poses"),
+    "lengths": (
+        damaged(lambda h: h.update(trans=h["trans"][:-1])),
+        r"unequal numbers of frames: rotations 40, translations 39",
+    ),
+    "NaN": (damaged(lambda h: h["poses"].__setitem__((3, 4), np.nan)), r"rotations hold NaN"),
+    "few": (
+        damaged(lambda h: h.update(poses=h["poses"][:, :40])),
+        r"rotations: got shape \(40, 40\), expected \(frames, 66",
+    ),
+    "code": (Foreign(), r"a pickle can run code"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_is_wrong_with_a_file_is_said_with_its_name(kind: str, tmp_path: Path) -> None:
+    held, message = REFUSED[kind]
+    write(tmp_path / "walk.pkl", held)
+    with pytest.raises(DataError, match=message) as caught:
+        read(tmp_path)
+    assert "walk.pkl" in str(caught.value)
+
+
+def test_a_rate_that_the_user_gives_stands_in_for_one_that_is_missing(tmp_path: Path) -> None:
+    write(tmp_path / "walk.pkl", REFUSED["rate"][0])
+    assert read(tmp_path, fps=25.0).fps == 25.0
+
+
+def test_several_scenes_in_one_file_are_refused_with_the_command_that_parts_them(tmp_path: Path) -> None:
+    made().repeat(2).save(tmp_path / "two.npz")
+    with pytest.raises(DataError, match=r"two\.npz: holds 2 scenes, expected one.*magnet export two\.npz"):
+        read(tmp_path)
+
+
+def test_shapes_of_another_body_are_refused(tmp_path: Path) -> None:
+    body = load_body()
+    made().replace(body="theirs").save(tmp_path / "walk.npz")
+    with pytest.raises(DataError, match=r"belong to body 'theirs', not to 'open-1'.*--body"):
+        to_clips(read(tmp_path), body, "walk", "scenes", "train", "any", Steps())
+
+
+def test_a_body_file_beside_the_scenes_is_no_scene(tmp_path: Path) -> None:
+    from magnet.datamodules.fakes.scenes import write as fake
+
+    fake(tmp_path, takes=3, frames=8)
+    assert [take.name for take in ScenesReader(tmp_path).found()] == ["amass1", "magnet3", "pickle2"]
+
+
+def test_shapes_of_another_family_than_the_bodys_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "walk.npz", scaled(0))  # SMPL's 72 numbers
+    body = made_up_body("smplx")
+    assert body.family == "smplx"
+    with pytest.raises(DataError, match=r"are SMPL's by the number of joints, but body .* is SMPL-X's: give that"):
+        to_clips(read(tmp_path), body, "walk", "scenes", "train", "any", Steps())
+    assert to_clips(read(tmp_path), made_up_body("smpl"), "walk", "scenes", "train", "any", Steps()).clips
+
+
+def test_scenes_are_prepared_without_a_body_file_too(tmp_path: Path) -> None:
+    for p in (0, 1):
+        write(tmp_path / f"walk_{'AB'[p]}.npz", plain(p))
+    order = Order("scenes", str(tmp_path), {"split": "scenes"}, "open", Steps())
+    assert prepare(order, tmp_path / "store").folder.manifest["body"]["id"] == load_body().id
