@@ -262,7 +262,7 @@ def test_a_plain_array_file_is_not_a_body(tmp_path):
 
 
 def test_no_file_says_what_to_give(tmp_path):
-    with pytest.raises(FileNotFoundError, match="give the path of a SMPL-X npz, or 'open'"):
+    with pytest.raises(FileNotFoundError, match="give the path of SMPL's or SMPL-X's npz or pkl, or 'open'"):
         load_body(tmp_path / "none.npz")
 
 
