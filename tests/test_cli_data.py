@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from magnet import cli, cli_data, cli_data_options
+from magnet.cli_data_shown import NOTES_SHOWN, show_notes
 from magnet.datamodules import catalogue
 
 
@@ -235,3 +236,43 @@ def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(cop
     assert cli.main(["data", "check", "dl", "--picture", "none", "--body", "dl/body.npz"]) == 1
     said = capsys.readouterr()
     assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out
+
+
+def test_the_store_may_be_named_last_in_place_of_out(made, tmp_path, capsys):
+    words = [
+        "data",
+        "prepare",
+        "dd100",
+        "--root",
+        str(made / "dl"),
+        "--body",
+        str(made / "dl/body.npz"),
+        "--limit",
+        "1",
+    ]
+    assert cli.main([*words, "--workers", "1", str(tmp_path / "store")]) == 0
+    assert (tmp_path / "store/manifest.json").is_file()
+    assert cli.main([*words, str(tmp_path / "store"), "--out", str(tmp_path / "other")]) == 2
+    assert "give one" in capsys.readouterr().err
+
+
+def test_of_notes_that_differ_in_numbers_alone_the_first_are_shown(capsys):
+    show_notes([f"off by {k / 10} cm (1 takes)" for k in range(NOTES_SHOWN + 3)] + ["another"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == NOTES_SHOWN + 2 and "note: another" in lines
+    assert lines[-1] == "  ... and 3 more like: off by # cm (# takes)"
+
+
+def test_a_folder_of_ones_own_is_recognised_by_its_files_and_a_wrong_table_is_named(tmp_path, capsys):
+    catalogue.find("scenes").load_fake()(tmp_path / "dl", 4, 40)
+    words = ["data", "check", str(tmp_path / "dl"), "--body", str(tmp_path / "dl/body.npz"), "--picture", "none"]
+    assert cli.main([*words, "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "Scenes of SMPL's family" in said and "amass1 (A, B)" in said
+    (tmp_path / "dl/people.csv").write_text("scene,file\ntango,gone.npz\n")
+    assert cli.main(words) == 2
+    assert "people.csv, line 2: gone.npz: no such file" in capsys.readouterr().err
+    (tmp_path / "dl/people.csv").unlink()
+    (tmp_path / "dl/more.bvh").touch()
+    assert cli.main(words) == 2
+    assert "could be bvh or scenes: say which with --name" in capsys.readouterr().err

@@ -179,12 +179,12 @@ def recognise(root: Path) -> str:
     """Which data set's layout lies under a folder.
 
     Raises:
-        ValueError: none does, or several do.
+        ValueError: none does, or several do, or a table of a user's own recordings is wrong.
     """
     found = _readable(root, [name for name in catalogue.NAMES if name not in catalogue.OWN])
     with suppress(OSError):
         found += ["cmu"] if CMU(str(root)).takes() else []
-    found = found or _readable(root, catalogue.OWN)
+    found = found or _own(root)
     if len(found) == 1:
         return found[0]
     if found:
@@ -202,6 +202,15 @@ def _readable(root: Path, names: Sequence[str]) -> list[str]:
         with suppress(ValueError, OSError):  # what this one lacks
             found += [name] if catalogue.find(name).load_reader()(root).found() else []
     return found
+
+
+def _own(root: Path) -> list[str]:
+    """Which of a user's own kinds of files there are. What is wrong with a table of them is raised."""
+    readers = []
+    for name in catalogue.OWN:
+        with suppress(ValueError, OSError):  # no such files
+            readers.append(catalogue.find(name).load_reader()(root))
+    return [reader.name for reader in readers if reader.found()]
 
 
 def check_download(

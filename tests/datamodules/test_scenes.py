@@ -13,12 +13,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from magnet.body import load_body
+from magnet.datamodules.check import check_store
 from magnet.datamodules.common import Steps, to_clips
 from magnet.datamodules.fakes.motion import made_up_body, people
 from magnet.datamodules.prepare import prepare
 from magnet.datamodules.prepare_takes import Order
+from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError
 from magnet.datamodules.scenes import ScenesReader
+from magnet.datamodules.store import SPLITS
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -195,3 +198,24 @@ def test_scenes_are_prepared_without_a_body_file_too(tmp_path: Path) -> None:
         write(tmp_path / f"walk_{'AB'[p]}.npz", plain(p))
     order = Order("scenes", str(tmp_path), {"split": "scenes"}, "open", Steps())
     assert prepare(order, tmp_path / "store").folder.manifest["body"]["id"] == load_body().id
+
+
+def test_a_scene_that_comes_later_leaves_the_prepared_ones_as_they_are(tmp_path: Path) -> None:
+    from magnet.datamodules.fakes.scenes import scenes, write_scenes
+
+    shown = scenes(6, 40, 0)
+    *first, last = shown
+    write_scenes(tmp_path / "dl", {name: shown[name] for name in first})
+    order = Order("scenes", str(tmp_path / "dl"), {}, str(tmp_path / "dl/body.npz"), Steps())
+    assert prepare(order, tmp_path / "store").made == 5
+    write_scenes(tmp_path / "dl", {last: shown[last]})
+    again = prepare(order, tmp_path / "store")
+    assert (again.made, again.kept) == (1, 5) and check_store(again.folder).problems == []
+    data = Prepared(root=str(tmp_path / "store"), body_model=order.body_file)
+    assert {clip.name for split in SPLITS for clip in data.clips(split)} == set(shown)
+
+
+def test_a_store_has_one_folder_by_either_name() -> None:
+    assert Prepared(root="here").path == Prepared(path="here").path == Prepared(path="here", root="here").path
+    with pytest.raises(ValueError, match="path here and root there are two names of one thing"):
+        Prepared(path="here", root="there")
