@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -97,6 +98,9 @@ TASK_GRIDS = (
 )
 """Long and short scenes of one to four agents, with a past and without, in strides, rolling and in pyramids."""
 
+POSED = 2
+"""How many of these poses are checked on, too, which takes a second each: enough to let the window move on."""
+
 
 def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = False) -> list[Grid]:
     """Check a task against the laws that every task obeys; for the tests of those who write tasks.
@@ -105,8 +109,9 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
     rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
     clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
     cannot influence the sample, nor can relations to it; what a stage hides from an agent cannot influence what the
-    stage makes of that agent, not by way of the others either; the same seed gives the same sample; and several
-    scenes in a batch are sampled as each would be alone.
+    stage makes of that agent, not by way of the others either; no pose depends on what is not known yet when it is
+    shown (`magnet.testing_poses.pose_law`); the same seed gives the same sample; and several scenes in a batch are
+    sampled as each would be alone.
 
     Args:
         task: the task with its options.
@@ -122,8 +127,11 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
         AssertionError: a law is broken; says which, on which grid, and where.
         ValueError: the task refuses one of the grids it was to be checked on, or all of `TASK_GRIDS`.
     """
+    from magnet.testing_poses import pose_law
+
     _check_record(task)
-    checked, refused = [], []
+    checked: list[Grid] = []
+    refused: list[str] = []
     for grid in TASK_GRIDS if grids is None else grids:
         try:
             schedule = task.schedule(grid)
@@ -137,6 +145,8 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
         _check_plan(task, grid, schedule)
         _check_samples(task, grid, schedule)
         _check_hidden(task, grid, schedule)
+        if grids is not None or len(checked) < POSED:
+            pose_law(task, grid)
         if nameless:
             renaming_law(task, task, grid, torch.arange(grid.agents).roll(1))
         checked.append(grid)
@@ -192,9 +202,9 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     _require(not left, f"{place}: (token, agent) {left[:1]} is left half denoised: end at 0 or stay at {LEVELS}")
     _require((schedule.finished & ~known).any(), f"{place}: nothing is generated")
     for number, stage in enumerate(schedule.stages):
-        width = stage.levels.shape[1]
+        width = stage.levels.shape[1] + stage.ahead
         _require(width <= grid.window, f"{place}: stage {number} is {width} tokens wide, the window {grid.window}")
-        shape = (grid.agents, width, grid.agents)
+        shape = (grid.agents, width - stage.ahead, grid.agents)
         fits = stage.hidden is None or tuple(stage.hidden.shape) == shape
         _require(fits, f"{place}: stage {number}: hidden is not of shape {shape}")
         if stage.hidden is not None:
@@ -203,12 +213,13 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
             _require(not blind.any(), f"{place}: stage {number}: hides from an agent what it generates of itself")
     again = task.schedule(grid)
     same = torch.equal(again.known, known) and len(again.stages) == len(schedule.stages)
+    same = same and (again.causal, again.lookahead) == (schedule.causal, schedule.lookahead)
     same = same and all(_same_stage(a, b) for a, b in zip(again.stages, schedule.stages, strict=True))
     _require(same, f"{place}: planned twice, the plans differ; a task must not draw random numbers")
 
 
 def _same_stage(a: Stage, b: Stage) -> bool:
-    if (a.hidden is None) != (b.hidden is None) or a.start != b.start:
+    if (a.hidden is None) != (b.hidden is None) or (a.start, a.ahead) != (b.start, b.ahead):
         return False
     hidden = a.hidden is None or b.hidden is None or torch.equal(a.hidden, b.hidden)
     return hidden and torch.equal(a.levels, b.levels)
@@ -292,7 +303,7 @@ def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
     _require(same, f"{place}: knows or generates other things for the slots they are in")
     for number, (stage, other) in enumerate(zip(first.stages, second.stages, strict=True)):
         hidden = None if stage.hidden is None else stage.hidden[order][:, :, order]
-        alike = _same_stage(other, Stage(stage.start, stage.levels[:, :, order], hidden))
+        alike = _same_stage(other, dataclasses.replace(stage, levels=stage.levels[:, :, order], hidden=hidden))
         _require(alike, f"{place}: stage {number} treats agents differently for the slots they are in")
     generator = torch.Generator().manual_seed(1)
     shape = (1, grid.tokens, grid.agents, layout.width)

@@ -13,6 +13,8 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, joined
 from magnet.partner import Partner
+from magnet.sampling.guidance import Guidance
+from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 
 FAST = SamplerOptions(steps=2)
@@ -87,11 +89,50 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(denoise
     assert (here.T_world_root - there.T_world_root).abs().max() < 1e-4
 
 
-def test_memory_of_the_past_does_not_grow(denoiser, duet):
+@pytest.mark.parametrize(
+    ("block", "options"),
+    [
+        (1, FAST),
+        (3, FAST),
+        (2, SamplerOptions(steps=2, guidance=Guidance("partner"))),
+        (1, SamplerOptions(steps=3, paste=False, eta=0.0, placement="integrate")),
+    ],
+    ids=["token by token", "three tokens", "guided", "bare"],
+)
+def test_answers_are_what_motion_control_gives_bit_for_bit(denoiser, block, options):
+    """Live and offline score the same: fed as it comes, or all known at once."""
+    scene, past = random_scene(2, 136, 3, torch.Generator().manual_seed(7)), 16
+    task, frames = MotionControl((0, 2), block), 136 - 16
+    whole = denoiser.generate(scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
+    partner = Partner(denoiser, scene.cut(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)
+    pieces = [4 * block * n for n in (1, 2)] * 40
+    fed, first = [], past
+    while first < scene.frames:
+        stop = first + min(pieces.pop(), scene.frames - first)
+        fed.append(partner.answer(scene.cut(first, stop)))
+        first = stop
+    live = joined(fed)
+    for name in ("body_rot", "T_world_root", "given"):
+        assert torch.equal(getattr(live, name), getattr(whole, name)[:, past:])
+
+
+def test_a_past_of_any_length_is_used_from_its_last_whole_tokens(denoiser, duet):
+    out = [
+        Partner(denoiser, duet.cut(first, 32), (0,), FAST, torch.Generator().manual_seed(0)).answer(duet.cut(32, 36))
+        for first in (2, 4)
+    ]
+    assert torch.equal(out[0].T_world_root, out[1].T_world_root)
+
+
+def test_memory_does_not_grow(denoiser, duet):
     partner = Partner(denoiser, duet.cut(0, 16), (0,), FAST, torch.Generator().manual_seed(0))
-    for _ in range(12):
+    held = []
+    for _ in range(60):
         partner.answer(duet.cut(16, 20))
-    assert partner.past.frames == 16
+        stream = partner._stream
+        held.append((partner.past.frames, stream.scene.frames, stream.tokens.shape[1], stream.veil.shape[1]))
+    assert held[-1] == held[-20] and max(held[-1]) < 100
+    assert torch.equal(partner.past.T_world_root[:, -4:, 1], duet.T_world_root[:, 16:20, 1])
 
 
 def test_what_cannot_be_answered_is_named(denoiser, duet):
@@ -106,6 +147,10 @@ def test_what_cannot_be_answered_is_named(denoiser, duet):
         Partner(denoiser, duet.cut(0, 16), (0, 1), FAST)
     with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 1"):
         Partner(denoiser, duet.cut(0, 16), (5,), FAST)
+    with pytest.raises(ValueError, match=r"multiple of 12: .* 3 are answered at a time"):
+        Partner(denoiser, duet.cut(0, 16), (0,), FAST, block=3).answer(duet.cut(16, 20))
+    with pytest.raises(ValueError, match="relation_noise='token': tokens of those who are given tell"):
+        Partner(tiny_denoiser(relation_noise="token"), duet.cut(0, 16))
 
 
 def test_a_loaded_model_gives_a_partner(denoiser, duet):

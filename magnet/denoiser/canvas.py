@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.denoiser.generation import reach
-from magnet.denoiser.seams import arrive, hold, joined, paste, step_between
+from magnet.denoiser.generation import reach, sight
+from magnet.denoiser.seams import arrive, hold, paste, step_between
+from magnet.denoiser.showing import seen
 from magnet.motion.frames import (
     Placement,
     canonical_frame,
@@ -25,7 +26,7 @@ from magnet.motion.frames import (
     shift_onto,
     to_9d,
 )
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, joined
 from magnet.motion.tokens import STRIDE, by_frame, by_token, relations_by_frame, relations_by_token
 from magnet.sampling.schedule import MaskSchedule
 
@@ -123,6 +124,8 @@ class Canvas:
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
+        self.causal, self._sight, self.released = schedule.causal, sight(schedule), 0
+        self.shown = 0  # rows of a causal plan whose bodies are final, and given from then on
 
     def extend(self, given: Scene, known: Tensor) -> None:
         """Take in more rows at the end. given (B, 4 n), known (n, P)"""
@@ -136,6 +139,7 @@ class Canvas:
         change must stay."""
         frames = rows * STRIDE
         self.rooted |= bool(self.known[:rows].any())
+        self.shown, self.released = max(self.shown - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
         self.T_world_can = self.T_world_can[:, frames:].clone()
         kept = self.given.cut(frames)
@@ -299,21 +303,22 @@ class Canvas:
     def _arrive(self, row: int, new: Tensor) -> Tensor:
         """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
 
-        Each agent's misfit is spread over its whole gap. Where nothing was known before, the world's origin
-        was arbitrary, and all who are there move along with the first who arrives.
+        Each agent's misfit is spread over its whole gap, or as much of it as has not been shown. Where nothing was
+        known before, the world's origin was arbitrary, and all who are there move along with the first who arrives.
         """
         moved = torch.zeros_like(self.placed)
-        arriving = self.known[row] & new if row < len(self.known) else torch.zeros_like(new)
+        arriving = self.known[row] & new & ~self._late(row) if row < len(self.known) else torch.zeros_like(new)
         if not bool(arriving.any()):
             return moved
         key = row * STRIDE
-        if not self.rooted and not bool(self.known[:row].any()):
+        if not self.rooted and not self.shown and not bool(self.known[:row].any()):
             self._root(key, arriving)
             moved[:row] |= self.placed[:row]
         for agent in arriving.nonzero()[:, 0].tolist():
             T_world_key = self.T_world_can[:, key, agent]
             key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
             gap = (self.placed & ~self.known)[:row, agent]
+            gap[: self.shown] = False  # too late to move
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
@@ -321,6 +326,13 @@ class Canvas:
             self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
             moved[start:row, agent] = True
         return moved
+
+    def _late(self, row: int) -> Tensor:
+        """Who is told of a known token only when the one before has been shown. -> (P,) bool"""
+        row += self.released
+        if not self.causal or not 0 < row < len(self._sight):
+            return torch.zeros_like(self.known[0])
+        return self._sight[row - 1] <= row
 
     def _root(self, key: int, arriving: Tensor) -> None:
         """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
@@ -331,7 +343,7 @@ class Canvas:
         path = self.T_world_can[scene, :key, lead]
         shift = T_world_key @ inverse(path[:, -1] @ step_between(path, key_step))
         shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
-        placed = self._by_frame(self.placed[: key // STRIDE])[..., None, None]
+        placed = self.by_frame(self.placed[: key // STRIDE])[..., None, None]
         now = self.T_world_can[:, :key]
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
@@ -339,8 +351,11 @@ class Canvas:
         """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
 
         `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
-        Poses depend on as many neighbouring rows as the decoder and the seams reach.
+        Poses depend on as many neighbouring rows as the decoder and the seams reach; those of causal plans on earlier
+        rows alone (`magnet.denoiser.showing`).
         """
+        if self.causal:
+            return seen(self, canvas, first, len(self.known) if stop is None else stop)
         layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.paste else 0
         stop = len(self.known) if stop is None else stop
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
@@ -353,11 +368,12 @@ class Canvas:
         T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
         decoded = posed(features[:, frames], T_world_can, given)
         if self.options.paste:
-            decoded = paste(decoded, given, T_world_can, self._by_frame(self.known[low:high]), self.options.blend)
+            decoded = paste(decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend)
         decoded = decoded.cut((first - low) * STRIDE, (stop - low) * STRIDE)
-        return hold(decoded, self._by_frame(self.placed[first:stop]), before)
+        return hold(decoded, self.by_frame(self.placed[first:stop]), before)
 
-    def _by_frame(self, rows: Tensor) -> Tensor:
+    def by_frame(self, rows: Tensor) -> Tensor:
+        """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""
         return rows.repeat_interleave(STRIDE, dim=0).to(self.given.device)
 
 

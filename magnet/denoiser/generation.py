@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -177,10 +178,16 @@ def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) 
 def sight(schedule: MaskSchedule) -> Tensor:
     """How far a known token's code may look ahead: up to which row, exclusive. -> (N, P) int
 
-    The first stage that hides what comes after a token settles it, as it would live: later frames of that agent do
-    not exist yet. N where no stage hides anything from everybody.
+    Without lookahead codes look to the end of the block that they are in, and those before the first block to where it
+    begins: so each is what it would be live, and is never encoded anew. In other plans the first stage that hides
+    what comes after a token settles it. N where no stage hides anything from everybody.
     """
     cuts = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
+    if not schedule.lookahead:
+        edges = sorted({edge for stage in schedule.stages for edge in stage.active})
+        for first, last in itertools.pairwise([0, *edges, schedule.tokens]):
+            cuts[first:last] = last
+        return cuts
     done = [0] * schedule.agents
     for stage in schedule.stages:
         if stage.hidden is None:
@@ -189,6 +196,9 @@ def sight(schedule: MaskSchedule) -> Tensor:
         for agent in gone.any(dim=0).nonzero()[:, 0].tolist():
             cut = stage.start + int(gone[:, agent].int().argmax())
             cuts[done[agent] : cut, agent] = cut
+            if not done[agent]:
+                begins = min(stage.active[0], cut)
+                cuts[:begins, agent] = begins
             done[agent] = max(done[agent], cut)
     return cuts
 

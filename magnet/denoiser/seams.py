@@ -9,6 +9,10 @@ from torch import Tensor
 from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar, turn
 from magnet.motion.scene import Scene, joined
 
+SPRING = 2.5
+"""How fast `go_on` fades, against the frames over which a seam is to: the slower, the smoother, and the longer feet
+slide that the decoder had put elsewhere. With `blend` 10 a difference is halved in 7 frames."""
+
 
 def smoothstep(ramp: Tensor) -> Tensor:
     """0 to 1 with no speed at either end. ramp in 0..1"""
@@ -108,6 +112,62 @@ def paste(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend
     return decoded.replace(
         body_rot=torch.where(keep[..., None, None, None], given.body_rot, body_rot),
         T_world_root=torch.where(keep[..., None, None], given.T_world_root, blended),
+    )
+
+
+def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
+    """How much of a seam's difference, and of its growth by a frame, is still added behind it.
+
+    A critically damped spring: from where and as fast as the difference was, (1 + r t) exp(-r t) and t exp(-r t) with
+    r = `SPRING` / blend. Its growth is known where the frame before the last known one is known too.
+    (T, P) bool -> (T, P) twice
+    """
+    frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
+    after = keep.int().cummax(dim=0).values.bool()
+    last = last_known(keep)
+    grows = after & (last > 0) & keep.gather(0, (last - 1).clamp_min(0))
+    since = (frame - last).float()
+    rate = SPRING / blend if blend else torch.inf
+    left = torch.where(since > 0, torch.exp(-rate * since.clamp_min(1)), 1.0)
+    stays = torch.where(since > 0, (1 + min(rate, 1e9) * since) * left, 1.0)
+    return torch.where(after, stays, 0.0), torch.where(grows, since * left, 0.0)
+
+
+def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
+    """Put given frames back, and go on from them smoothly into what is decoded; nothing in front of a seam changes.
+
+    Unlike with `paste`, poses go on as fast as they were moving: seams come with each block of a causal plan, where
+    faded differences alone would jerk.
+
+    Args:
+        decoded: (B, T, P) bodies.
+        given: (B, T, P) what is known or has been shown.
+        T_world_can: (B, T, P, 4, 4) where everybody stands.
+        keep: (T, P) bool, known frames.
+        blend: frames over which a seam fades out.
+    """
+    T_can_world = inverse(T_world_can)
+    decoded_can_root, given_can_root = T_can_world @ decoded.T_world_root, T_can_world @ given.T_world_root
+    tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
+    turns = roma.rotmat_to_rotvec(given_can_root[..., :3, :3] @ tilt.transpose(-1, -2))
+    bends = roma.rotmat_to_rotvec(given.body_rot @ decoded.body_rot.transpose(-1, -2))
+    moves = given_can_root[..., :3, 3] - lift
+    last, agents = last_known(keep), torch.arange(keep.shape[1], device=keep.device)
+    before, (stays, grows) = (last - 1).clamp_min(0), spring_weights(keep, blend)
+
+    def left(difference: Tensor) -> Tensor:
+        """What is left of a difference (B, T, P, ...) that was at the last known frame."""
+        at = difference[:, last, agents]
+        shape = (*keep.shape, *[1] * (difference.dim() - 3))
+        return stays.view(shape) * at + grows.view(shape) * (at - difference[:, before, agents])
+
+    body_rot = roma.rotvec_to_rotmat(left(bends)) @ decoded.body_rot
+    can_root = rigid(roma.rotvec_to_rotmat(left(turns)) @ tilt, lift + left(moves))
+    there = decoded.present[:, None, :, None, None]
+    T_world_root = torch.where(there, T_world_can @ can_root, decoded.T_world_root)
+    return decoded.replace(
+        body_rot=torch.where(keep[..., None, None, None], given.body_rot, body_rot),
+        T_world_root=torch.where(keep[..., None, None], given.T_world_root, T_world_root),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -22,12 +21,14 @@ from magnet.denoiser.generation import (
     task_sight,
 )
 from magnet.denoiser.inputs import check_given, check_request
+from magnet.denoiser.plan import endless, planned
+from magnet.denoiser.showing import Expected, own_view, show
 from magnet.denoiser.transformer import without_dropout
 from magnet.motion.scene import Scene, joined
 from magnet.motion.tokens import STRIDE
-from magnet.sampling.noise import NoiseStream
+from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.sampler import begin, run_stages
-from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
 
 if TYPE_CHECKING:
@@ -112,8 +113,10 @@ class Stream:
     """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
 
     The rows held are [first, stop): `tokens` and `veil` (B, n, P, D), the `history` of a multistep solver, and the
-    world in `canvas`.
+    world in `canvas`. `there` is how many rows there are so far of what is given.
     """
+
+    fed = False
 
     def __init__(
         self,
@@ -143,7 +146,7 @@ class Stream:
         grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
         self.rows: float = grid.tokens
         if frames is None:
-            schedule, self.plan = endless(task, grid, layout.agents)
+            schedule, self.plan = endless(task, grid, layout.agents, self.fed)
             self.rows = torch.inf
         else:
             schedule = task.schedule(grid).padded(layout.agents)
@@ -164,7 +167,10 @@ class Stream:
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
         self.health.begin(B)
         self.first = self.stop = 0
-        self.canvas = Canvas(model, scrub(self.scene, self.known, 0, 0), schedule, o, samples, self.health)
+        self.there: float = self.rows
+        self.reached = 0  # one past the last row that has been generated
+        self.expected = Expected(reach(model)[1])
+        self.canvas = Canvas(model, self._given(0, 0), schedule, o, samples, self.health)
         self.tokens, self.veil = self.noise.rows(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         kind = model.device.type
@@ -173,19 +179,44 @@ class Stream:
     def pieces(self) -> Iterator[Scene]:
         """Everything, piece by piece."""
         start, before = 0, None
-        for stage, final in self.plan:
+        for stage, final, needed in self.plan:
             if stage is not None:
                 self._run(stage)
-            while start < self.rows and final >= min(start + self.piece + self._margins[1], self.rows):
-                stop = int(min(start + self.piece, self.rows))
-                made = self._decoded(start, stop, before)
-                yield made if self.frames is None else made.cut(0, self.frames - start * STRIDE)
-                start, before = stop, made.cut(made.frames - 1)
+            for ready in self._ready(final):
+                while start < self.rows and ready >= min(start + self.piece, self.rows):
+                    stop = int(min(start + self.piece, self.rows))
+                    made = self._decoded(start, stop, before, needed)
+                    yield made if self.frames is None else made.cut(0, self.frames - start * STRIDE)
+                    start, before = stop, made.cut(made.frames - 1)
+
+    def _ready(self, final: int) -> Iterator[float]:
+        """Rows before which bodies can be handed out, given those before which nothing is generated or moved again.
+
+        Bodies of causal plans are made here, block by block, as they are live.
+        """
+        if not self.canvas.causal:
+            yield self.rows if final >= self.rows else final - self._margins[1]
+            return
+        for end in (min(self.reached, final), final):
+            while (shown := self.first + self.canvas.shown) < end:
+                yield self._show(min(shown + PIECE, end), end)
+
+    @torch.no_grad()
+    def _show(self, stop: int, end: int) -> int:
+        """Settle the bodies up to row `stop`, of which those before `end` are finished. Returns `stop`."""
+        near = min(stop + reach(self.model)[1], end)
+        with torch.autocast(self._autocast[0], enabled=False):
+            self._bring_in(near)
+            expected = self.expected.behind(end) if near == end else None
+            show(self.canvas, self.tokens, stop - self.first, near - self.first, expected)
+        return stop
 
     @property
     def _margins(self) -> tuple[int, int]:
         """Rows before and after a piece that its poses depend on: by its seams, which depend on their neighbours."""
         before, after = reach(self.model)
+        if self.canvas.causal:
+            return before + 2, 0
         seam = -(-self.options.blend // STRIDE) if self.options.paste else 0
         return before + seam + 1, after + seam
 
@@ -193,6 +224,7 @@ class Stream:
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
+        self._ahead = stage.ahead
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the step into the token behind the window is written too
             self.tokens = run_stages(
@@ -209,20 +241,29 @@ class Stream:
                 self.first,
                 self.history,
             )
+        self.reached = max(self.reached, stage.active[1])
+        if self.canvas.causal and self.expected.most:
+            self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.health.add_call(len(noisy))
+        width = noisy.shape[1]
+        # What lies ahead is nobody's: it is shown as the mean of pure noise, which tells nothing of anybody.
+        noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
+        levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
-            return self.model.denoise(noisy, levels, present).float()
+            clean = self.model.denoise(noisy, levels, present).float()
+        self._clean = clean.detach()
+        return clean[:, :width]
 
     @torch.no_grad()
-    def _decoded(self, start: int, stop: int, before: Scene | None) -> Scene:
-        """Bodies of rows [start, stop), which are final; rows that no later piece needs are let go."""
+    def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
+        """Bodies of rows [start, stop), which are final; rows that no later piece or stage needs are let go."""
         behind, ahead = self._margins
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(stop + ahead)
             made = self.canvas.scene(self.tokens, start - self.first, stop - self.first, before)
-        surplus = stop - behind - self.first
+        surplus = min(stop - behind, needed - 1) - self.first
         if surplus > 0:
             self.canvas.release(surplus)
             self.tokens, self.veil = self.tokens[:, surplus:].clone(), self.veil[:, surplus:].clone()
@@ -234,12 +275,12 @@ class Stream:
     def _bring_in(self, stop: int) -> None:
         """Bring in rows, whole pieces at a time, until those before `stop` are held."""
         behind, ahead = reach(self.model)
-        while self.stop < min(stop, self.rows):
-            last = int(min(self.stop + self.piece, self.rows))
+        while self.stop < min(stop, self.there):
+            last = int(min(self.stop + self.piece, self.there))
             # What is known is encoded with all the neighbours that its codes can depend on.
-            low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.rows))
+            low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
             known = self._known(low, high)
-            given = scrub(self.scene, self.known, low, high)
+            given = self._given(low, high)
             related = None if self.related is None else scrub(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
             tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
@@ -251,6 +292,10 @@ class Stream:
             self.veil = torch.cat([self.veil, veil], dim=1)
             self.canvas.extend(given.cut(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last
+
+    def _given(self, low: int, high: int) -> Scene:
+        """Rows [low, high) of the recording, as far as they are known."""
+        return scrub(self.scene, self.known, low, high)
 
     def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
         """How far the codes of some of the rows [low, high) look ahead, counted from `low`; 0 for the others."""
@@ -274,89 +319,3 @@ def whole_tokens(scene: Scene, frames: int) -> Scene:
     frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)
     valid = None if scene.valid is None else scene.valid[:, frame]
     return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=valid)
-
-
-# -- the plan ----------------------------------------------------------------------------------
-
-Plan = Iterator[tuple[Stage | None, float]]
-"""Stages in their order, each with the row before which nothing changes any more; None before the first."""
-
-
-def planned(schedule: MaskSchedule) -> Plan:
-    """The stages of a schedule."""
-    lowest = [*lows(schedule), schedule.tokens]
-    final = list(itertools.accumulate(reversed(lowest), min))[::-1]
-    yield None, final[0]
-    for number, stage in enumerate(schedule.stages):
-        yield stage, final[number + 1]
-
-
-def lows(schedule: MaskSchedule) -> list[int]:
-    """For each stage the first row that it may change: its window's, or the first of a gap that it closes.
-
-    An agent that arrives at a keyframe is moved since its last known row (see `Canvas`); where nobody was known
-    before, everybody moves along.
-    """
-    known = schedule.known
-    row = torch.arange(schedule.tokens)[:, None]
-    gap = torch.where(known, row, -1).cummax(dim=0).values + 1
-    gap[known.any(dim=1).cumsum(dim=0) == 0] = 0
-    arrives = torch.nn.functional.pad(known, (0, 0, 0, 1))[1:]
-    found = []
-    for stage in schedule.stages:
-        window = slice(stage.start, stage.stop)
-        closes = arrives[window] & (stage.levels[-1] == 0) & (stage.levels[0] > 0)
-        found.append(min([stage.start, *gap[window][closes].tolist()]))
-    return found
-
-
-def endless(task: Task, grid: Grid, slots: int) -> tuple[MaskSchedule, Plan]:
-    """The beginning of a scene without end, and its plan: that of a long scene, the end of which is repeated.
-
-    `slots` are the model's, free ones included.
-
-    Raises:
-        ValueError: the plan depends on the scene's end, or does not repeat itself.
-    """
-    long, longer = (
-        task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
-        for windows in (6, 7)
-    )
-    name = type(task).__name__
-    if bool(longer.known[grid.context :].any()):
-        raise ValueError(f"{name} is given something after the context, so it has an end: say how many frames")
-    pairs = itertools.takewhile(lambda pair: _moved(*pair) == 0, zip(long.stages, longer.stages, strict=False))
-    stages = [stage for stage, _ in pairs]
-    for period in range(1, len(stages) // 3 + 1):
-        late = stages[-2 * period :]
-        shift = late[period].start - late[0].start
-        earlier = stages[-3 * period : -period]
-        if shift > 0 and all(_moved(*pair) == shift for pair in zip(earlier, late, strict=True)):
-            return long, _repeated(stages, period, shift)
-    raise ValueError(f"{name}: its plan does not repeat itself, so it needs an end: say how many frames")
-
-
-def _repeated(stages: list[Stage], period: int, shift: int) -> Plan:
-    """Some stages, of which the last `period` then follow again and again, `shift` rows further on each time."""
-    rounds = (
-        dataclasses.replace(stage, start=stage.start + number * shift)
-        for number in itertools.count(1)
-        for stage in stages[-period:]
-    )
-    everything = itertools.chain(stages, rounds)
-    coming = list(itertools.islice(everything, len(stages) + period))
-    yield None, min(stage.start for stage in coming)
-    while True:
-        stage = coming.pop(0)
-        yield stage, min(later.start for later in coming[: len(stages) + period])
-        coming.append(next(everything))
-
-
-def _moved(a: Stage, b: Stage) -> int | None:
-    """By how many rows b is a, further on; None if it is something else."""
-    alike = a.levels.shape == b.levels.shape and torch.equal(a.levels, b.levels)
-    if a.hidden is None or b.hidden is None:
-        alike = alike and a.hidden is b.hidden
-    else:
-        alike = alike and torch.equal(a.hidden, b.hidden)
-    return b.start - a.start if alike else None

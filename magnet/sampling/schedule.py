@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,6 +17,9 @@ from magnet.sampling.plans import changing, initial_levels, levels_at, runs, tok
 
 __all__ = ["Grid", "MaskSchedule", "Stage", "initial_levels", "window_positions"]
 
+AHEAD = 3
+"""Token steps of pure noise behind a block, where there is room: with none, motion is a fifth slower."""
+
 
 @dataclass(frozen=True, eq=False)
 class Stage:
@@ -28,15 +32,25 @@ class Stage:
         hidden: (P, W, P) bool or None. hidden[p, i, q]: while agent p's tokens are updated, the model must
             not see agent q's token i. None: everybody sees everything. Where agents see different
             things each is updated from a view of its own; views run as one batch.
+        ahead: token steps behind the window that the model is shown as pure noise, nobody's: trained on windows that
+            go on, it slows people down where a window ends. They need not be there, so a plan can be the same
+            wherever its scene ends. What the model expects there closes the poses of causal plans.
     """
 
     start: int
     levels: Tensor
     hidden: Tensor | None = None
+    ahead: int = 0
 
     @property
     def stop(self) -> int:
         return self.start + self.levels.shape[1]
+
+    @property
+    def active(self) -> tuple[int, int]:
+        """The token steps that this stage changes, from the first to one past the last; (stop, stop): none."""
+        rows = (self.levels[0] != self.levels[-1]).any(dim=1).nonzero()[:, 0]
+        return (self.start + int(rows[0]), self.start + int(rows[-1]) + 1) if len(rows) else (self.stop, self.stop)
 
     @property
     def apart(self) -> bool:
@@ -52,7 +66,7 @@ class Stage:
         if hidden is not None and extra:
             hidden = torch.nn.functional.pad(hidden, (0, extra))
             hidden = torch.cat([hidden, hidden[:1].expand(extra, -1, -1)])  # nobody's view: one that is there already
-        return Stage(self.start, levels, hidden)
+        return dataclasses.replace(self, levels=levels, hidden=hidden)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +77,13 @@ class MaskSchedule:
     to the next; a column starts either clean (known) or at K (unknown); each denoising step changes
     something.
 
+    Attributes:
+        known: (N, P) bool, given by the task; everything else starts as pure noise.
+        lookahead: False: what is given after the token steps that a stage generates has not happened yet by then, so
+            that no code of what came before looks there either.
+        causal: poses are shown as soon as their tokens are finished, and nothing that is generated or given later
+            changes them. Always so where a stage hides something, or without `lookahead`.
+
     Raises:
         ValueError: a law is broken; names the stage, step, token and agent.
     """
@@ -70,9 +91,13 @@ class MaskSchedule:
     tokens: int
     agents: int
     stages: tuple[Stage, ...]
-    known: Tensor  # (N, P) bool: given by the task; everything else starts as pure noise
+    known: Tensor
+    lookahead: bool = True
+    causal: bool = False
 
     def __post_init__(self) -> None:
+        hides = not self.lookahead or any(stage.hidden is not None for stage in self.stages)
+        object.__setattr__(self, "causal", self.causal or hides)
         if tuple(self.known.shape) != (self.tokens, self.agents):
             raise ValueError(f"known: got {tuple(self.known.shape)}, expected {(self.tokens, self.agents)}")
         level = initial_levels(self.known)
@@ -108,7 +133,8 @@ class MaskSchedule:
     def padded(self, agents: int) -> MaskSchedule:
         """The same plan with free slots behind, of which nothing is known and nothing generated."""
         known = torch.nn.functional.pad(self.known, (0, agents - self.agents))
-        return MaskSchedule(self.tokens, agents, tuple(stage.padded(agents) for stage in self.stages), known)
+        stages = tuple(stage.padded(agents) for stage in self.stages)
+        return dataclasses.replace(self, agents=agents, stages=stages, known=known)
 
     @property
     def evaluations(self) -> int:
@@ -230,6 +256,10 @@ class MaskSchedule:
         whoever is denoised beside it, however noisy. With nobody `unseen` this samples the joint distribution of the
         block, whatever the delays: by the chain rule where an agent waits until the one before is done.
 
+        A plan in which somebody is unseen, delayed or without lookahead is `causal`. Windows end with the block, or
+        with what is given within sight of it, and pure noise lies ahead: so the plan of what comes first is the same
+        however long the scene.
+
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated.
@@ -248,14 +278,16 @@ class MaskSchedule:
                 "be half made up by then; leave rolling out"
             )
         require_whole("block", block, 1, grid.window)
+        causal = unseen is not None or delay is not None
         delay = torch.zeros(grid.agents, dtype=torch.long) if delay is None else delay
         plan = token_levels(grid)
         starts = [*delay.unique().tolist(), grid.steps + int(delay.max())]
         level, stages = initial_levels(known), []
         for first, last in runs(target, block):
-            past = grid.window - grid.stride
-            start = max(0, min(first - past, grid.tokens - grid.window), last - grid.window)
-            stop = min(start + grid.window, grid.tokens)
+            ahead = min(max(grid.stride - 1, AHEAD), (grid.window - last + first) // 2)
+            start = max(0, last + ahead - grid.window)
+            given = known[last : start + grid.window].any(dim=1).nonzero()[:, 0]
+            stop = last + int(given[-1]) + 1 if lookahead and len(given) else last
             now = slice(first - start, last - start)
             active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
             active[now] = target[first:last]
@@ -267,10 +299,9 @@ class MaskSchedule:
                 hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
                 if unseen is not None:
                     hidden[:, now] = unseen[:, None]
-                if not lookahead:
-                    hidden[:, last - start :] = True
                 hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
                 hidden |= active & (rows[-1] == LEVELS)
-                stages.append(Stage(start, rows.short(), hidden if hidden.any() else None))
+                ahead = start + grid.window - stop
+                stages.append(Stage(start, rows.short(), hidden if hidden.any() else None, ahead))
                 level[start:stop] = rows[-1]
-        return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
+        return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known, lookahead, causal)

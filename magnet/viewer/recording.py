@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_whole
+from magnet.denoiser.showing import own_view
 from magnet.denoiser.stream import Stream
 from magnet.files import load_npz
 from magnet.motion.scene import Scene, joined, require_rate
@@ -203,19 +204,6 @@ class RecordedStream(Stream):
         self.starts.append(stage.start * STRIDE)
         wanted = stage.levels[-1] < LEVELS  # the others stay unknown
         self.windows.append(preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted, stage.apart))
-
-
-def own_view(clean: Tensor, stage: Stage) -> Tensor:
-    """What each agent's own view expects of its tokens, guidance left out. (rows, W, P, D) -> (1, W, P, D)
-
-    A step's views and the branches of guidance run as one batch, views first; the first branch is the unguided one.
-    """
-    if stage.hidden is None:
-        return clean[:1]
-    views, view_of = stage.hidden.unique(dim=0, return_inverse=True)
-    each = clean.unflatten(0, (len(views), -1))[:, 0]  # (V, W, P, D)
-    agent = torch.arange(clean.shape[2])
-    return each[view_of, :, agent].transpose(0, 1)[None]
 
 
 def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, apart: bool = False) -> Scene:

@@ -49,7 +49,7 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     views = {len(stage.hidden.unique(dim=0)) if stage.hidden is not None else 1 for stage in schedule.stages}
     assert health.evaluations <= schedule.evaluations * max(views)
     assert made.agents == 4 and torch.equal(made.present, torch.tensor([[True, True, False, False]]))
-    if name == "motion_control":  # what is given is encoded otherwise there, see test_sight
+    if schedule.causal:  # shown block by block, see test_showing
         return
     padded = schedule.padded(4)
     given = scrub(scene.pad_agents(4), padded.known)

@@ -7,8 +7,9 @@ import torch
 
 from magnet.denoiser.canvas import Canvas, Health
 from magnet.denoiser.generation import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
+from magnet.denoiser.plan import endless, lows
 from magnet.denoiser.seams import joined
-from magnet.denoiser.stream import Stream, endless, lows
+from magnet.denoiser.stream import Stream
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream
@@ -20,6 +21,7 @@ from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing_poses import blocks_of
 from magnet.tokenizer.module import Tokenizer
 
 FAST = SamplerOptions(steps=2, stride=2)
@@ -82,7 +84,12 @@ def same(a: Scene, b: Scene) -> bool:
 # -- the same scene ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "piece"), [*((name, 3) for name in TASKS), ("joint_future", 8), ("some end", 64)])
+CAUSAL = ("motion_control", "agentic_sync", "agentic_async", "blocks", "turns")
+
+
+@pytest.mark.parametrize(
+    ("name", "piece"), [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
+)
 def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
     context = context_of(name)
     frames = 4 * TOKENS - context - 3
@@ -91,6 +98,33 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
     whole = joined(pieces)
     assert whole.frames == context + frames
     assert close(at_once(model, recording, TASKS[name], context, frames, FAST), whole)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(model, recording, name):
+    """Nor on when rows are let go: one piece holds them all."""
+    whole, pieces, rows = (
+        joined(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, piece))) for piece in (64, 5, 1)
+    )
+    assert same(whole, pieces) and same(whole, rows)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_the_same_happens_however_long_a_causal_scene_goes_on(model, recording, name):
+    """Live, nobody knows where it ends."""
+    long, short = (joined(list(streamed(model, recording, TASKS[name], 8, frames, 64))) for frames in (160, 96))
+    assert same(long.cut(0, short.frames), short)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model, recording, name):
+    done: list[int] = []
+    pieces = model.stream(recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, piece=1)
+    blocks = list(blocks_of(TASKS[name].schedule(planning_grid(26, 3, 2, 8, FAST))))
+    for row in range(26):
+        next(pieces)
+        needed = [stages for stages, end in blocks if end <= row] + [b for b, end in blocks if end > row][: row >= 2]
+        assert len(done) == sum(len(stage.levels) - 1 for stages in needed for stage in stages)
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def test_a_long_schedule_stays_readable(tmp_path: Path) -> None:
 def test_plain_characters_are_ascii() -> None:
     text = schedule_text(plan("agentic_async", offset=0.5), 80, colour=False).plain
     assert text.isascii()
-    assert text.splitlines()[0].split("A")[1].split() == ["o", "o", "o", "9", "9", "9", ".", ".", "."]
+    assert text.splitlines()[0].split("A")[1].split() == ["o", "o", "o", "9", ".", ".", ".", ".", "."]
 
 
 def test_mistakes_are_named(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_joint_future_needs_a_past():
 
 # -- what is hidden stays hidden ---------------------------------------------------------------
 
-HIDING = ("agentic_async", "agentic_sync", "motion_control")
+HIDING = ("agentic_async", "agentic_sync")
 
 
 @pytest.mark.parametrize("name", HIDING)

@@ -1,0 +1,122 @@
+"""The order in which a scene is made: a task's stages, and from when on which rows (token steps) are final."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+
+if TYPE_CHECKING:
+    from magnet.tasks.base import Task
+
+
+class Turn(NamedTuple):
+    """A stage, and what holds once it has run."""
+
+    stage: Stage | None  # None before the first
+    final: int  # rows before this one are never generated or moved again
+    needed: int  # rows before this one are never shown to the model again
+
+
+Plan = Iterator[Turn]
+
+
+def planned(schedule: MaskSchedule) -> Plan:
+    """The stages of a schedule."""
+    stages, end = schedule.stages, schedule.tokens
+    if schedule.causal:  # what has been shown is not moved, whatever it leads to
+        needed, final = (least(rows, end) for rows in ([s.start for s in stages], [s.active[0] for s in stages]))
+    else:
+        needed = final = least(lows(schedule), end)
+    for stage, *rows in zip((None, *stages), final, needed, strict=True):
+        yield Turn(stage, *rows)
+
+
+def least(rows: Sequence[int], end: int) -> list[int]:
+    """The least of all rows from each on, and `end` behind them. (S) -> (S + 1)"""
+    return list(itertools.accumulate(reversed([*rows, end]), min))[::-1]
+
+
+def lows(schedule: MaskSchedule) -> list[int]:
+    """For each stage the first row that it may change: its window's, or the first of a gap that it closes.
+
+    An agent that arrives at a keyframe is moved since its last known row (see `Canvas`); where nobody was known
+    before, everybody moves along.
+    """
+    known = schedule.known
+    row = torch.arange(schedule.tokens)[:, None]
+    gap = torch.where(known, row, -1).cummax(dim=0).values + 1
+    gap[known.any(dim=1).cumsum(dim=0) == 0] = 0
+    arrives = torch.nn.functional.pad(known, (0, 0, 0, 1))[1:]
+    found = []
+    for stage in schedule.stages:
+        window = slice(stage.start, stage.stop)
+        closes = arrives[window] & (stage.levels[-1] == 0) & (stage.levels[0] > 0)
+        found.append(min([stage.start, *gap[window][closes].tolist()]))
+    return found
+
+
+def endless(task: Task, grid: Grid, slots: int, fed: bool = False) -> tuple[MaskSchedule, Plan]:
+    """The beginning of a scene without end, and its plan: that of a long scene, the end of which is repeated.
+
+    `slots` are the model's, free ones included. `fed`: what the task is given after the context comes as it happens.
+
+    Raises:
+        ValueError: the plan depends on the scene's end, or does not repeat itself; or what would be fed is read ahead.
+    """
+    long, longer = (
+        task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
+        for windows in (6, 7)
+    )
+    name = type(task).__name__
+    later = longer.known[grid.context :]
+    if bool(later.any()) and not fed:
+        raise ValueError(f"{name} is given something after the context, so it has an end: say how many frames")
+    if bool(later.any()) and (longer.lookahead or bool((later != later[0]).any())):
+        raise ValueError(f"{name}: what it is given later cannot be fed as it happens, for it is read ahead")
+    pairs = itertools.takewhile(lambda pair: _moved(*pair) == 0, zip(long.stages, longer.stages, strict=False))
+    stages = [stage for stage, _ in pairs]
+    for period in range(1, len(stages) // 3 + 1):
+        late = stages[-2 * period :]
+        shift = late[period].start - late[0].start
+        earlier = stages[-3 * period : -period]
+        if shift > 0 and all(_moved(*pair) == shift for pair in zip(earlier, late, strict=True)):
+            return long, _repeated(stages, period, shift, long.causal)
+    raise ValueError(f"{name}: its plan does not repeat itself, so it needs an end: say how many frames")
+
+
+def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Plan:
+    """Some stages, of which the last `period` then follow again and again, `shift` rows further on each time."""
+    begun = [(stage, stage.active[0]) for stage in stages]
+    rounds = (
+        (dataclasses.replace(stage, start=stage.start + number * shift), first + number * shift)
+        for number in itertools.count(1)
+        for stage, first in begun[-period:]
+    )
+    everything = itertools.chain(begun, rounds)
+    coming = list(itertools.islice(everything, len(stages) + period))
+
+    def turn(stage: Stage | None) -> Turn:
+        needed = min(each.start for each, _ in coming)
+        return Turn(stage, min(first for _, first in coming) if causal else needed, needed)
+
+    yield turn(None)
+    while True:
+        stage, _ = coming.pop(0)
+        yield turn(stage)
+        coming.append(next(everything))
+
+
+def _moved(a: Stage, b: Stage) -> int | None:
+    """By how many rows b is a, further on; None if it is something else."""
+    alike = a.ahead == b.ahead and a.levels.shape == b.levels.shape and torch.equal(a.levels, b.levels)
+    if a.hidden is None or b.hidden is None:
+        alike = alike and a.hidden is b.hidden
+    else:
+        alike = alike and torch.equal(a.hidden, b.hidden)
+    return b.start - a.start if alike else None
