@@ -225,9 +225,9 @@ def test_rows_may_come_and_go_between_stages(name):
     held, first = start[:, :0], 0
     history, out = History.empty(held), start.clone()
     for stage in schedule.stages:
-        gone, last = stage.start - first, first + held.shape[1]
-        held, history, first = held[:, max(gone, 0) :], history.release(max(gone, 0)), first + max(gone, 0)
-        more = start[:, last : stage.stop]
+        gone = max(stage.start - first, 0)
+        held, history, first = held[:, gone:], history.release(gone), first + gone
+        more = start[:, first + held.shape[1] : stage.stop]
         held, history = torch.cat([held, more], dim=1), history.extend(more)
         moved = type(stage)(stage.start - first, stage.levels, stage.hidden)
         held = run_stages(mixing, [moved], held, veil[:, first:], present, layout, history=history)

@@ -19,7 +19,7 @@ from torch import Tensor
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import alpha_bar
 from magnet.sampling.sampler import sample
-from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+from magnet.sampling.schedule import AHEAD, Grid, MaskSchedule, Stage
 from magnet.sampling.solvers import Solver
 from magnet.tasks import Task, registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
@@ -95,16 +95,20 @@ class Gaussian:
         self.shape = (tokens, agents)
 
     def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """E[x | sqrt(a) x + sqrt(1 - a) noise], each token at a level of its own."""
+        """E[x | sqrt(a) x + sqrt(1 - a) noise], each token at a level of its own.
+
+        A window may end early: what comes after it is integrated out.
+        """
         clean = torch.zeros_like(noisy)
         flat = levels.flatten(1)
+        mean, covariance = (x[..., : flat.shape[1]] for x in (self.mean, self.covariance[: flat.shape[1]]))
         for row in flat.unique(dim=0):
             alpha = alpha_bar(row).double()
-            scaled = self.covariance * alpha.sqrt()  # covariance of x with sqrt(a) x
+            scaled = covariance * alpha.sqrt()  # covariance of x with sqrt(a) x
             gain = scaled @ torch.linalg.inv(alpha.sqrt()[:, None] * scaled + torch.diag(1 - alpha))
             who = (flat == row).all(dim=1)
-            off = noisy[who][..., 0].flatten(1) - alpha.sqrt() * self.mean
-            clean[who, ..., 0] = (self.mean + off @ gain.T).unflatten(1, self.shape)
+            off = noisy[who][..., 0].flatten(1) - alpha.sqrt() * mean
+            clean[who, ..., 0] = (mean + off @ gain.T).unflatten(1, (-1, self.shape[1]))
         return clean
 
     def given(self, target: Tensor, known: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -204,7 +208,9 @@ def check(
     found = []
     for steps in STEPS:
         rolling = steps // share if share else 0
-        grid = Grid(tokens, people, context, steps, window=tokens, stride=1, rolling=rolling, shift=shift)
+        # Windows of blocks keep room for what lies ahead: everything is to stay in sight all the same.
+        window = tokens if rolling else tokens + AHEAD
+        grid = Grid(tokens, people, context, steps, window=window, stride=1, rolling=rolling, shift=shift)
         schedule = task.schedule(grid)
         found.append(distribution(gaussian, schedule, values, eta, solver))
     (mean, coarse), (_, fine) = found

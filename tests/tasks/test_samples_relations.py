@@ -14,7 +14,7 @@ from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import alpha_bar
 from magnet.sampling.sampler import sample
-from magnet.sampling.schedule import Grid
+from magnet.sampling.schedule import AHEAD, Grid
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.base import Task
 
@@ -41,11 +41,12 @@ class Related:
         self.covariance = self.reads @ self.own @ self.reads.T
 
     def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """E[all numbers | each with noise of its group's level]"""
+        """E[all numbers | each with noise of its group's level]; what comes after the window is integrated out."""
         clean, flat = torch.zeros_like(noisy), levels.flatten(1)
+        size = flat.shape[1] * self.agents
         for row in flat.unique(dim=0):
-            alpha = alpha_bar(self.layout.group_levels(row.view(TOKENS, self.agents)).flatten()).double()
-            scaled = self.covariance * alpha.sqrt()
+            alpha = alpha_bar(self.layout.group_levels(row.view(-1, self.agents)).flatten()).double()
+            scaled = self.covariance[:size, :size] * alpha.sqrt()
             gain = scaled @ torch.linalg.pinv(alpha.sqrt()[:, None] * scaled + torch.diag(1 - alpha), hermitian=True)
             who = (flat == row).all(dim=1)
             told = noisy[who][..., self.numbers]
@@ -67,7 +68,7 @@ class Given:
 
 def covariance(world: Related, task: Task, steps: int) -> Tensor:
     """Of all numbers of the tokens that a task generates, with a past of zeros; nothing else is random."""
-    schedule = task.schedule(Grid(TOKENS, world.agents, PAST, steps, window=TOKENS, stride=1))
+    schedule = task.schedule(Grid(TOKENS, world.agents, PAST, steps, window=TOKENS + AHEAD, stride=1))
     G = world.agents
     size = TOKENS * world.agents * G
     noise = torch.zeros(2 * size, TOKENS, world.agents, world.layout.width, dtype=torch.float64)
