@@ -106,7 +106,13 @@ class Embody3DReader(Reader):
 
     def _downloaded(self) -> tuple[str, ...]:
         """Sections of which captures are there: acting and daylife, or all others."""
-        there = [section for section in self.listed if any(self.folder.glob(f"{section}/c--*/*/missing"))]
+        held = {path.parents[2].name for path in self.folder.glob("*/c--*/*/missing")}
+        if unlisted := [section for section in USUAL if section in held and section not in self.listed]:
+            raise DataError(
+                f"{self.folder}: captures of {', '.join(unlisted)}, but no {unlisted[0]}/{LIST}; get it from the "
+                f"toolbox, or name the sections to read as --reader.sections"
+            )
+        there = [section for section in self.listed if section in held]
         if not there:
             listed = f"lists of {', '.join(self.listed)}" if self.listed else f"no SECTION/{LIST}"
             raise DataError(
