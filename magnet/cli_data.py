@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from magnet.cli_data_shown import (
     show_gaps,
     show_notes,
     show_persons,
+    show_problems,
     show_skipped,
     show_splits,
 )
@@ -181,6 +181,7 @@ def needed(given: argparse.Namespace, *names: str) -> list[str]:
 def run_info(given: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from magnet.datamodules.check import noted
     from magnet.datamodules.prepare import absent_note
     from magnet.datamodules.store import Folder
 
@@ -212,7 +213,7 @@ def run_info(given: argparse.Namespace) -> int:
         ]
     )
     show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
-    show_notes([f"{entry['note']} ({len(entry['takes'])} takes)" for entry in m["notes"]])
+    show_notes([noted(entry["note"], entry["takes"]) for entry in m["notes"]])
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     if m.get("listed but not there"):
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
@@ -242,8 +243,7 @@ def run_check(given: argparse.Namespace) -> int:
     picture = Path(given.picture or f"{found.name}_check.png")
     if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
-    for problem in found.problems:
-        print(f"PROBLEM: {problem}", file=sys.stderr)
+    show_problems(found.problems)
     print(f"{len(found.problems)} problems" if found.problems else "all assertions hold")
     return FAILED if found.problems else 0
 

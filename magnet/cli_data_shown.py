@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from magnet.datamodules.windows import Split
 
 SKIPPED_SHOWN = 20
+PROBLEMS_SHOWN = 40
 PERSONS_SHOWN = 8
 NOTES_SHOWN = 8
 
@@ -64,6 +65,14 @@ def show_notes(notes: list[str]) -> None:
     for kind, count in alike.items():
         if count > NOTES_SHOWN:
             print(f"  ... and {count - NOTES_SHOWN} more like: {kind}")
+
+
+def show_problems(problems: list[str]) -> None:
+    """Assertions that do not hold, on the error stream."""
+    for problem in problems[:PROBLEMS_SHOWN]:
+        print(f"PROBLEM: {problem}", file=sys.stderr)
+    if len(problems) > PROBLEMS_SHOWN:
+        print(f"  ... and {len(problems) - PROBLEMS_SHOWN} more", file=sys.stderr)
 
 
 def show_persons(groups: list[tuple[list[str], int]]) -> None:

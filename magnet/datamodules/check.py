@@ -10,15 +10,16 @@ from pathlib import Path
 from statistics import mean
 
 import numpy as np
+import roma
 import torch
 
 from magnet.body import Body, load_body
-from magnet.datamodules import catalogue
+from magnet.datamodules import catalogue, check_people
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.fields import listing
 from magnet.datamodules.prepare import absent_note, chosen
 from magnet.datamodules.prepare_takes import Order, Part, Tell, convert_all
-from magnet.datamodules.recording import Reader
+from magnet.datamodules.recording import DataError, Reader
 from magnet.datamodules.store import SCALE, SPLITS, Folder, StoreError, body_hash, decode, file_hash
 from magnet.datamodules.store import Part as Stored
 from magnet.datamodules.windows import Split, at_least
@@ -60,6 +61,11 @@ class Checked:
             self.problems.append(f"{len(self.skipped)} of {takes} takes broke an assertion; they are listed above")
 
 
+def noted(note: str, takes: list[str]) -> str:
+    """What was found, and of which take or how many."""
+    return f"{note} ({takes[0] if len(takes) == 1 else f'{len(takes)} takes'})"
+
+
 def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], people: list[int]) -> None:
     """Add one take's clips."""
     count = counts.setdefault(split, Counter())
@@ -97,7 +103,7 @@ def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = No
         theirs = manifest["body"]["id"]
         found.problems.append(f"the store is of body {theirs!r}, and {body.id!r} has other joints at rest")
     found.skipped = [(entry["take"], entry["why"]) for entry in manifest["skipped"]]
-    found.notes = [f"{entry['note']} ({len(entry['takes'])} takes)" for entry in manifest["notes"]]
+    found.notes = [noted(entry["note"], entry["takes"]) for entry in manifest["notes"]]
     if absent := manifest.get("listed but not there"):
         found.notes.append(absent_note(absent))
     if found.problems:
@@ -132,8 +138,9 @@ def _check_split(folder: Folder, split: Split, found: Checked) -> None:
     if not np.isfinite(part.betas).all():
         found.problems.append(f"split {split}: shape numbers hold NaN or infinity")
     for c, name in enumerate(part.name):
-        if wrong := _wrong_rows(part, c):
-            found.problems.append(f"clip {name}: {wrong}; prepare the store again")
+        wrong = _wrong_rows(part, c)
+        for one in [wrong] if wrong else _wrong_people(part, c, own=not folder.manifest["body"].get("genders")):
+            found.problems.append(f"clip {name}: {one}; prepare the store again")
     found.scenes += _scenes(folder, part, SHOWN - len(found.scenes))
 
 
@@ -149,6 +156,19 @@ def _wrong_rows(part: Stored, clip: int) -> str | None:
     if low < PELVIS[0] or high > PELVIS[1]:
         return f"pelvises are {low:.1f} to {high:.1f} m over the floor, expected {PELVIS[0]:g} to {PELVIS[1]:g} m"
     return None
+
+
+def _wrong_people(part: Stored, clip: int, own: bool) -> list[str]:
+    """By person and frame; shape numbers only where they are those of the data set, and not of another body."""
+    names, rows = part.persons_of()[clip], part.rows(clip)
+    quat, pelvis = (rows[key].swapaxes(0, 1).astype(np.float32) for key in ("rotations", "pelvis"))
+    flags = check_people.seen(quat, pelvis, np.ones(pelvis.shape[:2], dtype=bool))
+    said = check_people.words(flags, names, 30.0, met=False)
+    try:
+        check_people.check_shapes(part.betas_of(clip) if own else part.betas_of(clip)[:0], names)
+    except DataError as error:
+        said.append(str(error))
+    return said
 
 
 def _scenes(folder: Folder, part: Stored, most: int) -> list[tuple[str, Scene]]:
@@ -245,7 +265,7 @@ def check_download(
         found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")
     if use.absent:
         found.notes.append(absent_note(use.absent))
-    notes: Counter[str] = Counter()
+    notes: dict[str, list[str]] = {}
     parts: dict[str, Part] = {}
     for take, part in convert_all(order, takes, lambda take: None, workers, tell):
         if part.error is None and len(found.scenes) < SHOWN:
@@ -257,9 +277,10 @@ def check_download(
         if part.error is not None:
             found.skipped.append((take.name, part.error))
             continue
-        notes.update(part.notes)
+        for note in part.notes:
+            notes.setdefault(note, []).append(take.name)
         tally(found.counts, take.split or "train", list(part.frames), list(part.people))
-    found.notes += [f"{note} ({count} takes)" for note, count in notes.items()]
+    found.notes += [noted(note, takes) for note, takes in notes.items()]
     found.count_skipped(len(takes))
     return found
 
@@ -276,6 +297,8 @@ def check_cmu(data: CMU) -> Checked:
         clips = data.clips(split)
         for clip in clips:
             tally(found.counts, split, [clip.frames], [clip.agents])
+            flags = _flags(clip.scene, data.body)
+            found.notes += [f"{clip.name}, {said}" for said in check_people.words(flags, (), 30.0, met=False)]
         seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
         found.scenes += [(clip.name, clip.scene.cut(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
     found.scenes = found.scenes[:SHOWN]
@@ -287,6 +310,19 @@ def check_cmu(data: CMU) -> Checked:
     found.notes.append(f"{masked} of {frames} frames are masked; each take's report lies in {data.cache_folder}")
     found.count_skipped(len(takes))
     return found
+
+
+def _flags(scene: Scene, body: Body) -> list[check_people.Flag]:
+    """Who is held, and what jumps, in a scene (B = 1)."""
+    T_world_root = scene.T_world_root[0]
+    rotations = torch.cat([T_world_root[:, :, None, :3, :3], scene.body_rot[0]], dim=2)
+    valid = torch.ones(scene.frames, dtype=torch.bool) if scene.valid is None else scene.valid[0]
+    return check_people.seen(
+        roma.rotmat_to_unitquat(rotations).numpy(),
+        T_world_root[..., :3, 3].numpy(),
+        valid[:, None].expand(-1, scene.agents).numpy(),
+        body.joints(scene)[0].numpy(),
+    )
 
 
 # -- the picture -------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.body.base import JOINT_NAMES
+from magnet.datamodules.check_people import WILD_ANGLE, who
 from magnet.datamodules.recording import Axis, DataError, Recording
 
 Array = NDArray[np.floating[Any]]
@@ -57,14 +59,18 @@ def usable(recording: Recording) -> Bools:
     valid = np.ones((T, P), dtype=bool) if recording.valid is None else np.asarray(recording.valid, dtype=bool)
     if not valid.any(axis=0).all():
         lost = np.flatnonzero(~valid.any(axis=0)).tolist()
-        raise DataError(f"people {lost} are valid in none of {T} frames; the tracking mask may mean the opposite")
+        called = f" ({', '.join(recording.persons[p] for p in lost)})" if recording.persons else ""
+        raise DataError(
+            f"people {lost}{called} are valid in none of {T} frames: never tracked, or the tracking mask means the "
+            f"opposite; leave the take out"
+        )
     for name in ("poses", "transl", "positions"):
         array = getattr(recording, name)
         if array is not None and not (fine := np.isfinite(array).reshape(T, P, -1).all(axis=-1) | ~valid).all():
             frame, person = np.argwhere(~fine)[0].tolist()
             raise DataError(
                 f"{name} holds NaN or infinity in {int((~fine).sum())} of {fine.size} frames, the first is frame "
-                f"{frame} of person {person}; mark such frames as not valid, or copy the file again"
+                f"{frame} of {who(person, recording.persons)}; mark such frames as not valid, or copy the file again"
             )
     if recording.betas is not None and not np.isfinite(recording.betas).all():
         raise DataError("betas hold NaN or infinity; copy the file again")
@@ -81,19 +87,24 @@ def filled(array: Array, valid: Bools) -> Array:
     return array[take, np.arange(valid.shape[1])]
 
 
-def check_angles(poses: Array, valid: Bools) -> None:
+def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
     """Axis-angle vectors (T, P, 22, 3) are in radians.
 
     Raises:
-        DataError: too many are longer than a full turn.
+        DataError: too many are longer than a full turn; says where the longest is.
     """
-    size = np.linalg.norm(np.asarray(poses, dtype=np.float64)[valid], axis=-1)
-    share = float((size > TURN).mean())
+    with np.errstate(all="ignore"):  # of frames that are not valid
+        size = np.linalg.norm(np.asarray(poses, dtype=np.float64), axis=-1)
+        size[np.abs(poses).max(axis=-1) > WILD_ANGLE] = 0.0  # what is no angle at all is another matter
+    size[~valid] = 0.0
+    share = float((size[valid] > TURN).mean())
     if share > 0.005:
-        what = "degrees" if np.percentile(size, 99) < 400 else "neither radians nor degrees"
+        what = "degrees" if np.percentile(size[valid], 99) < 400 else "neither radians nor degrees"
+        frame, person, joint = np.unravel_index(size.argmax(), size.shape)
         raise DataError(
             f"{100 * share:.0f} % of the rotation vectors are longer than a full turn (the longest is "
-            f"{size.max():.1f}), expected radians up to 3.15: they look like {what}; {CONVERT}"
+            f"{size.max():.4g}, {JOINT_NAMES[joint]} of {who(int(person), names)} in frame {frame}), expected "
+            f"radians up to 3.15: they look like {what}; {CONVERT}"
         )
 
 

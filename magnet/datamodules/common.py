@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -16,15 +15,16 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.family import title
 from magnet.body.fit import fit_body, floor_height
-from magnet.datamodules import check_motion
+from magnet.datamodules import check_motion, check_people
+from magnet.datamodules.check_people import Flag
 from magnet.datamodules.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.resample import FPS, resample_points, resample_rotations, resample_valid
 from magnet.datamodules.windows import Clip, Split
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
-STEPS_VERSION = 2
+STEPS_VERSION = 3
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
-FPS = 30.0
 FLOOR_PERCENTILE = 5.0
 """Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
 
@@ -69,17 +69,18 @@ class Motion:
     betas: Tensor  # (P, 10)
     valid: NDArray[np.bool_]  # (T, P)
     joints: Tensor  # (T, P, 22, 3) float32 world
+    notes: tuple[str, ...] = ()
 
     def turned(self, R: Tensor) -> Motion:
         """Seen from a world turned by R_new_old (3, 3) float64."""
         rotations = self.rotations.clone()
         rotations[:, :, 0] = R.float() @ rotations[:, :, 0]
-        return Motion(rotations, self.pelvis @ R.T, self.betas, self.valid, self.joints @ R.T.float())
+        return replace(self, rotations=rotations, pelvis=self.pelvis @ R.T, joints=self.joints @ R.T.float())
 
     def lowered(self, height: float) -> Motion:
         """With the floor, now at `height`, at 0."""
         down = torch.tensor([0.0, height, 0.0], dtype=torch.float64)
-        return Motion(self.rotations, self.pelvis - down, self.betas, self.valid, self.joints - down.float())
+        return replace(self, pelvis=self.pelvis - down, joints=self.joints - down.float())
 
 
 @dataclass(frozen=True)
@@ -116,20 +117,15 @@ def to_clips(
     """
     steps = steps or Steps()
     recording = of_body(recording, body, source, family)
+    names = recording.persons
     notes = list(recording.notes)
     for p, gender in enumerate(recording.genders):  # of a body that nobody gave
-        who = recording.persons[p] if recording.persons else f"person {p}"
-        notes.append(f"{who}: {gender}; the shape is used with the body model given")
-    up = steps.up or recording.up
-    valid = check_motion.usable(recording)
-    if recording.poses is not None:
-        motion = _posed(recording, valid, body)
-        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
-        motion = motion.turned(R_WORLD_FILE[up])
-        check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
-    else:
-        motion, residual = _fitted(recording, valid, body, up, steps)
-        notes.append(f"body {body.id} fitted to {'skeletons' if recording.rigs else 'positions'}: {residual}")
+        notes.append(f"{names[p] if names else f'person {p}'}: {gender}; the shape is used with the body model given")
+    motion, flags, flagged = _moved(recording, body, steps)
+    quat = roma.rotmat_to_unitquat(motion.rotations).numpy()
+    flags += check_people.jumps(quat, motion.joints.numpy(), motion.valid, but=flags)
+    flagged += check_people.words(flags, names, FPS)
+    notes += [*flagged, *motion.notes]
     jumps = check_motion.jumps(motion.pelvis.numpy(), motion.valid, FPS)
     if len(jumps):
         notes.append(f"cut at {len(jumps)} jumps of more than {check_motion.JUMP:g} m between frames")
@@ -139,7 +135,24 @@ def to_clips(
         )
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
     motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
-    return Outcome(_cut(motion, jumps, body, name, source, split, steps.min_frames), tuple(notes))
+    cuts = sorted({*jumps.tolist(), *(flag.start for flag in flags if flag.cut)})
+    return Outcome(_cut(motion, cuts, flagged, body, name, source, split, steps.min_frames), tuple(notes))
+
+
+def _moved(recording: Recording, body: Body, steps: Steps) -> tuple[Motion, list[Flag], list[str]]:
+    """At 30 fps, y up; what is wrong with whom there, and in words what was so in the file's own frames."""
+    up, valid = steps.up or recording.up, check_motion.usable(recording)
+    if recording.poses is not None:
+        check_motion.check_angles(recording.poses, valid, recording.persons)
+    valid, wild = check_people.screened(recording, valid)
+    if recording.poses is not None:
+        motion, flags = _posed(recording, valid, body)
+        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
+        motion = motion.turned(R_WORLD_FILE[up])
+        check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
+    else:
+        motion, flags = _fitted(recording, valid, body, up, steps)
+    return motion, flags, check_people.words(wild, recording.persons, recording.fps)
 
 
 def of_body(recording: Recording, body: Body, source: str, family: Family) -> Recording:
@@ -174,73 +187,46 @@ def of_body(recording: Recording, body: Body, source: str, family: Family) -> Re
     return replace(recording, betas=flat, genders=(), notes=(*recording.notes, said))
 
 
-# -- resampling --------------------------------------------------------------------------------
-
-
-def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:
-    """Which two frames each new frame i at time i / target lies between, and how far on: before, after, share."""
-    count = math.floor((frames - 1) * target / fps + 1e-9) + 1
-    place = torch.arange(count, dtype=torch.float64) * (fps / target)
-    before = (place + 1e-9).floor().long().clamp_max(frames - 1)
-    share = (place - before).clamp(0.0, 1.0)
-    share[share < 1e-9] = 0.0  # exact frames stay exact, and need no valid neighbour
-    return before, (before + 1).clamp_max(frames - 1), share
-
-
-def resample_rotations(quat: Tensor, fps: float, target: float = FPS) -> Tensor:
-    """Rotations at exact times, by slerp along the shorter arc. (T, ..., 4) unit quaternions -> (T', ..., 4)"""
-    before, after, share = times(len(quat), fps, target)
-    if not bool(share.any()):
-        return quat[before]
-    start = quat[before]
-    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), quat[after]))
-    share = share.view(-1, *[1] * (quat.dim() - 1))
-    return roma.quat_product(start, roma.rotvec_to_unitquat(turn * share))
-
-
-def resample_points(points: Tensor, fps: float, target: float = FPS) -> Tensor:
-    """Points at exact times, linearly. (T, ..., 3) -> (T', ..., 3)"""
-    before, after, share = times(len(points), fps, target)
-    return torch.lerp(points[before], points[after], share.view(-1, *[1] * (points.dim() - 1)))
-
-
-def resample_valid(valid: NDArray[np.bool_], fps: float, target: float = FPS) -> NDArray[np.bool_]:
-    """A new frame is valid when all frames that it is made of are. (T, P) -> (T', P)"""
-    before, after, share = times(len(valid), fps, target)
-    return valid[before.numpy()] & (valid[after.numpy()] | (share.numpy() == 0)[:, None])
-
-
 # -- the two kinds of recording ----------------------------------------------------------------
 
 
-def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> Motion:
+def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[Motion, list[Flag]]:
     place = recording.transl if recording.pelvis is None else recording.pelvis
     assert recording.poses is not None and place is not None and recording.betas is not None
-    check_motion.check_angles(recording.poses, valid)
     poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
     place = check_motion.filled(np.asarray(place, dtype=np.float64), valid)
     check_motion.check_apart(place, valid)
     betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
     quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
-    rotations = roma.unitquat_to_rotmat(resample_rotations(quat, recording.fps)).float()
+    quat = resample_rotations(quat, recording.fps)
+    rotations = roma.unitquat_to_rotmat(quat).float()
     rest = body.rest_joints(betas)
+    check_people.check_stature(rest.numpy(), recording.persons)
     # SMPL's root turns about the rest pelvis and is moved by transl after that
     pelvis = resample_points(torch.from_numpy(place), recording.fps)
     if recording.pelvis is None:
         pelvis = pelvis + rest[:, 0]
     joints = body.forward_kinematics(rotations[:, :, 1:], rigid(rotations[:, :, 0], pelvis.float()), betas.float())
-    return Motion(rotations, pelvis, betas, resample_valid(valid, recording.fps), joints)
+    good = resample_valid(valid, recording.fps)
+    flags = check_people.frozen(*check_people.held(pelvis.numpy(), quat.numpy()), good)
+    good = check_people.without(good, flags, recording.persons, FPS)
+    return Motion(rotations, pelvis, betas, good, joints), flags
 
 
-def _fitted(recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, steps: Steps) -> tuple[Motion, str]:
+def _fitted(
+    recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, steps: Steps
+) -> tuple[Motion, list[Flag]]:
     assert recording.positions is not None
     positions = check_motion.filled(np.asarray(recording.positions, dtype=np.float64), valid)
     points = resample_points(torch.from_numpy(positions), recording.fps)
     good = resample_valid(valid, recording.fps)
+    flags = check_people.frozen(*check_people.held_points(points.numpy()), good)
+    good = check_people.without(good, flags, recording.persons, FPS)
     check_motion.check_limbs(points.numpy(), recording.joints, good)
     spread = np.full((*points.shape[:2], BODY_JOINTS, 3), np.nan)
     spread[:, :, list(recording.joints)] = points.numpy()
     check_motion.check_up(up, spread, good, chosen=steps.up is not None)
+    flags += check_people.jumps(None, spread, good)
     spread = spread @ R_WORLD_FILE[up].numpy().T
     if np.isfinite(spread[:, :, check_motion.WALKING]).all():
         check_motion.check_apart(spread[:, :, 0], good)
@@ -263,8 +249,9 @@ def _fitted(recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis
     rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
     off = 100 * residual.numpy()[good]
     said = f"mean residual {off.mean():.1f} cm, 95 % below {np.percentile(off, 95):.1f} cm"
+    notes = (f"body {body.id} fitted to {'skeletons' if recording.rigs else 'positions'}: {said}",)
     pelvis = scene.T_world_root[0, :, :, :3, 3].double()
-    return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0]), said
+    return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0], notes), flags
 
 
 def _side_by_side(people: Sequence[Scene]) -> Scene:
@@ -280,25 +267,20 @@ def _side_by_side(people: Sequence[Scene]) -> Scene:
 # -- cutting -----------------------------------------------------------------------------------
 
 
-def stretches(good: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
-    """Runs of True of at least so many frames, as (start, stop). good: (T,) bool"""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
-
-
 def _cut(
-    motion: Motion, jumps: NDArray[np.intp], body: Body, name: str, source: str, split: Split, least: int
+    motion: Motion, cuts: list[int], flagged: list[str], body: Body, name: str, source: str, split: Split, least: int
 ) -> list[Clip]:
     together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
     frames = len(together)
     pieces: list[tuple[int, int]] = []
-    edges = [0, *(int(jump) for jump in jumps), frames]
+    edges = [0, *cuts, frames]
     for first, end in pairwise(edges):
-        pieces += [(first + a, first + b) for a, b in stretches(together[first:end], least)]
+        pieces += [(first + a, first + b) for a, b in check_people.stretches(together[first:end], least)]
     if not pieces:
         raise DataError(
             f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "
-            f"{int(together.sum())} of them valid; lower --min_frames to keep shorter ones"
+            f"{int(together.sum())} of them valid{''.join(f'; {one}' for one in flagged)}; lower --min_frames to keep "
+            f"shorter ones"
         )
     clips = []
     for start, stop in pieces:

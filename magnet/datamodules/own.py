@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import ClassVar, Generic, Literal, Protocol, Self, TypeVar
 
 from magnet.datamodules.arrays import hashed_split
-from magnet.datamodules.common import FPS
 from magnet.datamodules.fields import listing
 from magnet.datamodules.own_files import TABLE, Group, Seat, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.resample import FPS
 from magnet.datamodules.store import SPLITS
 from magnet.datamodules.windows import Split
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.datamodules.common import FPS
 from magnet.datamodules.prepare_takes import Part
 from magnet.datamodules.recording import Take
+from magnet.datamodules.resample import FPS
 from magnet.datamodules.store import FORMAT, MANIFEST, SPLITS, Folder, as_json, write_whole
 from magnet.datamodules.store_rows import ROW
 from magnet.datamodules.windows import Split

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from magnet.body import Body, load_body
 from magnet.body.family import title, titles
 from magnet.datamodules import catalogue
+from magnet.datamodules.check_people import check_shapes
 from magnet.datamodules.common import STEPS_VERSION, Steps, to_clips
 from magnet.datamodules.genders import load_bodies, one_body
 from magnet.datamodules.recording import Gender, Reader, Take
@@ -212,7 +213,10 @@ class Part:
 def convert(reader: Reader, take: Take, body: Body, steps: Steps, bodies: Mapping[Gender, Body] | None = None) -> Part:
     """Read a take and put it through the common steps; whatever is wrong with it becomes the part's error."""
     try:
-        recording = one_body(reader.read(take), bodies or {}, body)
+        recording = reader.read(take)
+        if recording.betas is not None:
+            check_shapes(recording.betas, recording.persons)
+        recording = one_body(recording, bodies or {}, body)
         made = to_clips(recording, body, take.name, reader.name, take.split or "train", reader.family, steps)
     except (ValueError, OSError) as error:
         return Part.failed(relative(str(error) or type(error).__name__, reader.root))

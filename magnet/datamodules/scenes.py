@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.datamodules.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
-from magnet.datamodules.common import resample_points, resample_rotations, resample_valid
 from magnet.datamodules.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.own import OwnReader
 from magnet.datamodules.own_files import Group, Seat
 from magnet.datamodules.recording import Axis, DataError, Family, Gender, Recording
+from magnet.datamodules.resample import resample_points, resample_rotations, resample_valid
 from magnet.datamodules.unpickle import load_pickle
 from magnet.motion.scene import Scene
 

@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet.body import load_body
 from magnet.datamodules import check_motion
 from magnet.datamodules.asf_amc import read_amc, read_asf
-from magnet.datamodules.common import Steps, resample_rotations, resample_valid, stretches, times, to_clips
+from magnet.datamodules.check_people import stretches
+from magnet.datamodules.common import Steps, to_clips
 from magnet.datamodules.fakes.motion import UP, made_up_body, people, turned
 from magnet.datamodules.recording import DataError
+from magnet.datamodules.resample import resample_rotations, resample_valid, times
 from magnet.synthesis import synthesize
 from tests.datamodules.made import SPOILED, in_degrees, recorded, tracked
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from magnet.datamodules.catalogue import NAMES, OWN
-from magnet.datamodules.common import Steps, times
+from magnet.datamodules.common import Steps
 from magnet.datamodules.draws import whole_clips
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, turned
@@ -24,6 +24,7 @@ from magnet.datamodules.prepare import chosen, prepare
 from magnet.datamodules.prepare_takes import convert
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.recording import DataError
+from magnet.datamodules.resample import times
 from magnet.datamodules.windows import Split
 
 from .made_scenes import FITTED, FORMS, MILLIMETRE, joints_at_30_fps, placed, random_scene, scene_of, written
