@@ -63,7 +63,9 @@ def test_fields_replace_those_of_a_preset():
     assert (options.steps, options.rolling, options.guidance.kind) == (50, 0, "history")
 
 
-@pytest.mark.parametrize(("wrong", "hint"), [("papr", "did you mean paper?"), ("xyz", "there are default, paper")])
+@pytest.mark.parametrize(
+    ("wrong", "hint"), [("papr", "did you mean paper?"), ("xyz", "there are default, steady, paper")]
+)
 def test_a_wrong_name_suggests_the_closest(wrong: str, hint: str):
     import argparse
 
