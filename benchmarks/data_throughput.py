@@ -246,14 +246,14 @@ def through_prepare(download: Path, store: Path, frames: int, workers: int, take
 
 def make(store: Path, frames: int, clip_frames: int = 300, persons: int = 2) -> None:
     """A store of so many frames, written as `prepare` does, of few different clips in turn."""
-    from magnet.datamodules.common import to_clips
     from magnet.datamodules.fakes.body import write_body
     from magnet.datamodules.fakes.motion import made_up_body, people
-    from magnet.datamodules.prepare import SHARD_ROWS
-    from magnet.datamodules.prepare_pack import Source, pack
-    from magnet.datamodules.prepare_takes import Part
-    from magnet.datamodules.recording import Recording, Take
-    from magnet.datamodules.store import body_hash, encode
+    from magnet.datamodules.preparing.canonicalize import to_clips
+    from magnet.datamodules.preparing.convert import Part
+    from magnet.datamodules.preparing.pack import Source, pack
+    from magnet.datamodules.preparing.prepare import SHARD_ROWS
+    from magnet.datamodules.reading.recording import Recording, Take
+    from magnet.datamodules.store.reader import body_hash, encode
 
     body, parts = made_up_body(), []
     for seed in range(16):

@@ -25,7 +25,7 @@ from magnet.cli_data_shown import (
 
 if TYPE_CHECKING:
     from magnet.body import Body
-    from magnet.datamodules.check import Checked
+    from magnet.datamodules.preparing.check import Checked
 
 DESCRIPTION = """\
 Prepare, check, describe, fake and download data sets.
@@ -181,9 +181,9 @@ def needed(given: argparse.Namespace, *names: str) -> list[str]:
 def run_info(given: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from magnet.datamodules.check import noted
-    from magnet.datamodules.prepare import absent_note
-    from magnet.datamodules.store import Folder
+    from magnet.datamodules.preparing.check import noted
+    from magnet.datamodules.preparing.prepare import absent_note
+    from magnet.datamodules.store.reader import Folder
 
     (path,) = needed(given, "path")
     folder = Folder(path)
@@ -224,8 +224,8 @@ def run_info(given: argparse.Namespace) -> int:
 
 
 def run_check(given: argparse.Namespace) -> int:
-    from magnet.datamodules import check
-    from magnet.datamodules.store import MANIFEST, STATE
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.store.reader import MANIFEST, STATE
 
     path = Path(needed(given, "path")[0]).expanduser()
     if (path / MANIFEST).exists() or (path / STATE).is_dir():
@@ -251,8 +251,8 @@ def run_check(given: argparse.Namespace) -> int:
 def checked_store(given: argparse.Namespace, path: Path) -> tuple[Checked, Body | None]:
     """What was found, and the body to draw."""
     from magnet.body import load_body
-    from magnet.datamodules import check
-    from magnet.datamodules.store import Folder
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.store.reader import Folder
 
     refuse_unused(given, "a store, which is checked whole, as it was prepared,")
     body = load_body(given.body) if given.body != "open" else None
@@ -262,8 +262,8 @@ def checked_store(given: argparse.Namespace, path: Path) -> tuple[Checked, Body 
 
 def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
     """What was found, and the body to draw."""
-    from magnet.datamodules import check
     from magnet.datamodules.cmu import CMU
+    from magnet.datamodules.preparing import check
 
     refuse_unused(given, "CMU's recordings, all of which are fitted once and kept,", "name")
     data = CMU(str(path), body_model=given.body)
@@ -272,8 +272,8 @@ def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
 
 def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[Checked, Body]:
     """What was found, and the body to draw."""
-    from magnet.datamodules import check
-    from magnet.datamodules.prepare import read_splits
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.preparing.prepare import read_splits
 
     order = order_of(given, name, str(path))
     body, splits = order.body(), read_splits(given.splits) if given.splits else None
@@ -295,7 +295,7 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
-    from magnet.datamodules.prepare import absent_note, prepare, read_splits
+    from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
 
     if given.place and given.out and given.place != given.out:
         raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
@@ -327,7 +327,7 @@ def run_prepare(given: argparse.Namespace) -> int:
 
 def run_fake(given: argparse.Namespace) -> int:
     from magnet.datamodules import catalogue
-    from magnet.datamodules.windows import at_least
+    from magnet.datamodules.clip import at_least
     from magnet.files import writing
 
     name, out = needed(given, "name", "out")
@@ -358,7 +358,7 @@ def run_download(given: argparse.Namespace) -> int:
         kind = catalogue.find(name).load_reader()
         raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
     (out,) = needed(given, "out")
-    from magnet.datamodules.download import download_cmu
+    from magnet.datamodules.reading.download import download_cmu
     from magnet.files import writing
 
     subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from magnet.datamodules.recording import Reader
+    from magnet.datamodules.reading.recording import Reader
 
 BODIES = {
     "smplx": "--body SMPLX_NEUTRAL.npz",

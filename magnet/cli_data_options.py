@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magnet.datamodules.prepare_takes import Order
-    from magnet.datamodules.recording import Reader
+    from magnet.datamodules.preparing.convert import Order
+    from magnet.datamodules.reading.recording import Reader
 
 
 def all_reader_options(words: Sequence[str]) -> bool:
@@ -55,9 +55,9 @@ def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
 def order_of(given: argparse.Namespace, name: str, root: str) -> Order:
     """What is to be prepared or checked, and how. Without --body, the body is the neutral one of --bodies."""
     from magnet.datamodules import catalogue
-    from magnet.datamodules.common import Steps
-    from magnet.datamodules.genders import find_bodies
-    from magnet.datamodules.prepare_takes import Order, families_of
+    from magnet.datamodules.preparing.canonicalize import Steps
+    from magnet.datamodules.preparing.convert import Order, families_of
+    from magnet.datamodules.preparing.genders import find_bodies
 
     options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
     if given.body == "open" and given.bodies:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magnet.datamodules.windows import Split
+    from magnet.datamodules.clip import Split
 
 SKIPPED_SHOWN = 20
 PROBLEMS_SHOWN = 40
@@ -48,7 +48,7 @@ def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
 
 def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
     """What the splits lack, where nobody overlooks it."""
-    from magnet.datamodules.split_gaps import split_gaps
+    from magnet.datamodules.preparing.split_gaps import split_gaps
 
     for line in split_gaps(clips):
         print(f"WARNING: {line}", file=sys.stderr)

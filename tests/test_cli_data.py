@@ -215,7 +215,7 @@ def test_readers_options_are_read_by_their_types():
 
 
 def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
-    from magnet.datamodules import download
+    from magnet.datamodules.reading import download
 
     asked = []
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.recording import DataError
+from magnet.datamodules.reading.recording import DataError
 from magnet.unpickle import load_object_npy, load_pickle
 
 PLAIN: dict[str, Any] = {

@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, Doubles, floats, hashed_split, listed_splits, open_names, require
-from magnet.datamodules.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_split, listed_splits, open_names, require
+from magnet.datamodules.reading.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.unpickle import load_pickle
 
 LARGEST = 7

@@ -13,10 +13,11 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from magnet.body import Body, load_body
-from magnet.datamodules.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
-from magnet.datamodules.loaders import FixedLoader, TrainLoader
-from magnet.datamodules.store_mapped import MappedStore, Piece
-from magnet.datamodules.windows import Clip, Draw, Split, Store, at_least
+from magnet.datamodules.clip import Clip, Split, at_least
+from magnet.datamodules.store.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
+from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
+from magnet.datamodules.store.mapped import MappedStore, Piece
+from magnet.datamodules.store.memory import Draw, Store
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 

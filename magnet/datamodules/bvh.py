@@ -15,9 +15,9 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.base import JOINT_NAMES
-from magnet.datamodules.own import OwnReader
-from magnet.datamodules.own_files import Seat
-from magnet.datamodules.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.reading.own import OwnReader
+from magnet.datamodules.reading.own_files import Seat
+from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.datamodules.resample import resample_points, resample_rotations
 from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto

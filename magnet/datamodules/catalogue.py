@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magnet.datamodules.prepared import Prepared
-    from magnet.datamodules.recording import Reader
+    from magnet.datamodules.reading.recording import Reader
 
 
 @dataclass(frozen=True)

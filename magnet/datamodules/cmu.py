@@ -17,10 +17,10 @@ from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from magnet.body import Body
-from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.base import Clip, MotionDataModule, Split
-from magnet.datamodules.cmu_fit import Fitted, check_rate, fit_recordings
-from magnet.datamodules.cmu_subjects import RATES, USUAL_RATE, couple_of
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.cmu_fit import Fitted, check_rate, fit_recordings
+from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
 from magnet.datamodules.speeds import at_speed
 from magnet.files import writing
 from magnet.motion.scene import Scene

@@ -8,8 +8,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import one_length
-from magnet.datamodules.fields import (
+from magnet.datamodules.clip import Split
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.reading.arrays import one_length
+from magnet.datamodules.reading.fields import (
     Person,
     first_folder,
     gender_of,
@@ -19,9 +21,7 @@ from magnet.datamodules.fields import (
     shape_numbers,
     side_by_side,
 )
-from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.unpickle import load_object_npy
 
 FPS = 30.0

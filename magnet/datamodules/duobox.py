@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import one_length
-from magnet.datamodules.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import one_length
+from magnet.datamodules.reading.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.unpickle import load_object_npy, load_pickle
 
 FPS = 120.0

@@ -11,7 +11,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.datamodules.arrays import (
+from magnet.datamodules.clip import Split
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.reading.arrays import (
     AGAIN,
     Doubles,
     floats,
@@ -21,11 +23,9 @@ from magnet.datamodules.arrays import (
     open_npy,
     require,
 )
-from magnet.datamodules.fields import Person, listing, mapping, side_by_side
-from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.session_split import split_sessions
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.reading.session_split import split_sessions
 
 WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
 FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")

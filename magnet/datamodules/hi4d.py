@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, Doubles, floats, open_npz
-from magnet.datamodules.fields import listing, person, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, open_npz
+from magnet.datamodules.reading.fields import listing, person, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 
 SHAPES = {"global_orient": (2, 3), "body_pose": (2, 69), "transl": (2, 3), "betas": (2, 10)}
 

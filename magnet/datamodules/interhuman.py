@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
-from magnet.datamodules.fields import listing, mapping, natural, person, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
+from magnet.datamodules.reading.fields import listing, mapping, natural, person, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.unpickle import load_pickle
 
 FPS = 59.94

@@ -7,11 +7,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from magnet.datamodules.arrays import OR_YOURS, open_names, open_npz
-from magnet.datamodules.fields import Person, first_folder, listing, person, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import OR_YOURS, open_names, open_npz
+from magnet.datamodules.reading.fields import Person, first_folder, listing, person, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.unpickle import load_pickle
 
 FPS = 120.0

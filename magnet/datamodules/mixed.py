@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
-from magnet.datamodules.store_mapped import MappedStore, Piece
-from magnet.datamodules.windows import Store
+from magnet.datamodules.store.mapped import MappedStore, Piece
+from magnet.datamodules.store.memory import Store
 
 
 class Mixed(MotionDataModule):

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from magnet.datamodules.base import Clip, EmptySplitError, MotionDataModule, Split
-from magnet.datamodules.recording import Reader
-from magnet.datamodules.store import Folder, StoreError, body_hash
-from magnet.datamodules.store_mapped import MappedStore, Piece
-from magnet.datamodules.windows import Store
+from magnet.datamodules.reading.recording import Reader
+from magnet.datamodules.store.mapped import MappedStore, Piece
+from magnet.datamodules.store.memory import Store
+from magnet.datamodules.store.reader import Folder, StoreError, body_hash
 
 
 class Prepared(MotionDataModule):

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from magnet.datamodules.arrays import AGAIN, OR_YOURS, open_npz, require
-from magnet.datamodules.fields import first_folder, listing, mapping, person, shortest, side_by_side
+from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.remocap_track import FPS, MAP, file_like, track
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, open_npz, require
+from magnet.datamodules.reading.fields import first_folder, listing, mapping, person, shortest, side_by_side
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.reading.remocap_track import FPS, MAP, file_like, track
 from magnet.unpickle import load_object_npy, load_pickle
 
 PLACES = ("", "LindyHop", "ReMoCap/LindyHop", "data/LindyHop")

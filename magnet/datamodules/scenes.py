@@ -13,14 +13,14 @@ import roma
 import torch
 from numpy.typing import NDArray
 
-from magnet.datamodules.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
-from magnet.datamodules.fields import gender_of, mapping, shape_numbers
-from magnet.datamodules.own import OwnReader
-from magnet.datamodules.own_files import Group, Seat
-from magnet.datamodules.recording import Axis, DataError, Family, Gender, Recording
+from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
+from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
+from magnet.datamodules.reading.own import OwnReader
+from magnet.datamodules.reading.own_files import Group, Seat
+from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.resample import resample_points, resample_rotations, resample_valid
-from magnet.datamodules.unpickle import load_pickle
 from magnet.motion.scene import Scene
+from magnet.unpickle import load_pickle
 
 WIDTH = 66
 """Numbers of the pelvis and 21 body joints."""

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.clip import SPLITS
 from magnet.synthesis import COUPLINGS, CoupledScene, synthesize
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 SEEDS = 1_000_000
 """Seeds a split owns: clips of different splits never share one."""
 

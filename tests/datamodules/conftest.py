@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from magnet.datamodules import catalogue
-from magnet.datamodules.common import Steps
-from magnet.datamodules.prepare import prepare
-from magnet.datamodules.prepare_takes import Order
-
-from .made import ENTRY, NAME, write
+from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.prepare import prepare
+from tests.datamodules.made import ENTRY, NAME, write
 
 
 @pytest.fixture(scope="module")

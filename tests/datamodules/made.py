@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from magnet.datamodules import catalogue
+from magnet.datamodules.clip import Split
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import Axis, DataError, Reader, Recording, Take
-from magnet.datamodules.windows import Split
+from magnet.datamodules.reading.recording import Axis, DataError, Reader, Recording, Take
 
 NAME = "made"
 SPLITS: tuple[Split, ...] = ("train", "train", "train", "val", "test")

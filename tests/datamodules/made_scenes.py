@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.catalogue import NAMES
-from magnet.datamodules.common import Steps
 from magnet.datamodules.duobox import DuoBoxReader
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
-from magnet.datamodules.prepare_takes import Order
-from magnet.datamodules.recording import Reader, Recording
-
-from .reading import fake_of, world_joints
+from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.reading.recording import Reader, Recording
+from tests.datamodules.readers import fake_of, world_joints
 
 MILLIMETRE = 0.001
 FITTED = 0.04

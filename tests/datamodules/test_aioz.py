@@ -11,9 +11,8 @@ import pytest
 
 from magnet.datamodules.aioz import AIOZ, AIOZReader
 from magnet.datamodules.fakes.aioz import write
-from magnet.datamodules.recording import DataError
-
-from .reading import Foreign, check_damaged, cut, rewritten
+from magnet.datamodules.reading.recording import DataError
+from tests.datamodules.readers import Foreign, check_damaged, cut, rewritten
 
 
 @pytest.fixture

@@ -17,9 +17,8 @@ from magnet import cli
 from magnet.cli_data_shown import SKIPPED_SHOWN
 from magnet.datamodules.catalogue import NAMES
 from magnet.datamodules.fakes import remocap as fake_remocap
-from magnet.datamodules.recording import Take
-
-from .reading import Foreign, cut, fake_of
+from magnet.datamodules.reading.recording import Take
+from tests.datamodules.readers import Foreign, cut, fake_of
 
 Damage = Callable[[Take], Any]
 SAID = {

@@ -11,12 +11,12 @@ import torch
 
 from magnet.body import load_body
 from magnet.datamodules.bvh import BVHReader, read_joints
-from magnet.datamodules.common import Steps, to_clips
 from magnet.datamodules.fakes.bvh import named, write_scenes
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
-from magnet.datamodules.own import FEW
-from magnet.datamodules.prepare_takes import convert
-from magnet.datamodules.recording import DataError, Reader
+from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.convert import convert
+from magnet.datamodules.reading.own import FEW
+from magnet.datamodules.reading.recording import DataError, Reader
 from magnet.export.bvh import save_bvh
 from magnet.synthesis import synthesize
 

@@ -12,9 +12,8 @@ import pytest
 
 from magnet.datamodules.chi3d import CHI3DReader
 from magnet.datamodules.fakes.chi3d import write
-from magnet.datamodules.recording import DataError
-
-from .reading import check_damaged, cut
+from magnet.datamodules.reading.recording import DataError
+from tests.datamodules.readers import check_damaged, cut
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from magnet.datamodules import cmu
-from magnet.datamodules.asf_amc import read_amc, read_asf
 from magnet.datamodules.cmu import CMU
-from magnet.datamodules.cmu_fit import ENDS, check_rate, fit_recordings, wrists_apart
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.cmu_fit import ENDS, check_rate, fit_recordings, wrists_apart
 from tests.datamodules.slow_cmu import slow_ends
 
 

@@ -15,7 +15,7 @@ from magnet import cli
 from magnet.datamodules import catalogue, cmu
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import Reader
+from magnet.datamodules.reading.recording import Reader
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}

@@ -11,7 +11,7 @@ import pytest
 
 from magnet.datamodules.dd100 import DD100Reader
 from magnet.datamodules.fakes import dd100 as fake
-from magnet.datamodules.recording import DataError, Recording
+from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.unpickle import load_object_npy
 
 TAKES, FRAMES = 4, 12

@@ -12,10 +12,9 @@ import pytest
 
 from magnet.datamodules.duobox import FITS, MAP, SKELETONS, SKIPPED, DuoBoxReader
 from magnet.datamodules.fakes import duobox as fake
-from magnet.datamodules.recording import DataError, Recording
+from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.unpickle import load_object_npy
-
-from .reading import world_joints
+from tests.datamodules.readers import world_joints
 
 TAKES, FRAMES = 2, 8
 PARTS = ("tr0", "tr1", "tr2", "tr3", "va0", "te0")

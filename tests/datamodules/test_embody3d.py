@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.check import recognise
 from magnet.datamodules.embody3d import Embody3D, Embody3DReader
 from magnet.datamodules.fakes.embody3d import write
-from magnet.datamodules.recording import DataError, Take
-
-from .reading import Foreign, cut, refused
+from magnet.datamodules.preparing.check import recognise
+from magnet.datamodules.reading.recording import DataError, Take
+from tests.datamodules.readers import Foreign, cut, refused
 
 
 @pytest.fixture

@@ -11,9 +11,8 @@ import pytest
 
 from magnet.datamodules.fakes.hi4d import write
 from magnet.datamodules.hi4d import Hi4DReader
-from magnet.datamodules.recording import DataError
-
-from .reading import Foreign, check_damaged, cut
+from magnet.datamodules.reading.recording import DataError
+from tests.datamodules.readers import Foreign, check_damaged, cut
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.common import Steps
 from magnet.datamodules.fakes import interx as fake
 from magnet.datamodules.interx import InterXReader
-from magnet.datamodules.prepare import prepare
-from magnet.datamodules.prepare_takes import Order
-from magnet.datamodules.recording import DataError, Recording
+from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.prepare import prepare
+from magnet.datamodules.reading.recording import DataError, Recording
 
 TAKES, FRAMES = 4, 4
 

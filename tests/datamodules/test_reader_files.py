@@ -16,12 +16,11 @@ import pytest
 
 from magnet import cli
 from magnet.datamodules.catalogue import NAMES
-from magnet.datamodules.common import Steps
 from magnet.datamodules.fakes.remocap import write_fits
-from magnet.datamodules.prepare_takes import Order, content, take_key
-
-from .made_scenes import FORMS, written
-from .reading import fake_of
+from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.convert import Order, content, take_key
+from tests.datamodules.made_scenes import FORMS, written
+from tests.datamodules.readers import fake_of
 
 SEEN: set[Path] | None = None
 """Files opened by this process, while they are of interest."""

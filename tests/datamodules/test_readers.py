@@ -16,19 +16,27 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from magnet.datamodules.catalogue import NAMES, OWN
-from magnet.datamodules.common import Steps
-from magnet.datamodules.draws import whole_clips
+from magnet.datamodules.clip import Split
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, turned
-from magnet.datamodules.prepare import chosen, prepare
-from magnet.datamodules.prepare_takes import convert
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError
+from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.convert import convert
+from magnet.datamodules.preparing.prepare import chosen, prepare
+from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.resample import times
-from magnet.datamodules.windows import Split
-
-from .made_scenes import FITTED, FORMS, MILLIMETRE, joints_at_30_fps, placed, random_scene, scene_of, written
-from .reading import fake_of, world_joints
+from magnet.datamodules.store.draws import whole_clips
+from tests.datamodules.made_scenes import (
+    FITTED,
+    FORMS,
+    MILLIMETRE,
+    joints_at_30_fps,
+    placed,
+    random_scene,
+    scene_of,
+    written,
+)
+from tests.datamodules.readers import fake_of, world_joints
 
 TAKES = {"duobox": 1, "remocap": 2, "bvh": 4, "scenes": 4}
 """Of a download, where one take has all splits, takes long to fit, or fewer are split in time; else 3."""

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.catalogue import NAMES, OWN
-from magnet.datamodules.common import Steps, to_clips
 from magnet.datamodules.fakes.motion import made_up_body
-from magnet.datamodules.recording import DataError, Reader, Recording
+from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.reading.recording import DataError, Reader, Recording
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 TAKES, FRAMES, ROUNDS, FILES = 3, 4, 2, 7

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.bvh_header import read_bvh_header
 from magnet.datamodules.fakes import remocap as fake
-from magnet.datamodules.recording import DataError, Recording
+from magnet.datamodules.reading.bvh_header import read_bvh_header
+from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.datamodules.remocap import ReMoCapReader
 from magnet.unpickle import load_pickle
 

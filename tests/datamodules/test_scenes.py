@@ -13,20 +13,19 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from magnet.body import load_body
-from magnet.datamodules.check import check_store
-from magnet.datamodules.common import Steps, to_clips
+from magnet.datamodules.clip import SPLITS
 from magnet.datamodules.fakes.motion import made_up_body, people
-from magnet.datamodules.prepare import prepare
-from magnet.datamodules.prepare_takes import Order
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.recording import DataError
+from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.check import check_store
+from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.prepare import prepare
+from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.scenes import ScenesReader
-from magnet.datamodules.store import SPLITS
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
-
-from .reading import Foreign, world_joints
+from tests.datamodules.readers import Foreign, world_joints
 
 TRUE = people(40, 2, 30.0, 3)
 

@@ -2,7 +2,7 @@ import pytest
 import roma
 import torch
 
-from magnet.datamodules.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.motion.frames import (
     canonical_frame,
     canonical_steps,

@@ -13,7 +13,7 @@ from magnet.body.base import JOINT_NAMES, PARENTS
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
-from magnet.datamodules.recording import Axis
+from magnet.datamodules.reading.recording import Axis
 
 FPS = 120.0
 AXIS: Axis = "+z"

@@ -11,9 +11,9 @@ import numpy as np
 import roma
 import torch
 
-from magnet.datamodules.arrays import hashed_split
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+from magnet.datamodules.reading.arrays import hashed_split
 
 FPS = 50.0
 ACTIONS = ("Grab", "Handshake", "Hit", "HoldingHands", "Hug", "Kick", "Posing", "Push")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magnet.body import Body, load_body
 from magnet.datamodules.fakes.body import Kind, write_body
-from magnet.datamodules.recording import Axis
+from magnet.datamodules.reading.recording import Axis
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 from magnet.synthesis.generate import FEWEST_FRAMES

@@ -18,7 +18,7 @@ import torch
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
-from magnet.datamodules.remocap_track import FPS
+from magnet.datamodules.reading.remocap_track import FPS
 
 SEQUENCES = (3, 8, 6, 5, 7, 9, 10, 16)
 TESTED = (6,)

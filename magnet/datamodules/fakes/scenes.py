@@ -12,7 +12,7 @@ import torch
 
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, made_up_body, people, turned
-from magnet.datamodules.recording import Axis
+from magnet.datamodules.reading.recording import Axis
 from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene
 

@@ -1,0 +1,72 @@
+"""A clip: one recording of people as every data set gives it, and which split it belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.motion.scene import Scene
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One recording of people who share a world: 30 fps, y up, floor at height 0.
+
+    Args:
+        scene: one scene (B = 1) of T frames whose agents are all present.
+        name: what reports call it, such as "60_05+61_05".
+        source: the data set or part of it, which mixture weights refer to.
+        split: train, val or test.
+
+    Raises:
+        ValueError: several scenes, an absent agent, a NaN, no frames or no such split; the message names the clip.
+    """
+
+    scene: Scene
+    name: str
+    source: str
+    split: Split
+
+    def __post_init__(self) -> None:
+        if self.split not in get_args(Split):
+            raise ValueError(f"clip {self.name}: got split {self.split!r}, expected one of {get_args(Split)}")
+        if self.scene.scenes != 1 or not self.scene.frames or not self.scene.agents:
+            shape = tuple(self.scene.T_world_root.shape[:3])
+            raise ValueError(f"clip {self.name}: got (B, T, P) = {shape}, expected one scene with frames and agents")
+        if not bool(self.scene.present.all()):
+            raise ValueError(f"clip {self.name}: has an absent agent; a clip holds only the people who are there")
+        for field in ("body_rot", "T_world_root", "betas"):
+            if not bool(getattr(self.scene, field).isfinite().all()):
+                raise ValueError(f"clip {self.name}: {field} holds NaN or infinity; mask such frames with `valid`")
+
+    @property
+    def frames(self) -> int:
+        return self.scene.frames
+
+    @property
+    def agents(self) -> int:
+        return self.scene.agents
+
+    def good(self) -> NDArray[np.bool_]:
+        """Which frames are valid. (T,) bool"""
+        if self.scene.valid is None:
+            return np.ones(self.frames, dtype=bool)
+        return self.scene.valid[0].cpu().numpy()
+
+
+def at_least(least: int, **numbers: int | None) -> None:
+    """Every number that is given is so large.
+
+    Raises:
+        ValueError: names the one that is not.
+    """
+    for name, number in numbers.items():
+        if number is not None and number < least:
+            raise ValueError(f"{name}: got {number}, expected at least {least}")

@@ -1,0 +1,1 @@
+"""Recordings to clips, and a whole download to a store."""

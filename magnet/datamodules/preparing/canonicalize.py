@@ -1,0 +1,301 @@
+"""The steps between any reader and clips: y up, 30 fps at exact times, floor at 0, origin, cuts at lost tracking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body import Body
+from magnet.body.family import title
+from magnet.body.fit import fit_body, floor_height
+from magnet.datamodules.clip import Clip, Split
+from magnet.datamodules.preparing import check_motion, check_people
+from magnet.datamodules.preparing.check_people import Flag
+from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.resample import FPS, resample_points, resample_rotations, resample_valid
+from magnet.motion.frames import rigid
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+STEPS_VERSION = 3
+"""Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
+FLOOR_PERCENTILE = 5.0
+"""Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
+
+R_WORLD_FILE: dict[Axis, Tensor] = {
+    "+y": torch.eye(3, dtype=torch.float64),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)),
+    "+z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64),
+    "-z": torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64),
+    "+x": torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64),
+    "-x": torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64),
+}
+"""Rotation that takes a file's up axis to +y."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What can be chosen about the common steps; part of what a prepared store is remembered by.
+
+    Args:
+        min_frames: shortest clip that is kept, at 30 fps.
+        up: the files' up axis, in place of the one that the reader declares; None: the reader's.
+        trust_fps: do not refuse people who move too fast or too slowly for the declared frame rate.
+    """
+
+    min_frames: int = 30
+    up: Axis | None = None
+    trust_fps: bool = False
+
+    def __post_init__(self) -> None:
+        if self.min_frames < 1:
+            raise ValueError(f"min_frames: got {self.min_frames}, expected at least 1")
+        if self.up is not None and self.up not in R_WORLD_FILE:
+            raise ValueError(f"up: got {self.up!r}, expected one of {', '.join(R_WORLD_FILE)}")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """T frames of P people at 30 fps on their way to clips."""
+
+    rotations: Tensor  # (T, P, 22, 3, 3) float32, the pelvis's in the world, others relative to their parents
+    pelvis: Tensor  # (T, P, 3) float64 metres, the joint
+    betas: Tensor  # (P, 10)
+    valid: NDArray[np.bool_]  # (T, P)
+    joints: Tensor  # (T, P, 22, 3) float32 world
+    notes: tuple[str, ...] = ()
+
+    def turned(self, R: Tensor) -> Motion:
+        """Seen from a world turned by R_new_old (3, 3) float64."""
+        rotations = self.rotations.clone()
+        rotations[:, :, 0] = R.float() @ rotations[:, :, 0]
+        return replace(self, rotations=rotations, pelvis=self.pelvis @ R.T, joints=self.joints @ R.T.float())
+
+    def lowered(self, height: float) -> Motion:
+        """With the floor, now at `height`, at 0."""
+        down = torch.tensor([0.0, height, 0.0], dtype=torch.float64)
+        return replace(self, pelvis=self.pelvis - down, joints=self.joints - down.float())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The clips of one take, and what should be known about them."""
+
+    clips: list[Clip]
+    notes: tuple[str, ...]
+
+
+def to_clips(
+    recording: Recording,
+    body: Body,
+    name: str,
+    source: str,
+    split: Split,
+    family: Family = "smplx",
+    steps: Steps | None = None,
+) -> Outcome:
+    """All common steps: a recording to clips of `body`.
+
+    Args:
+        recording: as read, at any rate and with any up axis.
+        body: whose shape numbers `betas` are; for positions: the body to fit.
+        name: the take's; pieces of it are called "name [start:stop]" by their frames at 30 fps.
+        source: the data set.
+        split: of the take.
+        family: of the data set.
+        steps: what can be chosen.
+
+    Raises:
+        DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or
+            positions that the body does not fit within 4 cm.
+    """
+    steps = steps or Steps()
+    recording = of_body(recording, body, source, family)
+    names = recording.persons
+    notes = list(recording.notes)
+    for p, gender in enumerate(recording.genders):  # of a body that nobody gave
+        notes.append(f"{names[p] if names else f'person {p}'}: {gender}; the shape is used with the body model given")
+    motion, flags, flagged = _moved(recording, body, steps)
+    quat = roma.rotmat_to_unitquat(motion.rotations).numpy()
+    flags += check_people.jumps(quat, motion.joints.numpy(), motion.valid, but=flags)
+    flagged += check_people.words(flags, names, FPS)
+    notes += [*flagged, *motion.notes]
+    jumps = check_motion.jumps(motion.pelvis.numpy(), motion.valid, FPS)
+    if len(jumps):
+        notes.append(f"cut at {len(jumps)} jumps of more than {check_motion.JUMP:g} m between frames")
+    if not steps.trust_fps:
+        check_motion.check_rate(
+            motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.said_fps or recording.fps, FPS
+        )
+    soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
+    motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
+    cuts = sorted({*jumps.tolist(), *(flag.start for flag in flags if flag.cut)})
+    return Outcome(_cut(motion, cuts, flagged, body, name, source, split, steps.min_frames), tuple(notes))
+
+
+def _moved(recording: Recording, body: Body, steps: Steps) -> tuple[Motion, list[Flag], list[str]]:
+    """At 30 fps, y up; what is wrong with whom there, and in words what was so in the file's own frames."""
+    up, valid = steps.up or recording.up, check_motion.usable(recording)
+    if recording.poses is not None:
+        check_motion.check_angles(recording.poses, valid, recording.persons)
+    valid, wild = check_people.screened(recording, valid)
+    if recording.poses is not None:
+        motion, flags = _posed(recording, valid, body)
+        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
+        motion = motion.turned(R_WORLD_FILE[up])
+        check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
+    else:
+        motion, flags = _fitted(recording, valid, body, up, steps)
+    return motion, flags, check_people.words(wild, recording.persons, recording.fps)
+
+
+def of_body(recording: Recording, body: Body, source: str, family: Family) -> Recording:
+    """The recording if its shape numbers can be used with `body`.
+
+    Where files may hold anything (`family` any), rotations of SMPL's family go with the open body in its mean shape.
+
+    Raises:
+        DataError: they are another body's.
+    """
+    if recording.poses is None or recording.body == body.id:
+        return recording
+    if recording.body:
+        raise DataError(
+            f"its shape numbers belong to body {recording.body!r}, not to {body.id!r}: give that one's file with "
+            "--body, or no --body for the open one"
+        )
+    if not body.id.startswith("open"):
+        if recording.shapes_of and body.family not in ("", recording.shapes_of):
+            raise DataError(
+                f"its shape numbers are {title(recording.shapes_of)}'s by the number of joints, but body {body.id!r} "
+                f"is {title(body.family)}'s: give that one's file with --body or --bodies, or none for the open one"
+            )
+        return recording
+    if family != "any":
+        raise DataError(
+            f"rotations and shape numbers of {source} belong to SMPL-X's body, not to {body.id}: "
+            "give --body SMPLX_NEUTRAL.npz"
+        )
+    said = f"rotations of SMPL's family on body {body.id} in its mean shape: limbs are approximate without --body FILE"
+    flat = np.zeros_like(np.asarray(recording.betas))
+    return replace(recording, betas=flat, genders=(), notes=(*recording.notes, said))
+
+
+# -- the two kinds of recording ----------------------------------------------------------------
+
+
+def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[Motion, list[Flag]]:
+    place = recording.transl if recording.pelvis is None else recording.pelvis
+    assert recording.poses is not None and place is not None and recording.betas is not None
+    poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
+    place = check_motion.filled(np.asarray(place, dtype=np.float64), valid)
+    check_motion.check_apart(place, valid)
+    betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
+    quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
+    quat = resample_rotations(quat, recording.fps)
+    rotations = roma.unitquat_to_rotmat(quat).float()
+    rest = body.rest_joints(betas)
+    check_people.check_stature(rest.numpy(), recording.persons)
+    # SMPL's root turns about the rest pelvis and is moved by transl after that
+    pelvis = resample_points(torch.from_numpy(place), recording.fps)
+    if recording.pelvis is None:
+        pelvis = pelvis + rest[:, 0]
+    joints = body.forward_kinematics(rotations[:, :, 1:], rigid(rotations[:, :, 0], pelvis.float()), betas.float())
+    good = resample_valid(valid, recording.fps)
+    flags = check_people.frozen(*check_people.held(pelvis.numpy(), quat.numpy()), good)
+    good = check_people.without(good, flags, recording.persons, FPS)
+    return Motion(rotations, pelvis, betas, good, joints), flags
+
+
+def _fitted(
+    recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, steps: Steps
+) -> tuple[Motion, list[Flag]]:
+    assert recording.positions is not None
+    positions = check_motion.filled(np.asarray(recording.positions, dtype=np.float64), valid)
+    points = resample_points(torch.from_numpy(positions), recording.fps)
+    good = resample_valid(valid, recording.fps)
+    flags = check_people.frozen(*check_people.held_points(points.numpy()), good)
+    good = check_people.without(good, flags, recording.persons, FPS)
+    check_motion.check_limbs(points.numpy(), recording.joints, good)
+    spread = np.full((*points.shape[:2], BODY_JOINTS, 3), np.nan)
+    spread[:, :, list(recording.joints)] = points.numpy()
+    check_motion.check_up(up, spread, good, chosen=steps.up is not None)
+    flags += check_people.jumps(None, spread, good)
+    spread = spread @ R_WORLD_FILE[up].numpy().T
+    if np.isfinite(spread[:, :, check_motion.WALKING]).all():
+        check_motion.check_apart(spread[:, :, 0], good)
+        check_motion.check_lengths(spread, spread[:, :, 0], good)
+    if not steps.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
+        check_motion.check_rate(
+            spread[:, :, check_motion.WALKING], good, recording.said_fps or recording.fps, FPS
+        )  # before a fit of minutes
+    targets = (points @ R_WORLD_FILE[up].T).float()
+    try:
+        if recording.rigs:
+            people, offs = zip(*(rig.onto(body, up, FPS) for rig in recording.rigs), strict=True)
+            scene = _side_by_side(people)
+            residual = torch.stack(offs, dim=1)
+        else:
+            fit = fit_body(targets, recording.joints, body, valid=torch.from_numpy(good), grounded=True, fps=FPS)
+            scene, residual = fit.scene, fit.residual
+    except ValueError as error:
+        raise DataError(str(error)) from error
+    rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
+    off = 100 * residual.numpy()[good]
+    said = f"mean residual {off.mean():.1f} cm, 95 % below {np.percentile(off, 95):.1f} cm"
+    notes = (f"body {body.id} fitted to {'skeletons' if recording.rigs else 'positions'}: {said}",)
+    pelvis = scene.T_world_root[0, :, :, :3, 3].double()
+    return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0], notes), flags
+
+
+def _side_by_side(people: Sequence[Scene]) -> Scene:
+    return people[0].replace(
+        body_rot=torch.cat([person.body_rot for person in people], dim=2),
+        T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
+        betas=torch.cat([person.betas for person in people], dim=1),
+        present=torch.cat([person.present for person in people], dim=1),
+        valid=None,
+    )
+
+
+# -- cutting -----------------------------------------------------------------------------------
+
+
+def _cut(
+    motion: Motion, cuts: list[int], flagged: list[str], body: Body, name: str, source: str, split: Split, least: int
+) -> list[Clip]:
+    together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
+    frames = len(together)
+    pieces: list[tuple[int, int]] = []
+    edges = [0, *cuts, frames]
+    for first, end in pairwise(edges):
+        pieces += [(first + a, first + b) for a, b in check_people.stretches(together[first:end], least)]
+    if not pieces:
+        raise DataError(
+            f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "
+            f"{int(together.sum())} of them valid{''.join(f'; {one}' for one in flagged)}; lower --min_frames to keep "
+            f"shorter ones"
+        )
+    clips = []
+    for start, stop in pieces:
+        label = name if (start, stop) == (0, frames) else f"{name} [{start}:{stop}]"
+        pelvis = motion.pelvis[start:stop]
+        origin = pelvis[0].mean(dim=0) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+        rotations = motion.rotations[start:stop]
+        scene = Scene(
+            body_rot=rotations[None, :, :, 1:],
+            T_world_root=rigid(rotations[:, :, 0], (pelvis - origin).float())[None],
+            betas=motion.betas.float()[None],
+            present=torch.ones(1, len(motion.betas), dtype=torch.bool),
+            fps=FPS,
+            body=body.id,
+            names=(label,),
+        )
+        clips.append(Clip(scene, label, source, split))
+    return clips

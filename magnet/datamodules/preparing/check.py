@@ -1,0 +1,355 @@
+"""`magnet data check`: every assertion on a store or a download, what it holds, and a picture of some scenes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+import roma
+import torch
+
+from magnet.body import Body, load_body
+from magnet.datamodules import catalogue
+from magnet.datamodules.clip import SPLITS, Split, at_least
+from magnet.datamodules.cmu import CMU
+from magnet.datamodules.preparing import check_people
+from magnet.datamodules.preparing.convert import Order, Part, Tell, convert_all
+from magnet.datamodules.preparing.prepare import absent_note, chosen
+from magnet.datamodules.reading.fields import listing
+from magnet.datamodules.reading.recording import DataError, Reader
+from magnet.datamodules.store.reader import SCALE, Folder, StoreError, body_hash, decode, file_hash
+from magnet.datamodules.store.reader import Part as Stored
+from magnet.export.picture import contact_sheet
+from magnet.motion.scene import Scene
+
+UNIT = 2.0
+"""By how much a stored quaternion's length may differ from the scale: rounding to whole numbers moves it by one."""
+PELVIS = (-1.0, 6.0)
+"""Metres over the floor that pelvises are found at, climbing and lifting included."""
+SHOWN, SHOWN_FRAMES = 4, 120
+"""Clips in the picture, and frames of each."""
+
+
+@dataclass
+class Checked:
+    """What a check found."""
+
+    name: str  # of the data set
+    title: str
+    problems: list[str] = field(default_factory=list)
+    counts: dict[Split, Counter[str]] = field(default_factory=dict)  # takes, clips, frames, person frames, N people
+    skipped: list[tuple[str, str]] = field(default_factory=list)  # take, why
+    notes: list[str] = field(default_factory=list)
+    scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
+
+    def clips_by_people(self) -> dict[Split, dict[int, int]]:
+        """Clips of each split that has any, by number of people."""
+        of = {
+            split: [(n.removeprefix("of "), k) for n, k in c.items() if "of " in n] for split, c in self.counts.items()
+        }
+        return {split: {int(n): count for n, count in counts} for split, counts in of.items()}
+
+    def count_skipped(self, takes: int) -> None:
+        """Skipped ones of so many takes are a problem."""
+        if not self.counts:
+            self.problems.append(f"none of {takes} takes can be used")
+        elif self.skipped:
+            self.problems.append(f"{len(self.skipped)} of {takes} takes broke an assertion; they are listed above")
+
+
+def noted(note: str, takes: list[str]) -> str:
+    """What was found, and of which take or how many."""
+    return f"{note} ({takes[0] if len(takes) == 1 else f'{len(takes)} takes'})"
+
+
+def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], people: list[int]) -> None:
+    """Add one take's clips."""
+    count = counts.setdefault(split, Counter())
+    count["takes"] += 1
+    count["clips"] += len(frames)
+    count["frames"] += sum(frames)
+    count["person frames"] += sum(f * p for f, p in zip(frames, people, strict=True))
+    for number in people:
+        count[f"of {number}"] += 1
+
+
+# -- a store -----------------------------------------------------------------------------------
+
+
+def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = None) -> Checked:
+    """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
+
+    Args:
+        folder: the opened store.
+        body: its body, to check that it is; None: not checked.
+        tell: is told of progress, by file.
+    """
+    manifest = folder.manifest
+    found = Checked(manifest["name"], manifest["title"])
+    files = folder.files()
+    for number, (name, digest) in enumerate(sorted(files.items())):
+        if tell is not None:
+            tell(name, number, 2 * len(files))
+        path = folder.path / name
+        if not path.is_file():
+            found.problems.append(f"{name} is missing; prepare the store again")
+        elif file_hash(path) != digest:
+            found.problems.append(f"{name} is damaged: its checksum is not the manifest's; prepare the store again")
+    if body is not None and body_hash(body) != manifest["body"]["sha256"]:
+        theirs = manifest["body"]["id"]
+        found.problems.append(f"the store is of body {theirs!r}, and {body.id!r} has other joints at rest")
+    found.skipped = [(entry["take"], entry["why"]) for entry in manifest["skipped"]]
+    found.notes = [noted(entry["note"], entry["takes"]) for entry in manifest["notes"]]
+    if absent := manifest.get("listed but not there"):
+        found.notes.append(absent_note(absent))
+    if found.problems:
+        return found
+    try:
+        for split in SPLITS:
+            _check_split(folder, split, found)
+    except StoreError as error:
+        found.problems.append(str(error))
+    return found
+
+
+def _check_split(folder: Folder, split: Split, found: Checked) -> None:
+    part, said = folder.split(split), folder.manifest["splits"][split]
+    take_of: dict[str, tuple[list[int], list[int]]] = {}
+    for c, take in enumerate(part.take):
+        frames, people = take_of.setdefault(take, ([], []))
+        frames.append(int(part.frames[c]))
+        people.append(int(part.people[c]))
+    for frames, people in take_of.values():
+        tally(found.counts, split, frames, people)
+    counted = found.counts.get(split, Counter())
+    for name in ("takes", "clips", "frames", "person frames"):
+        if counted[name] != said[name]:
+            found.problems.append(f"split {split}: the index has {counted[name]} {name}, the manifest {said[name]}")
+    total = int(part.ends[-1]) if len(part.ends) else 0
+    if total != counted["person frames"]:
+        found.problems.append(f"split {split}: shards have {total} rows, the index {counted['person frames']}")
+        return
+    if len(set(part.name)) < len(part.name):
+        found.problems.append(f"split {split}: clips are named twice")
+    if not np.isfinite(part.betas).all():
+        found.problems.append(f"split {split}: shape numbers hold NaN or infinity")
+    for c, name in enumerate(part.name):
+        wrong = _wrong_rows(part, c)
+        for one in [wrong] if wrong else _wrong_people(part, c, own=not folder.manifest["body"].get("genders")):
+            found.problems.append(f"clip {name}: {one}; prepare the store again")
+    found.scenes += _scenes(folder, part, SHOWN - len(found.scenes))
+
+
+def _wrong_rows(part: Stored, clip: int) -> str | None:
+    rows = part.rows(clip)
+    length = np.sqrt(np.square(rows["rotations"].astype(np.float32)).sum(axis=-1))
+    if np.abs(length - SCALE).max() > UNIT:
+        return "rotations are not unit quaternions"
+    pelvis = rows["pelvis"]
+    if not np.isfinite(pelvis).all():
+        return "pelvises hold NaN or infinity"
+    low, high = float(pelvis[..., 1].min()), float(pelvis[..., 1].max())
+    if low < PELVIS[0] or high > PELVIS[1]:
+        return f"pelvises are {low:.1f} to {high:.1f} m over the floor, expected {PELVIS[0]:g} to {PELVIS[1]:g} m"
+    return None
+
+
+def _wrong_people(part: Stored, clip: int, own: bool) -> list[str]:
+    """By person and frame; shape numbers only where they are those of the data set, and not of another body."""
+    names, rows = part.persons_of()[clip], part.rows(clip)
+    quat, pelvis = (rows[key].swapaxes(0, 1).astype(np.float32) for key in ("rotations", "pelvis"))
+    flags = check_people.seen(quat, pelvis, np.ones(pelvis.shape[:2], dtype=bool))
+    said = check_people.words(flags, names, 30.0, met=False)
+    try:
+        check_people.check_shapes(part.betas_of(clip) if own else part.betas_of(clip)[:0], names)
+    except DataError as error:
+        said.append(str(error))
+    return said
+
+
+def _scenes(folder: Folder, part: Stored, most: int) -> list[tuple[str, Scene]]:
+    """Some clips, evenly spread over those that are long enough."""
+    longest = int(part.frames.max()) if len(part.frames) else 0
+    good = np.flatnonzero(part.frames >= min(SHOWN_FRAMES, longest))
+    count = min(most, 2, len(good))
+    chosen_clips = good[np.arange(count) * len(good) // max(count, 1)]
+    return [(part.name[c], _scene(part.rows(c), part.betas_of(c), folder.body)) for c in chosen_clips.tolist()]
+
+
+def _scene(rows: np.ndarray, betas: np.ndarray, body: str) -> Scene:
+    rows = rows[:, :SHOWN_FRAMES]
+    body_rot, T_world_root = decode(*(torch.from_numpy(rows[key].copy()) for key in ("rotations", "pelvis")))
+    return Scene(
+        body_rot=body_rot.transpose(0, 1)[None],
+        T_world_root=T_world_root.transpose(0, 1)[None],
+        betas=torch.from_numpy(np.array(betas))[None],
+        present=torch.ones(1, len(rows), dtype=torch.bool),
+        body=body,
+    )
+
+
+# -- a download --------------------------------------------------------------------------------
+
+
+def recognise(root: Path) -> str:
+    """Which data set's layout lies under a folder.
+
+    Raises:
+        ValueError: none does, or several do, or a table of a user's own recordings is wrong.
+    """
+    found = _readable(root, [name for name in catalogue.NAMES if name not in catalogue.OWN])
+    with suppress(OSError):
+        found += ["cmu"] if CMU(str(root)).takes() else []
+    found = found or _own(root)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name")
+    raise ValueError(
+        f"{root} is neither a prepared store nor a download that is known; it holds {listing(root)}; give "
+        "another folder, or say which data set it should be with --name, to be told what is missing"
+    )
+
+
+def _readable(root: Path, names: Sequence[str]) -> list[str]:
+    """Those data sets whose reader finds takes."""
+    found = []
+    for name in names:
+        with suppress(ValueError, OSError):  # what this one lacks
+            found += [name] if catalogue.find(name).load_reader()(root).found() else []
+    return found
+
+
+def _own(root: Path) -> list[str]:
+    """Which of a user's own kinds of files there are. What is wrong with a table of them is raised."""
+    readers = []
+    for name in catalogue.OWN:
+        with suppress(ValueError, OSError):  # no such files
+            readers.append(catalogue.find(name).load_reader()(root))
+    return [reader.name for reader in readers if reader.found()]
+
+
+def check_download(
+    order: Order,
+    workers: int = 1,
+    splits: dict[str, Split] | None = None,
+    limit: int | None = None,
+    tell: Tell | None = None,
+) -> Checked:
+    """Every take of a download read and put through the common steps; nothing is written.
+
+    Args:
+        order: which data set, where, and how.
+        workers: processes.
+        splits: as for `prepare`.
+        limit: as for `prepare`.
+        tell: is told of progress.
+
+    Raises:
+        DataError: there are no takes at all.
+        ValueError: a list of splits that does not fit, or a number out of range.
+    """
+    at_least(1, workers=workers, limit=limit)
+    reader: Reader = order.reader()
+    body = order.body()
+    found = Checked(reader.name, reader.title)
+    use = chosen(reader, splits, limit)
+    takes = use.takes
+    found.notes += reader.summary()
+    if use.left_out:
+        whose = "the data set's rule" if splits is None else "the list given"
+        found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")
+    if use.absent:
+        found.notes.append(absent_note(use.absent))
+    notes: dict[str, list[str]] = {}
+    parts: dict[str, Part] = {}
+    for take, part in convert_all(order, takes, lambda take: None, workers, tell):
+        if part.error is None and len(found.scenes) < SHOWN:
+            P, T = part.people[0], part.frames[0]
+            found.scenes.append((part.names[0], _scene(part.rows[: P * T].reshape(P, T), part.betas[:P], body.id)))
+        parts[take.name] = part
+    for take in takes:
+        part = parts[take.name]
+        if part.error is not None:
+            found.skipped.append((take.name, part.error))
+            continue
+        for note in part.notes:
+            notes.setdefault(note, []).append(take.name)
+        tally(found.counts, take.split or "train", list(part.frames), list(part.people))
+    found.notes += [noted(note, takes) for note, takes in notes.items()]
+    found.count_skipped(len(takes))
+    return found
+
+
+def check_cmu(data: CMU) -> Checked:
+    """Every recording of CMU fitted as for training, into its cache; a second check only reads that.
+
+    Raises:
+        FileNotFoundError: the folder holds no recordings.
+    """
+    found = Checked("cmu", "CMU Graphics Lab Motion Capture Database")
+    found.skipped = list(data.fit_takes().items())
+    for split in SPLITS:
+        clips = data.clips(split)
+        for clip in clips:
+            tally(found.counts, split, [clip.frames], [clip.agents])
+            flags = _flags(clip.scene, data.body)
+            found.notes += [f"{clip.name}, {said}" for said in check_people.words(flags, (), 30.0, met=False)]
+        seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
+        found.scenes += [(clip.name, clip.scene.cut(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
+    found.scenes = found.scenes[:SHOWN]
+    takes = data.takes()
+    reports = [report for take in takes if "frames" in (report := data.report(take))]
+    if limbs := [report["limb error cm"] for report in reports if report["limb error cm"] is not None]:
+        found.notes.append(f"body {data.body.id} fitted: limbs {mean(limbs):.1f} cm off, {max(limbs):.1f} at worst")
+    masked, frames = (sum(report[key] for report in reports) for key in ("frames masked", "frames"))
+    found.notes.append(f"{masked} of {frames} frames are masked; each take's report lies in {data.cache_folder}")
+    found.count_skipped(len(takes))
+    return found
+
+
+def _flags(scene: Scene, body: Body) -> list[check_people.Flag]:
+    """Who is held, and what jumps, in a scene (B = 1)."""
+    T_world_root = scene.T_world_root[0]
+    rotations = torch.cat([T_world_root[:, :, None, :3, :3], scene.body_rot[0]], dim=2)
+    valid = torch.ones(scene.frames, dtype=torch.bool) if scene.valid is None else scene.valid[0]
+    return check_people.seen(
+        roma.rotmat_to_unitquat(rotations).numpy(),
+        T_world_root[..., :3, 3].numpy(),
+        valid[:, None].expand(-1, scene.agents).numpy(),
+        body.joints(scene)[0].numpy(),
+    )
+
+
+# -- the picture -------------------------------------------------------------------------------
+
+
+def draw(found: Checked, path: Path, body: Body | None) -> Path | None:
+    """A contact sheet of the scenes kept, as skeletons; None when there are none.
+
+    Without the store's own body the open one is drawn, in its mean shape.
+    """
+    if not found.scenes:
+        return None
+    frames = min(scene.frames for _, scene in found.scenes)
+    scenes = [(name, scene.cut(0, frames)) for name, scene in found.scenes]
+    title = found.title
+    if body is None or body.id != scenes[0][1].body:
+        body = load_body()
+        scenes = [(n, s.replace(body=body.id, betas=torch.zeros_like(s.betas))) for n, s in scenes]
+        title += " (drawn with the open body's mean shape)"
+    return contact_sheet(scenes, path, context_frames=0, body=body, style="capsules", title=title)
+
+
+def lines(found: Checked) -> Iterator[tuple[str, ...]]:
+    """Rows of the table of counts: split, takes, clips by people, frames, minutes."""
+    for split in SPLITS:
+        count = found.counts.get(split, Counter())
+        people = ", ".join(f"{n} {what}" for what, n in sorted(count.items()) if what.startswith("of "))
+        minutes = count["frames"] / 30 / 60
+        yield split, f"{count['takes']}", f"{count['clips']} ({people})", f"{count['frames']:,}", f"{minutes:.1f}"

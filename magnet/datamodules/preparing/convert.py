@@ -1,0 +1,327 @@
+"""One take of a download to one part on disk: what the worker processes of `prepare` do."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magnet.body import Body, load_body
+from magnet.body.family import title, titles
+from magnet.datamodules import catalogue
+from magnet.datamodules.preparing.canonicalize import STEPS_VERSION, Steps, to_clips
+from magnet.datamodules.preparing.check_people import check_shapes
+from magnet.datamodules.preparing.genders import load_bodies, one_body
+from magnet.datamodules.reading.recording import Gender, Reader, Take
+from magnet.datamodules.store.reader import FORMAT, body_hash, file_hash, write_whole
+from magnet.datamodules.store.rows import ROW, encode
+from magnet.threads import one_thread
+
+PART_VERSION = 2
+"""Raise it whenever a part holds something else: takes prepared before are then made anew."""
+BODY_FROM = {
+    "smplx": "https://smpl-x.is.tue.mpg.de (register; SMPLX_NEUTRAL.npz or .pkl)",
+    "smpl": "https://smpl.is.tue.mpg.de for SMPL, https://mano.is.tue.mpg.de for SMPL-H (register; npz or pkl)",
+}
+
+
+def families_of(kind: type[Reader]) -> tuple[str, ...]:
+    """Families of bodies that a data set's shape numbers belong to; none where it has no such numbers."""
+    return kind.shapes_of or ((kind.family,) if kind.family in BODY_FROM else ())
+
+
+def require_family(kind: type[Reader], body: Body, option: str, file: str) -> None:
+    """Refuse a body whose tree of joints is another family's: its shape numbers mean something else.
+
+    Raises:
+        ValueError: it is.
+    """
+    families = families_of(kind)
+    if not families or body.family in ("", *families) or body.id.startswith("open"):
+        return
+    other = (
+        "" if option == "--bodies" else f", or with --bodies beside this one, to have everybody as {title(body.family)}"
+    )
+    raise ValueError(
+        f"{option} {file}: body {body.id!r} is {title(body.family)}'s by its tree of joints, but {kind.title} holds "
+        f"shape numbers of {titles(families)}: give that body's file with {option}{other}; it is from "
+        f"{BODY_FROM[kind.family]}"
+    )
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be prepared, and how; plain values that every process builds its own reader and body from.
+
+    Args:
+        name: of the data set in the catalogue.
+        root: folder of the download.
+        options: of the reader's constructor; files and folders among them as `Path`.
+        body_file: path of the body file, or "open".
+        steps: what can be chosen about the common steps.
+        body_files: folder or files of gendered bodies that shape numbers belong to; none: all belong to `body_file`.
+    """
+
+    name: str
+    root: str
+    options: dict[str, Any]
+    body_file: str
+    steps: Steps
+    body_files: tuple[str, ...] = ()
+
+    def reader(self) -> Reader:
+        """The data set's reader on the download."""
+        return catalogue.find(self.name).load_reader()(self.root, **self.options)
+
+    def body(self) -> Body:
+        """The body model.
+
+        Raises:
+            ValueError: the data set holds shape numbers, but no body file was given, or another family's; says where to
+                get it.
+        """
+        kind = catalogue.find(self.name).load_reader()
+        if self.body_file == "open" and kind.family not in ("positions", "any"):
+            raise ValueError(
+                f"{kind.title} holds shape numbers of {kind.family.upper()}: give the body's file with --body FILE, "
+                f"from {BODY_FROM[kind.family]}; `magnet data fake` writes a made-up body.npz beside its files"
+            )
+        body = load_body(self.body_file)
+        if not self.body_files:
+            require_family(kind, body, "--body", self.body_file)
+        return body
+
+    def bodies(self) -> dict[Gender, Body]:
+        """Gendered bodies that shape numbers belong to.
+
+        Raises:
+            ValueError: files that are not there, not to be told apart, or of another family.
+        """
+        kind = catalogue.find(self.name).load_reader()
+        bodies = load_bodies(self.body_files, families_of(kind)) if self.body_files else {}
+        for gender, body in bodies.items():
+            require_family(kind, body, "--bodies", f"the {gender} one")
+        return bodies
+
+    def settings(self, body: Body) -> dict[str, Any]:
+        """Everything besides a take's files that its part depends on."""
+        kind = catalogue.find(self.name).load_reader()
+        return {
+            "format": FORMAT,
+            "part version": PART_VERSION,
+            "steps version": STEPS_VERSION,
+            "steps": self.steps.__dict__,
+            "reader": self.name,
+            "reader version": kind.version,
+            "options": {key: content(value) for key, value in self.options.items()},
+            "body": body_hash(body),
+            "bodies": {gender: body_hash(one) for gender, one in self.bodies().items()},
+        }
+
+
+def content(value: Any) -> str:
+    """An option's value as text: of a file or folder what it is called and holds, so that its place is no part of it.
+
+    Raises:
+        ValueError: no such file or folder.
+    """
+    if not isinstance(value, Path):
+        return str(value)
+    if not value.exists():
+        raise ValueError(f"{value}: no such file or folder")
+    inside = sorted(path for path in value.rglob("*") if path.is_file()) if value.is_dir() else [value]
+    listed = [[path.relative_to(value).as_posix(), file_hash(path)] for path in inside]
+    return f"{value.resolve().name} ({hashlib.sha256(json.dumps(listed).encode()).hexdigest()[:16]})"
+
+
+def take_key(take: Take, root: Path, settings: dict[str, Any]) -> str:
+    """Name of a take's part: another size or time of a file, one that came or went, another setting: another part."""
+    files: list[list[str | int]] = []
+    for path in (*take.files, *take.also):
+        try:
+            stat = path.stat()
+        except OSError:
+            files.append([os.path.relpath(path, root), "missing"])
+        else:
+            files.append([os.path.relpath(path, root), stat.st_size, stat.st_mtime_ns])
+    text = json.dumps([take.name, files, settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one take became."""
+
+    error: str | None
+    notes: tuple[str, ...]
+    names: tuple[str, ...]  # of its clips
+    frames: tuple[int, ...]
+    people: tuple[int, ...]
+    betas: NDArray[np.float32]  # (people of all its clips, 10)
+    rows: NDArray[np.void]  # (rows of all its clips,) of `ROW`
+    persons: tuple[str, ...] = ()  # names or roles of the people in all its clips; (): none are known
+
+    @staticmethod
+    def failed(error: str) -> Part:
+        """A take that gives nothing."""
+        return Part(shortened(error), (), (), (), (), np.zeros((0, 10), dtype=np.float32), np.zeros(0, dtype=ROW))
+
+    def save(self, path: Path) -> None:
+        """All of it or nothing."""
+        facts = {name: getattr(self, name) for name in ("error", "notes", "names", "frames", "people", "persons")}
+        text = np.array(json.dumps(facts))
+
+        def write(out: Any) -> None:
+            for array in (text, self.betas, self.rows):
+                np.lib.format.write_array(out, array, allow_pickle=False)
+
+        write_whole(path.parent, lambda _: path.name, write)
+
+    def saved(self, path: Path) -> Part:
+        """Itself without rows, once it is on disk."""
+        self.save(path)
+        return replace(self, rows=self.rows[:0])
+
+    @staticmethod
+    def load(path: Path, rows: bool = True) -> Part:
+        """What `save` wrote, with or without its rows.
+
+        Raises:
+            ValueError: it is damaged.
+        """
+        with path.open("rb") as file:
+            facts = json.loads(str(np.lib.format.read_array(file, allow_pickle=False)))
+            betas = np.lib.format.read_array(file, allow_pickle=False)
+            array = np.lib.format.read_array(file, allow_pickle=False) if rows else np.zeros(0, dtype=ROW)
+        lists = {name: tuple(facts[name]) for name in ("notes", "names", "frames", "people", "persons")}
+        return Part(error=facts["error"], betas=betas, rows=array, **lists)
+
+
+def convert(reader: Reader, take: Take, body: Body, steps: Steps, bodies: Mapping[Gender, Body] | None = None) -> Part:
+    """Read a take and put it through the common steps; whatever is wrong with it becomes the part's error."""
+    try:
+        recording = reader.read(take)
+        if recording.betas is not None:
+            check_shapes(recording.betas, recording.persons)
+        recording = one_body(recording, bodies or {}, body)
+        made = to_clips(recording, body, take.name, reader.name, take.split or "train", reader.family, steps)
+    except (ValueError, OSError) as error:
+        return Part.failed(relative(str(error) or type(error).__name__, reader.root))
+    except Exception as error:  # a reader that does not know what to say: the others go on
+        return Part.failed(relative(f"{type(error).__name__}: {error}", reader.root))
+    clips = made.clips
+    return Part(
+        error=None,
+        notes=tuple(relative(note, reader.root) for note in made.notes),
+        names=tuple(clip.name for clip in clips),
+        frames=tuple(clip.frames for clip in clips),
+        people=tuple(clip.agents for clip in clips),
+        betas=np.concatenate([clip.scene.betas[0].float().numpy() for clip in clips]),
+        rows=np.concatenate([encode(clip.scene) for clip in clips]),
+        persons=recording.persons,
+    )
+
+
+def shortened(text: str, most: int = 600) -> str:
+    """A message that fits a list of them."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
+
+
+def relative(text: str, root: Path) -> str:
+    """A message without the folder of the download, so that a store does not depend on where it was made."""
+    for path in sorted({str(root), str(root.absolute()), str(root.resolve())}, key=len, reverse=True):
+        text = text.replace(path + os.sep, "")
+    return text
+
+
+# -- processes ---------------------------------------------------------------------------------
+
+_HERE: dict[str, Any] = {}
+
+
+def begin(order: Order) -> None:
+    """Set up a worker process: one thread, its own reader and body; it ends when its parent is gone."""
+    torch.set_num_threads(1)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    _HERE.update(order=order, reader=order.reader(), body=order.body(), bodies=order.bodies())
+
+
+def _follow_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def work(take: Take, path: Path | None) -> Part:
+    """Make one part in a worker process, on disk if there is a path. Returns it without its rows if so."""
+    part = convert(_HERE["reader"], take, _HERE["body"], _HERE["order"].steps, _HERE["bodies"])
+    return part if path is None else part.saved(path)
+
+
+Tell = Callable[[str, int, int], None]
+"""Called with what is being done, how many bytes of the download are done, and how many there are."""
+
+
+def convert_all(
+    order: Order,
+    takes: list[Take],
+    file: Callable[[Take], Path | None],
+    workers: int,
+    tell: Tell | None = None,
+) -> Iterator[tuple[Take, Part]]:
+    """Make the parts of all takes as they are done, each on disk, whole, where `file` says; in any order.
+
+    Raises:
+        OSError: a worker process died.
+    """
+    size = {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
+    total, done = sum(size.values()), 0
+    tell = tell or (lambda name, done, total: None)
+    if takes:
+        tell(takes[0].name, 0, total)
+    for take, part in _converted(order, sorted(takes, key=lambda take: -size[take.name]), file, workers):
+        done += size[take.name]
+        tell(take.name, done, total)
+        yield take, part
+
+
+def _converted(
+    order: Order, takes: list[Take], file: Callable[[Take], Path | None], workers: int
+) -> Iterator[tuple[Take, Part]]:
+    if workers == 1 or len(takes) < 2:
+        reader, body, bodies = order.reader(), order.body(), order.bodies()
+        for take in takes:
+            with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
+                part, path = convert(reader, take, body, order.steps, bodies), file(take)
+                part = part if path is None else part.saved(path)
+            yield take, part
+        return
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(order,))
+    try:
+        running = {pool.submit(work, take, file(take)): take for take in takes}
+        while running:
+            ready, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ready:
+                yield running.pop(future), future.result()
+    except BrokenProcessPool as error:
+        raise OSError(
+            "a worker process died, perhaps for want of memory: run the same command again with fewer --workers; "
+            "finished takes are kept"
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

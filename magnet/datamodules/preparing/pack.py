@@ -1,0 +1,170 @@
+"""Parts of takes to the shards, index and manifest of a store: in the order of takes, so that bytes do not vary."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.datamodules.clip import SPLITS, Split
+from magnet.datamodules.preparing.convert import Part
+from magnet.datamodules.reading.recording import Take
+from magnet.datamodules.resample import FPS
+from magnet.datamodules.store.reader import FORMAT, MANIFEST, Folder, as_json, write_whole
+from magnet.datamodules.store.rows import ROW
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a take's rows are: in its part, or still in the present store."""
+
+    take: Take
+    file: Path
+    place: dict[str, Any] | None  # in the present store
+
+    def head(self, old: Folder | None) -> Part:
+        """All but the rows."""
+        return self._stored(old, False) if self._kept(old) else Part.load(self.file, rows=False)
+
+    def whole(self, old: Folder | None) -> Part:
+        """With its rows."""
+        return self._stored(old, True) if self._kept(old) else Part.load(self.file)
+
+    def _kept(self, old: Folder | None) -> bool:
+        return self.place is not None and old is not None
+
+    def _stored(self, old: Folder | None, rows: bool) -> Part:
+        assert self.place is not None and old is not None
+        split, first, count = self.place["split"], self.place["first"], self.place["clips"]
+        part = old.split(split)
+        mine = range(first, first + count)
+        end = np.cumsum(part.people)
+        low = int(end[first] - part.people[first])
+        return Part(
+            error=None,
+            notes=tuple(self.place["notes"]),
+            names=tuple(part.name[c] for c in mine),
+            frames=tuple(int(part.frames[c]) for c in mine),
+            people=tuple(int(part.people[c]) for c in mine),
+            betas=np.array(part.betas[low : int(end[first + count - 1])]),
+            rows=np.concatenate([part.rows(c).reshape(-1) for c in mine]) if rows else np.zeros(0, dtype=ROW),
+            persons=part.persons_of()[first],
+        )
+
+
+def pack(
+    sources: list[Source], old: Folder | None, out: Path, facts: dict[str, Any], shard_rows: int
+) -> dict[str, dict[str, Any]] | None:
+    """Write the store; the manifest comes last, and until then the old one is whole.
+
+    Returns where each take's clips are, by its name; None when no take gave any, and nothing was written.
+    """
+    heads = [source.head(old) for source in sources]
+    if not any(head.names for head in heads):
+        return None
+    table: dict[str, list[Any]] = {"name": [], "take": [], "split": [], "frames": [], "people": [], "persons": []}
+    places: dict[str, dict[str, Any]] = {}
+    betas: list[NDArray[np.float32]] = []
+    shown: dict[str, Any] = {}
+    for split in SPLITS:
+        mine = [(s, h) for s, h in zip(sources, heads, strict=True) if s.take.split == split and h.error is None]
+        first = 0
+        for source, head in mine:
+            count = len(head.names)
+            places[source.take.name] = {"split": split, "first": first, "clips": count, "notes": list(head.notes)}
+            first += count
+            table["name"] += head.names
+            table["take"] += [source.take.name] * count
+            table["split"] += [split] * count
+            table["frames"] += head.frames
+            table["people"] += head.people
+            table["persons"] += [head.persons] * count
+            betas.append(head.betas)
+        shards = [
+            write_shard(out, split, number, rows, [source for source, _ in group], old)
+            for number, (rows, group) in enumerate(groups(mine, shard_rows))
+        ]
+        shown[split] = summary(mine, shards)
+    failed = {s.take.name: (s.take.split, h.error) for s, h in zip(sources, heads, strict=True) if h.error is not None}
+    notes = [(note, s.take.name) for s, h in zip(sources, heads, strict=True) for note in h.notes]
+    persons = [(h.persons, s.take.name) for s, h in zip(sources, heads, strict=True) if h.error is None]
+    manifest = {
+        **facts,
+        "format": FORMAT,
+        "fps": FPS,
+        "clips": write_npy_or_json(out, "clips", table),
+        "betas": write_npy_or_json(out, "betas", np.concatenate(betas).astype("<f4")),
+        "splits": shown,
+        "skipped": [{"take": name, "split": split, "why": why} for name, (split, why) in failed.items()],
+        "notes": [{"note": note, "takes": takes} for note, takes in by_first(notes)],
+        "persons": [{"persons": names, "takes": takes} for names, takes in by_first(persons) if names],
+    }
+    write_whole(out, lambda _: MANIFEST, lambda file: file.write(as_json(manifest)))
+    return places
+
+
+def by_first(pairs: list[tuple[Any, str]]) -> list[tuple[Any, list[str]]]:
+    """The second ones of each first one, in the order of first ones."""
+    found: dict[Any, list[str]] = {}
+    for first, second in pairs:
+        found.setdefault(first, []).append(second)
+    return list(found.items())
+
+
+def groups(mine: list[tuple[Source, Part]], most: int) -> Iterator[tuple[int, list[tuple[Source, Part]]]]:
+    """Takes in order, as many to a shard as fit; with each shard's number of rows."""
+    held: list[tuple[Source, Part]] = []
+    rows = 0
+    for source, head in mine:
+        count = sum(f * p for f, p in zip(head.frames, head.people, strict=True))
+        if held and rows + count > most:
+            yield rows, held
+            held, rows = [], 0
+        held.append((source, head))
+        rows += count
+    if held:
+        yield rows, held
+
+
+def write_shard(
+    out: Path, split: Split, number: int, rows: int, sources: list[Source], old: Folder | None
+) -> dict[str, Any]:
+    """One npy of `rows` rows, streamed take by take. Returns its entry in the manifest."""
+
+    def write(file: Any) -> None:
+        np.lib.format.write_array_header_1_0(
+            file, {"descr": np.lib.format.dtype_to_descr(ROW), "fortran_order": False, "shape": (rows,)}
+        )
+        for source in sources:
+            file.write(np.ascontiguousarray(source.whole(old).rows).tobytes())
+
+    file, digest = write_whole(out, lambda digest: f"{split}-{number:05d}-{digest[:8]}.npy", write)
+    return {"file": file, "sha256": digest, "rows": rows}
+
+
+def write_npy_or_json(out: Path, name: str, value: Any) -> dict[str, str]:
+    """An array or a table, named by its content. Returns its entry in the manifest."""
+    if isinstance(value, np.ndarray):
+        suffix, write = "npy", lambda file: np.lib.format.write_array(file, value, version=(1, 0), allow_pickle=False)
+    else:
+        suffix, write = "json", lambda file: file.write(as_json(value))
+    file, digest = write_whole(out, lambda digest: f"{name}-{digest[:8]}.{suffix}", write)
+    return {"file": file, "sha256": digest}
+
+
+def summary(mine: list[tuple[Source, Part]], shards: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the manifest says of a split."""
+    clips = [(f, p) for _, head in mine for f, p in zip(head.frames, head.people, strict=True)]
+    return {
+        "takes": len(mine),
+        "clips": len(clips),
+        "frames": sum(f for f, _ in clips),
+        "person frames": sum(f * p for f, p in clips),
+        "clips by people": {str(n): count for n, count in sorted(Counter(p for _, p in clips).items())},
+        "shards": shards,
+    }

@@ -1,0 +1,274 @@
+"""From CMU's skeleton to a body: which bone is which joint, how the rest poses differ, where the floor is."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body import PARENTS, Body
+from magnet.body.fit import Fit, fit_body, floor_height, swing
+from magnet.datamodules.reading.asf_amc import Recording, Skeleton, euler, together
+from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
+from magnet.motion.rotations import geodesic
+from magnet.motion.scene import Scene
+
+FPS = 30.0
+ENDS = {
+    1: "lhipjoint", 2: "rhipjoint", 4: "lfemur", 5: "rfemur", 7: "ltibia", 8: "rtibia", 10: "lfoot", 11: "rfoot",
+    16: "lclavicle", 17: "rclavicle", 18: "lhumerus", 19: "rhumerus", 20: "lwrist", 21: "rwrist",
+    12: "lowerneck",
+}  # fmt: skip
+"""Joint: the bone whose end it is. The spine's joints lie elsewhere in the two skeletons: only rotations are used.
+
+The bone `wrist` is the last third of the forearm: it lies in one line with `radius` and only rolls. The hand bends at
+its end, and so there is the wrist (`radius` ends 7 to 10 cm before it).
+"""
+LIMBS = (1, 2, 4, 5, 7, 8, 10, 11, 16, 17, 18, 19, 20, 21)
+WEIGHT = {12: 0.1, 20: 3.0, 21: 3.0}
+"""The neck's joint differs too, and so only leans on the fit; dancers hold hands, so that wrists matter."""
+TOUCH, TOUCH_WEIGHT = 0.12, 25.0
+"""Metres within which two people's wrists count as touching, and what their weights grow by."""
+HELD = 0.20
+"""Metres within which two people's wrists say that they may hold hands."""
+TURNS = {
+    0: "root", 1: "lfemur", 2: "rfemur", 3: "lowerback", 4: "ltibia", 5: "rtibia", 6: "upperback", 7: "lfoot",
+    8: "rfoot", 9: "thorax", 10: "ltoes", 11: "rtoes", 12: "upperneck", 15: "head", 16: "lhumerus", 17: "rhumerus",
+    18: "lradius", 19: "rradius", 20: "lhand", 21: "rhand",
+}  # fmt: skip
+"""Joint: the bone whose rotation it takes."""
+LEG_SPREAD = 20.0
+"""Degrees that CMU's rest pose has each leg out to the side, foot and toes with it."""
+ELBOW_PLANE = 30.0
+"""Degrees that CMU's elbows bend upwards of forwards in the rest pose, where ours bend forwards."""
+LIMITS = {3: 60.0, 12: 80.0, 15: 50.0, 7: 80.0, 8: 80.0}
+"""Degrees between a joint's part of the body and its parent's beyond which the bone was recorded wrongly turned."""
+FLIP_MARGIN = 4
+"""Frames at 30 fps in which a foot swings over into the wrong way round and back."""
+ROLL_LIMIT, WRIST_LIMIT = 120.0, 85.0
+"""The same for a hand against its forearm: about the forearm's length and away from it."""
+FASTEST_PELVIS, FASTEST_HAND, SLOWEST_HAND, LIKELY_FALL = 4.5, 11.5, 0.1, 24.0
+"""Metres a second at the 99th percentile (3.1, 8.3 and 1.8 in the recordings); and m/s2 downwards at the 1st."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A take as a scene, and the numbers for its report."""
+
+    fit: Fit
+    glitches: tuple[Glitches, ...]
+    limb_error: float  # metres, mean over limb joints, valid frames and people
+    wrist_error: float  # the same over both wrists
+    wrist_recorded: float  # metres between two people's nearest wrists over the take; NaN for one person
+    wrist_fitted: float
+    held_recorded: float  # share of frames with two people's wrists closer than HELD; NaN for one person
+    held_fitted: float
+    floor: float  # metres that the recording's ground lay above its y = 0
+
+
+def _about(letter: str, degrees: float) -> Tensor:
+    angles = np.zeros(3)
+    angles["xyz".index(letter)] = np.radians(degrees)
+    return torch.from_numpy(euler(angles, "xyz"))
+
+
+def alignment(skeleton: Skeleton, rest: Tensor) -> Tensor:
+    """Rotation of each joint's part of the body from our rest pose to CMU's. rest (22, 3) -> (22, 3, 3)"""
+    aligned = torch.eye(3, dtype=torch.float64).repeat(22, 1, 1)
+    rest = rest.double()
+
+    def align(joint: int, child: int, bone: str, first: Tensor) -> None:
+        ours = (first @ (rest[child] - rest[joint])[:, None])[:, 0]
+        theirs = torch.from_numpy(skeleton.offset[skeleton.names.index(bone)])
+        aligned[joint] = swing(ours, theirs) @ first
+
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        spread = _about("z", sign * LEG_SPREAD)
+        for joint, child in ((1, 4), (4, 7), (7, 10)):
+            align(joint + side, child + side, TURNS[joint + side], spread)
+        aligned[10 + side] = spread
+        align(16 + side, 18 + side, TURNS[16 + side], _about("x", -ELBOW_PLANE))
+        align(18 + side, 20 + side, TURNS[18 + side], _about("x", -ELBOW_PLANE / 2))
+    return aligned
+
+
+def hints(recording: Recording, rest: Tensor) -> Tensor:
+    """World rotations of our joints as far as the recording knows them. rest (22, 3) -> (T, 22, 3, 3), NaN elsewhere"""
+    names = recording.skeleton.names
+    turned, _ = recording.world()
+    world = torch.from_numpy(turned)
+    aligned = alignment(recording.skeleton, rest)
+    known = torch.full((recording.frames, 22, 3, 3), torch.nan, dtype=torch.float64)
+    for joint, bone in TURNS.items():
+        known[:, joint] = world[:, names.index(bone)] @ aligned[joint]
+    for side, letter in ((0, "l"), (1, "r")):
+        forearm, hand = world[:, names.index(f"{letter}radius")], world[:, names.index(f"{letter}hand")]
+        half, wrong = _half_roll(forearm.transpose(-1, -2) @ hand)
+        # A forearm rolls along all its length: the elbow takes half of it, the wrist the rest.
+        known[:, 18 + side] = forearm @ half @ aligned[18 + side]
+        known[wrong, 20 + side] = torch.nan
+    for joint, limit in LIMITS.items():
+        # Written so that a joint whose parent is not known is not known either.
+        wrong = ~(geodesic(known[:, PARENTS[joint]], known[:, joint]) <= np.radians(limit))
+        if joint in (7, 8):
+            wrong = _widened(wrong, FLIP_MARGIN)
+        known[wrong, joint] = torch.nan
+        if joint in (7, 8):
+            known[wrong, joint + 3] = torch.nan  # the toes went with the foot
+    return known
+
+
+def _widened(mask: Tensor, by: int) -> Tensor:
+    """(T,) bool, True also up to `by` frames before and after."""
+    return F.max_pool1d(mask.float()[None], 2 * by + 1, stride=1, padding=by)[0] > 0
+
+
+def _half_roll(hand: Tensor) -> tuple[Tensor, Tensor]:
+    """Half of a hand's roll about its forearm, which lies along x, and where the hand cannot be right.
+
+    (T, 3, 3) -> (T, 3, 3), the identity where it is wrong; (T,) bool
+    """
+    x, y, z, w = roma.rotmat_to_unitquat(hand).unbind(-1)
+    roll = 2 * torch.atan2(x, w)
+    roll = torch.atan2(roll.sin(), roll.cos())
+    bend = 2 * torch.atan2((y * y + z * z).sqrt(), (x * x + w * w).sqrt())
+    wrong = (roll.abs() > np.radians(ROLL_LIMIT)) | (bend > np.radians(WRIST_LIMIT))
+    axis = torch.zeros(len(hand), 3, dtype=hand.dtype)
+    axis[:, 0] = torch.where(wrong, 0.0, roll / 2)
+    return roma.rotvec_to_rotmat(axis), wrong
+
+
+def fit_recordings(
+    recordings: Sequence[Recording],
+    body: Body,
+    *,
+    trim: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Fitted:
+    """People captured together as bodies in one scene at 30 fps, standing on y = 0.
+
+    Raises:
+        ValueError: lengths differ, or the body does not fit.
+    """
+    recordings = together(recordings, trim)
+    mended, glitches = zip(*(repaired(recording) for recording in recordings), strict=True)
+    resampled = [recording.resampled(FPS) for recording in mended]
+    joints = list(ENDS)
+    ends, turns, valid = [], [], []
+    rest = body.rest_joints(torch.zeros(10))
+    for recording, glitch in zip(resampled, glitches, strict=True):
+        _, end = recording.world()
+        ends.append(torch.from_numpy(end[:, [recording.skeleton.names.index(ENDS[j]) for j in joints]]))
+        turns.append(hints(recording, rest))
+        valid.append(~_seen(glitch.masked, recording.frames, recordings[0].fps))
+    targets, turn, good = torch.stack(ends, dim=1), torch.stack(turns, dim=1), torch.stack(valid, dim=1)
+    weights = torch.tensor([WEIGHT.get(j, 1.0) for j in joints], dtype=torch.float64)
+    weights = weights * touching(targets, joints)
+    for ankle, ball in ((7, 10), (8, 11)):
+        # A foot turned the wrong way round has its ball on the wrong side.
+        weights[:, :, joints.index(ball)] *= turn[:, :, ankle].isfinite().all(dim=-1).all(dim=-1)
+    fit = fit_body(
+        targets, joints, body, rotations=turn, weights=weights, valid=good, grounded=True, fps=FPS, progress=progress
+    )
+    limbs = [joints.index(j) for j in LIMBS]
+    found = body.joints(fit.scene)[0]
+    scene, floor = on_floor(fit.scene, found, body)
+    wrists = [joints.index(20), joints.index(21)]
+    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, 20:22]))
+    return Fitted(
+        fit=Fit(scene, fit.residual),
+        glitches=tuple(glitches),
+        limb_error=float(fit.residual[good][:, limbs].mean()),
+        wrist_error=float(fit.residual[good][:, wrists].mean()),
+        wrist_recorded=float(recorded.amin()) if len(recorded) else math.nan,
+        wrist_fitted=float(fitted.amin()) if len(fitted) else math.nan,
+        held_recorded=float((recorded < HELD).double().mean()),
+        held_fitted=float((fitted < HELD).double().mean()),
+        floor=floor,
+    )
+
+
+def _seen(masked: np.ndarray, frames: int, fps: float) -> Tensor:
+    """Which resampled frames lie on or beside a masked one. -> (frames,) bool"""
+    at = np.arange(frames) * (fps / FPS)
+    low = np.clip(np.floor(at + 1e-9).astype(int), 0, len(masked) - 1)
+    high = np.clip(np.ceil(at - 1e-9).astype(int), 0, len(masked) - 1)
+    return torch.from_numpy(masked[low] | masked[high])
+
+
+def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
+    """Weights that grow where wrists of two people come together. (T, P, M, 3) -> (T, P, M)"""
+    grown = torch.ones(targets.shape[:3], dtype=targets.dtype)
+    wrists = [joints.index(20), joints.index(21)]
+    for p in range(targets.shape[1]):
+        others = [q for q in range(targets.shape[1]) if q != p]
+        if others:
+            theirs = targets[:, others][:, :, wrists].flatten(1, 2)
+            near = torch.cdist(targets[:, p, wrists], theirs).amin(dim=-1)
+            grown[:, p, wrists] += TOUCH_WEIGHT * torch.exp(-((near / TOUCH) ** 2))
+    return grown
+
+
+def wrists_apart(wrists: Tensor, valid: Tensor) -> Tensor:
+    """Metres between the nearest wrists of two people, in frames with two who are valid; none for one person.
+
+    (T, P, 2, 3), (T, P) -> (frames,)
+    """
+    pairs = [(p, q) for p in range(wrists.shape[1]) for q in range(p)]
+    nearest = torch.full((len(wrists), 1), torch.inf, dtype=wrists.dtype)
+    for p, q in pairs:
+        apart = torch.cdist(wrists[:, p], wrists[:, q]).amin(dim=(-1, -2))
+        nearest = torch.cat([nearest, torch.where(valid[:, p] & valid[:, q], apart, torch.inf)[:, None]], dim=1)
+    nearest = nearest.amin(dim=1)
+    return nearest[nearest.isfinite()]
+
+
+def on_floor(scene: Scene, found: Tensor, body: Body) -> tuple[Scene, float]:
+    """The scene moved up or down so that resting feet rest at y = 0; and the height that the floor was at.
+
+    Of the lower sole of each person and frame, the median over valid frames is taken as resting: people stand on at
+    least one foot for most of a take. One height serves everybody, for they stand on one floor.
+    """
+    lowest = floor_height(found, body, scene.betas[0])
+    good = slice(None) if scene.valid is None else scene.valid[0]
+    floor = float(lowest[good].median())
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[..., 1, 3] -= floor
+    return scene.replace(T_world_root=T_world_root), floor
+
+
+def check_rate(recording: Recording) -> None:
+    """Whether people move like that: the frame rate is not in the file, and a wrong one shows in speeds.
+
+    A rate that is wrong by two shows only where somebody jumps or falls, and then gives a warning: 143_35, called
+    120 fps, was found so.
+
+    Raises:
+        ValueError: speeds that no person reaches, or nobody moves at all.
+    """
+    if recording.frames < recording.fps:
+        return  # too short to say
+    _, end = recording.resampled(FPS).world()
+    names = recording.skeleton.names
+    pelvis = np.diff(end[:, names.index("root")], axis=0) * FPS
+    wrists = np.diff(end[:, [names.index(ENDS[20]), names.index(ENDS[21])]], axis=0) * FPS
+    speed = float(np.percentile(np.linalg.norm(pelvis, axis=-1), 99))
+    hand = float(np.percentile(np.linalg.norm(wrists, axis=-1), 99))
+    fall = float(-np.percentile(np.diff(pelvis[:, 1]) * FPS, 1))
+    found = (
+        f"{recording.path}: at {recording.fps:g} fps the pelvis moves at {speed:.1f} m/s, hands at {hand:.1f} m/s "
+        f"and the pelvis falls with {fall:.0f} m/s2"
+    )
+    if hand < SLOWEST_HAND:
+        raise ValueError(f"{found}: somebody stands still, which nobody does for long; leave the recording out")
+    if speed > FASTEST_PELVIS or hand > FASTEST_HAND:
+        raise ValueError(f"{found}, which nobody does; give the frame rate of its subject with `fps`")
+    if fall > LIKELY_FALL:
+        warnings.warn(f"{found}, which is unlikely; check the frame rate of its subject (`fps`)", stacklevel=2)

@@ -1,0 +1,183 @@
+"""What SMPL-X files of several data sets have in common: one person's keys, people side by side, folders."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magnet.datamodules.reading.arrays import Doubles, floats, one_length, one_shape, require
+from magnet.datamodules.reading.recording import GENDERS, Axis, DataError, Gender, Recording
+
+
+@dataclass(frozen=True)
+class Person:
+    """One person's file: T frames in radians and metres."""
+
+    poses: Doubles  # (T, 22, 3) axis-angle
+    transl: Doubles  # (T, 3)
+    betas: Doubles  # (10,)
+    name: str
+    notes: tuple[str, ...] = ()
+    gender: Gender | None = None
+
+    @property
+    def frames(self) -> int:
+        return len(self.poses)
+
+
+def mapping(where: object, held: Any) -> Mapping[str, Any]:
+    """What a file holds, when it is a dict with text keys.
+
+    Raises:
+        DataError: it is not.
+    """
+    if not isinstance(held, Mapping) or not all(isinstance(key, str) for key in held):
+        what = f"an array {held.shape}" if isinstance(held, np.ndarray) else f"a {type(held).__name__}"
+        raise DataError(f"{where}: holds {what}, expected a dict of named arrays; is it another file of the data set?")
+    return held
+
+
+def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Doubles:
+    """A key's value as so many numbers a frame, however a frame is shaped. -> (T, width)
+
+    Raises:
+        DataError: no such key, no frames, another width, or NaN.
+    """
+    require(where, held, (key,))
+    value = held[key]
+    if isinstance(value, np.ndarray) and value.ndim > 2 and math.prod(value.shape[1:]) == width:
+        value = value.reshape(len(value), width)
+    return floats(f"{where}: {key}", value, ("T", width))
+
+
+def shape_numbers(where: object, held: Mapping[str, Any], key: str = "betas") -> tuple[Doubles, tuple[str, ...]]:
+    """A person's first ten shape numbers from (10+,), (1, 10+) or (T, 10+). -> (10,), notes
+
+    Raises:
+        DataError: no such key, another shape, or NaN.
+    """
+    require(where, held, (key,))
+    value = held[key]
+    if isinstance(value, np.ndarray) and value.ndim == 1:
+        value = value[None]
+    return one_shape(f"{where}: {key}", floats(f"{where}: {key}", value, ("T", "shapes")))
+
+
+def gender_of(said: Any) -> Gender | None:
+    """The gender in a file's own words: text, bytes, or an array of one of them; None: it says something else."""
+    said = said.item() if isinstance(said, np.ndarray) and said.size == 1 else said
+    said = said.decode("latin-1") if isinstance(said, bytes) else said
+    return next((gender for gender in GENDERS if isinstance(said, str) and said.strip().lower() == gender), None)
+
+
+def person(
+    where: object,
+    held: Mapping[str, Any],
+    name: str,
+    *,
+    gender: Any = None,
+    orient: str = "global_orient",
+    body: str = "body_pose",
+    transl: str = "transl",
+) -> Person:
+    """One person from a dict with keys of SMPL-X's family: root and 21 body joints in axis-angle, metres.
+
+    Args:
+        where: the file, for messages.
+        held: what it holds.
+        name: of the person.
+        gender: of the body that the shape is of, as the data set says it.
+        orient: the root's key.
+        body: the joints' key.
+        transl: the translation's key.
+
+    Raises:
+        DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
+    """
+    require(where, held, (orient, body, transl, "betas"))
+    parts = {key: rows(where, held, key, width) for key, width in ((orient, 3), (body, 63), (transl, 3))}
+    frames = one_length(where, {key: len(part) for key, part in parts.items()})
+    poses = np.concatenate([parts[orient], parts[body]], axis=1).reshape(frames, 22, 3)
+    shape, notes = shape_numbers(where, held)
+    return Person(poses, parts[transl], shape, name, notes, gender_of(gender))
+
+
+def side_by_side(
+    where: object, people: Sequence[Person], fps: float, up: Axis, *, cut: bool = False, notes: Iterable[str] = ()
+) -> Recording:
+    """People who were recorded together as one recording.
+
+    Args:
+        where: the take, for messages.
+        people: in their order of agents.
+        fps: of all of them.
+        up: as the data set declares it.
+        cut: cut unequal lengths to the shortest, with a note.
+        notes: what else was found.
+
+    Raises:
+        DataError: unequal lengths.
+    """
+    lengths, said = {someone.name: someone.frames for someone in people}, list(notes)
+    if not cut:
+        one_length(where, lengths)
+    frames, why = shortest(lengths)
+    said += why
+    said += [f"{someone.name}: {note}" for someone in people for note in someone.notes]
+    known = any(someone.gender for someone in people)
+    return Recording(
+        fps=fps,
+        up=up,
+        poses=np.stack([someone.poses[:frames] for someone in people], axis=1),
+        transl=np.stack([someone.transl[:frames] for someone in people], axis=1),
+        betas=np.stack([someone.betas for someone in people]),
+        persons=tuple(lengths),
+        notes=tuple(said),
+        genders=tuple(someone.gender or "neutral" for someone in people) if known else (),
+    )
+
+
+def shortest(lengths: Mapping[str, int]) -> tuple[int, list[str]]:
+    """Frames that everybody has, and a note where somebody has more."""
+    frames = min(lengths.values())
+    if frames == max(lengths.values()):
+        return frames, []
+    listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
+    return frames, [f"unequal numbers of frames ({listed}), cut to the shortest"]
+
+
+# -- folders -----------------------------------------------------------------------------------
+
+
+def first_folder(root: Path, places: Sequence[str], holds: str) -> Path | None:
+    """The first of `places` under `root` that has something matching the glob `holds`; upper and lower case alike."""
+    for place in places:
+        for folder in _folders(root, [part for part in place.split("/") if part]):
+            if any(folder.glob(holds)):
+                return folder
+    return None
+
+
+def _folders(root: Path, parts: Sequence[str]) -> list[Path]:
+    if not parts:
+        return [root]
+    named = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name.casefold() == parts[0].casefold()]
+    return [folder for path in named for folder in _folders(path, parts[1:])]
+
+
+def listing(folder: Path, most: int = 8) -> str:
+    """What a folder holds, in a few words."""
+    names = [path.name + "/" * path.is_dir() for path in sorted(folder.iterdir())]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return (", ".join(names[:most]) + more) or "nothing"
+
+
+def natural(name: str) -> tuple[tuple[str, int], ...]:
+    """Sort key by which take 10 comes after take 9."""
+    return tuple((text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name))

@@ -1,0 +1,214 @@
+"""Which files of a user's folder are people of one scene: by their names, by a pattern, or by a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from magnet.datamodules.reading.fields import natural
+from magnet.datamodules.reading.recording import DataError
+
+TABLE = "people.csv"
+"""The table that is taken without being named, where it lies in the folder."""
+COLUMNS = ("scene", "person", "file", "role", "start")
+NEEDED = ("scene", "file")
+
+WORDS = (
+    r"[a-h]|(?:p|person|actor|dancer|subject|player|performer|agent|skeleton|character)[ _.\-]?\d+"
+    r"|leader|follower|lead|follow|actor|reactor|man|woman|male|female"
+)
+"""How the end of a file's name says whose it is; a number alone does not, for it may count takes."""
+NAMED = re.compile(rf"(?P<scene>.*[^ _.\-])[ _.\-]+(?P<person>{WORDS})", re.IGNORECASE)
+ONLY = re.compile(rf"(?P<person>{WORDS})", re.IGNORECASE)
+"""A name that is nothing else: the folder is the scene then."""
+HERE = "scene"
+"""What the scene of such files is called where they lie in no folder of their own."""
+
+
+@dataclass(frozen=True)
+class Seat:
+    """One person's file.
+
+    Args:
+        person: a name or role; "" where nothing tells.
+        file: where it is.
+        start: second of the scene's clock at which its first frame lies.
+    """
+
+    person: str
+    file: Path
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class Group:
+    """A scene and its people's files.
+
+    Args:
+        scene: its name.
+        seats: one a file, in the order of people.
+        alone: its one file is named like one of several people's, and there is no other.
+    """
+
+    scene: str
+    seats: tuple[Seat, ...]
+    alone: bool = False
+
+
+def files_of(root: Path, suffixes: Sequence[str]) -> list[Path]:
+    """All files of these suffixes under a folder, take 10 after take 9; hidden ones are left out."""
+    found = [
+        path
+        for path in root.rglob("*")
+        if path.suffix.lower() in suffixes
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+    ]
+    return sorted(found, key=lambda path: (natural(path.relative_to(root).as_posix()), path.as_posix()))
+
+
+# -- by names ----------------------------------------------------------------------------------
+
+
+def by_names(root: Path, files: Iterable[Path]) -> list[Group]:
+    """Files whose names differ in the last word alone, such as dance_A and dance_B; in a folder, A and B alone.
+
+    Everybody else is alone in a scene.
+    """
+    told = [_told(root, path) for path in files]
+    members = Counter(scene for scene, person, _ in told if person)
+    together: dict[str, list[Seat]] = {}
+    alone: set[str] = set()
+    for scene, person, path in told:
+        whole = _label(root, path)
+        if person and members[scene] > 1:
+            together.setdefault(scene, []).append(Seat(person, path))
+            continue
+        while (whole in members and members[whole] > 1) or whole in together:
+            whole += path.suffix
+        together[whole] = [Seat("", path)]
+        if person:
+            alone.add(whole)
+    return [Group(scene, tuple(seats), scene in alone) for scene, seats in together.items()]
+
+
+def _label(root: Path, path: Path) -> str:
+    return path.relative_to(root).with_suffix("").as_posix()
+
+
+def _told(root: Path, path: Path) -> tuple[str, str, Path]:
+    """Scene and person by a file's name; "" for nobody's."""
+    folder = path.parent.relative_to(root).as_posix()
+    inside = "" if folder == "." else f"{folder}/"
+    if match := NAMED.fullmatch(path.stem):
+        return inside + match["scene"], match["person"], path
+    if match := ONLY.fullmatch(path.stem):
+        return folder if inside else HERE, match["person"], path
+    return inside + path.stem, "", path
+
+
+# -- by a pattern ------------------------------------------------------------------------------
+
+
+def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Group], list[Path]]:
+    """Groups by a pattern of the path under `root` without its suffix, such as {scene}/{person} or {person}-{scene}.
+
+    A `*` stands for anything but a slash. Also returns the files that do not fit.
+
+    Raises:
+        ValueError: the pattern lacks {scene} or {person}, or holds one twice.
+    """
+    if any(pattern.count(word) != 1 for word in ("{scene}", "{person}")):
+        raise ValueError(
+            f"pattern: got {pattern!r}, expected {{scene}} and {{person}} once each, as {{scene}}/{{person}}"
+        )
+    words = {"{scene}": "(?P<scene>.+)", "{person}": "(?P<person>[^/]+?)", "*": "[^/]*"}
+    parts = re.split(r"(\{scene\}|\{person\}|\*)", pattern)
+    form = re.compile("".join(words.get(part, re.escape(part)) for part in parts))
+    together: dict[str, list[Seat]] = {}
+    strangers = []
+    for path in files:
+        if match := form.fullmatch(_label(root, path)):
+            together.setdefault(match["scene"], []).append(Seat(match["person"], path))
+        else:
+            strangers.append(path)
+    return [Group(scene, tuple(seats)) for scene, seats in together.items()], strangers
+
+
+# -- by a table --------------------------------------------------------------------------------
+
+
+def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[Group]:
+    """Groups by a CSV with a head: scene and file (under `root`), and, where they are wanted, person, role and start.
+
+    Raises:
+        DataError: a column is missing or unknown, a file is not there, lies elsewhere, is of another kind or is named
+            twice, or a start is no number of seconds; names the line.
+    """
+    together: dict[str, list[Seat]] = {}
+    used: dict[Path, int] = {}
+    for number, row in _rows(table):
+        where = f"{table}, line {number}"
+        file = _file(where, root, row["file"], suffixes)
+        if file in used:
+            raise DataError(f"{where}: {row['file']} is named in line {used[file]} already; one row a file")
+        used[file] = number
+        person = " ".join(filter(None, (row.get("person", ""), row.get("role", ""))))
+        together.setdefault(row["scene"], []).append(Seat(person, file, _seconds(where, row.get("start", ""))))
+    if not together:
+        raise DataError(f"{table}: lists no file; expected a row a file with {', '.join(COLUMNS)}")
+    return [Group(scene, tuple(seats)) for scene, seats in together.items()]
+
+
+def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
+    """Rows that hold anything, with their lines."""
+    try:
+        lines = table.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError as error:
+        raise DataError(f"{table}: no such file; give a CSV with the columns {', '.join(COLUMNS)}") from error
+    except (OSError, ValueError) as error:
+        raise DataError(f"{table}: cannot be read as text ({error}); save it as CSV in UTF-8") from error
+    first = lines[0] if lines else ""
+    mark = max(",;\t", key=first.count)
+    head = [word.strip().lower() for word in next(csv.reader([first], delimiter=mark), [])]
+    strange, lacking = sorted(set(head) - set(COLUMNS)), [name for name in NEEDED if name not in head]
+    if strange or lacking or len(set(head)) < len(head):
+        raise DataError(
+            f"{table}, line 1: the columns are {', '.join(head) or 'none'}; expected {', '.join(NEEDED)}, and of "
+            "person, role and start those that are wanted"
+        )
+    found = []
+    for number, line in enumerate(lines[1:], 2):
+        words = [word.strip() for word in next(csv.reader([line], delimiter=mark), [])]
+        if not any(words):
+            continue
+        if len(words) != len(head) or not all(words[head.index(name)] for name in NEEDED):
+            raise DataError(f"{table}, line {number}: got {line!r}, expected {', '.join(head)}")
+        found.append((number, dict(zip(head, words, strict=True))))
+    return found
+
+
+def _file(where: str, root: Path, name: str, suffixes: Sequence[str]) -> Path:
+    path = root / name
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise DataError(f"{where}: {name} lies outside {root}; put it inside, and name it from there")
+    if path.suffix.lower() not in suffixes:
+        raise DataError(f"{where}: {name} is no {' or '.join(suffixes)} file")
+    if not path.is_file():
+        raise DataError(f"{where}: {name}: no such file under {root}; names are relative to that folder")
+    return path
+
+
+def _seconds(where: str, text: str) -> float:
+    try:
+        start = float(text or 0.0)
+    except ValueError:
+        start = math.nan
+    if not math.isfinite(start):
+        raise DataError(f"{where}: start is {text!r}, expected seconds on the scene's clock, such as 1.25")
+    return start

@@ -1,0 +1,1 @@
+"""Clips in memory or on disk, and batches of windows of them."""

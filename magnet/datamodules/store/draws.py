@@ -1,0 +1,256 @@
+"""Which windows a batch shows: random ones to train on, fixed ones to score, composed ones of either kind."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.checks import require_whole
+from magnet.datamodules.clip import Ints
+from magnet.datamodules.store.memory import Draw, Store, all_starts, spaced_starts
+from magnet.seeding import derive
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How often each thing happens to a training window; 0 is never."""
+
+    mirror: float = 0.5
+    shuffle: bool = True
+    drop: float = 0.0
+    drop_at_most: int = 1
+    compose: float = 0.0
+    apart: tuple[float, float] = (1.6, 3.5)
+
+    def __post_init__(self) -> None:
+        for name, share in {"mirror": self.mirror, "drop_agent": self.drop, "compose": self.compose}.items():
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
+        require_whole("drop_at_most", self.drop_at_most, 1)
+
+
+def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Floats:
+    """Uniform numbers of samples `first` to `first + count` of an epoch, a row each. -> (count, columns) in [0, 1)
+
+    A counter-based generator: row i is the same whichever rows it is drawn with.
+    """
+    blocks = -(-columns // 4)  # one count of Philox yields four numbers
+    philox = np.random.Philox(key=np.array([seed % 2**64, epoch], dtype=np.uint64))
+    philox.advance(first * blocks)
+    return np.random.Generator(philox).random((count, 4 * blocks))[:, :columns]
+
+
+class RandomDraws:
+    """Training windows: sample i of epoch e depends only on (seed, e, i) and the clips.
+
+    Where the store divides its clips among processes, a process draws from its own alone. Sample k of process r is
+    then sample k * world + r of the epoch and depends on (seed, e, k, r, world).
+
+    Args:
+        store: the training clips.
+        frames: window length.
+        weights: share of each source; None: every valid window is equally likely.
+        augmentation: what happens to the windows.
+        seed: of all randomness.
+        rank: of this process.
+        world: number of processes.
+
+    Raises:
+        ValueError: no clip has a valid frame, or a weight names no source, or they leave nothing.
+    """
+
+    COLUMNS = 12
+
+    def __init__(
+        self,
+        store: Store,
+        frames: int,
+        weights: Mapping[str, float] | None,
+        augmentation: Augmentation,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
+        self.store, self.augmentation, self.seed = store, augmentation, seed
+        self.count = np.maximum(store.length - frames + 1, 1)
+        self.starts, self.first = self._listed(frames)
+        share = self.count * self._weigh(weights)
+        if not share.sum() > 0:
+            raise ValueError(f"split train: no valid window of {frames} frames is left by weights={weights}")
+        owners = store.owners(share / share.sum(), world) if world > 1 else None
+        self.shared = owners is not None
+        if owners is not None:
+            self.seed = derive(seed, "share", rank, world)
+            share = np.where(owners == rank, share, 0.0)
+        self.cdf = np.cumsum(share) / share.sum()
+
+    def _listed(self, frames: int) -> tuple[Ints, Ints]:
+        """Starts of clips with invalid frames, and where each clip's begin among them; -1: any start will do."""
+        first = np.full(len(self.count), -1, dtype=np.int64)
+        starts: list[Ints] = [np.zeros(0, dtype=np.int64)]
+        total = 0
+        for clip in np.flatnonzero(~self.store.whole):
+            starts.append(all_starts(self.store.good(int(clip)), frames))
+            first[clip], self.count[clip] = total, len(starts[-1])
+            total += len(starts[-1])
+        return np.concatenate(starts), first
+
+    def _weigh(self, weights: Mapping[str, float] | None) -> Floats:
+        """Weight of one window of each clip."""
+        if weights is None:
+            return np.ones(len(self.count))
+        source = self.store.sources
+        unknown = sorted(set(weights) - set(source))
+        if unknown:
+            raise ValueError(f"weights: no training clip has the source {unknown}; there are {sorted(set(source))}")
+        if min(weights.values()) < 0:
+            raise ValueError(f"weights: got {dict(weights)}, expected no negative number")
+        windows = {s: self.count[source == s].sum() for s in weights}
+        return np.array([weights.get(s, 0.0) / max(windows.get(s, 1), 1) for s in source])
+
+    def __call__(self, epoch: int, first: int, count: int) -> Draw:
+        """Samples `first` to `first + count` of an epoch; of this process's share, if there are shares."""
+        slots = self.store.max_agents
+        u = uniforms(self.seed, epoch, first, count, self.COLUMNS + slots)
+        augment = self.augmentation
+        a, start_a = self._window(u[:, 0], u[:, 1])
+        b, start_b = self._window(u[:, 2], u[:, 3])
+        people = self.store.people
+        joining = np.where((u[:, 4] < augment.compose) & (a != b), np.minimum(people[b], slots - people[a]), 0)
+        joining[people[a] + joining < 3] = 0
+        members, groups = seat(people[a], joining, people[b], (u[:, 5] * people[b]).astype(np.int64), slots)
+
+        total = people[a] + joining
+        for scene in np.flatnonzero((u[:, 6] < augment.drop) & (total >= 2)):
+            share = u[scene, 6] / augment.drop  # uniform again, among the scenes that lose somebody
+            members[scene, dropped(int(total[scene]), augment.drop_at_most, share, u[scene, 7])] = -1
+        if augment.shuffle:
+            order = u[:, self.COLUMNS :].argsort(axis=1, kind="stable")
+            members, groups = np.take_along_axis(members, order, 1), np.take_along_axis(groups, order, 1)
+
+        clips = np.stack([a, np.where(joining > 0, b, -1)], axis=1)
+        low, high = augment.apart
+        placing = np.stack([u[:, 8] * 2 * np.pi, u[:, 9] * 2 * np.pi, low + u[:, 10] * (high - low)], axis=1)
+        draw = Draw(clips, np.stack([start_a, start_b], axis=1), members, groups, u[:, 11] < augment.mirror, placing)
+        return without_empty_groups(draw)
+
+    def _window(self, u: Floats, v: Floats) -> tuple[Ints, Ints]:
+        clip = np.minimum(np.searchsorted(self.cdf, u, side="right"), len(self.cdf) - 1)
+        start = (v * self.count[clip]).astype(np.int64)
+        listed = np.flatnonzero(self.first[clip] >= 0)
+        start[listed] = self.starts[self.first[clip[listed]] + start[listed]]
+        return clip, start
+
+
+def seat(first: Ints, joining: Ints, second: Ints, turn: Ints, slots: int) -> tuple[Ints, Ints]:
+    """Slots in order: all `first` people, then `joining` of the `second` ones, from person `turn` on. -> (B, P) x 2"""
+    slot = np.arange(slots)
+    later = slot - first[:, None]
+    members = np.where(later < joining[:, None], (later + turn[:, None]) % second[:, None], -1)
+    return np.where(later < 0, slot, members), (later >= 0).astype(np.int64)
+
+
+def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
+    """Who of so many people is masked: 1 to `at_most` of them, each number equally likely, but never everybody.
+
+    share, which: uniform numbers in [0, 1), for how many and for who.
+    """
+    limit = min(at_most, people - 1)
+    count = min(1 + int(share * limit), limit)
+    groups = list(itertools.combinations(range(people), count))
+    return list(groups[int(which * len(groups))])
+
+
+def without_empty_groups(draw: Draw) -> Draw:
+    """A scene of which one group has been dropped altogether is a scene of the other."""
+    for group in (0, 1):
+        gone = (draw.clips[:, 1] >= 0) & ~((draw.members >= 0) & (draw.groups == group)).any(axis=1)
+        if group == 0:
+            draw.clips[gone, 0], draw.starts[gone, 0] = draw.clips[gone, 1], draw.starts[gone, 1]
+            draw.groups[gone] = 0
+        draw.clips[gone, 1] = -1
+    return draw
+
+
+def fixed_draws(store: Store, frames: int, stride: int, pad: bool = False) -> Draw:
+    """Clean windows of every clip in order, `stride` apart.
+
+    Args:
+        store: the clips.
+        frames: window length.
+        stride: frames between the starts of windows of a clip.
+        pad: a clip shorter than the window gives one, padded; otherwise none.
+    """
+    pairs = []
+    for c in range(len(store.length)):
+        good = store.good(c)
+        starts = all_starts(good, frames) if pad and len(good) < frames else spaced_starts(good, frames, stride)
+        pairs += [(c, int(start)) for start in starts]
+    return whole_clips(store, pairs)
+
+
+def whole_clips(store: Store, windows: Sequence[tuple[int, int]]) -> Draw:
+    """Windows (clip, start) as recorded, everybody in the first slots."""
+    array = np.array(windows, dtype=np.int64).reshape(-1, 2)
+    people = store.people[array[:, 0]]
+    none = np.zeros_like(people)
+    members, groups = seat(people, none, none + 1, none, store.max_agents)
+    nowhere = np.full_like(people, -1)
+    return Draw(
+        clips=np.stack([array[:, 0], nowhere], axis=1),
+        starts=np.stack([array[:, 1], none], axis=1),
+        members=members,
+        groups=groups,
+        mirrored=np.zeros(len(array), dtype=bool),
+        placing=np.zeros((len(array), 3)),
+    )
+
+
+def composed_draws(store: Store, plain: Draw, count: int, apart: tuple[float, float], seed: int) -> Draw:
+    """Scenes of three and four people in turn, each made of two of the plain windows of different clips.
+
+    Where the second clip has more people than the scene still needs, some of them are left out.
+
+    Raises:
+        ValueError: the clips or slots do not allow such scenes.
+    """
+    people = store.people[plain.clips[:, 0]]
+    sizes = [size for size in (3, 4) if size <= store.max_agents]
+    pairs: dict[int, list[tuple[int, int]]] = {}
+    for size in sizes:
+        pairs[size] = [
+            (i, j)
+            for i in range(len(plain))
+            for j in range(len(plain))
+            if plain.clips[i, 0] != plain.clips[j, 0] and people[i] < size <= people[i] + people[j]
+        ]
+    sizes = [size for size in sizes if pairs[size]]
+    if not sizes:
+        raise ValueError(
+            f"composed_test={count}: needs max_agents of 3 or more (got {store.max_agents}) and test windows of two"
+            f" clips that make up three people (got {len(plain)} windows of {len(set(plain.clips[:, 0]))} clips)"
+        )
+    u = uniforms(seed, 0, 0, count, 5)
+    rows = []
+    for k in range(count):
+        options = pairs[sizes[k % len(sizes)]]
+        rows.append(options[int(u[k, 0] * len(options))])
+    first, second = np.array(rows, dtype=np.int64).T
+    wanted = np.array([sizes[k % len(sizes)] for k in range(count)], dtype=np.int64)
+    turn = (u[:, 1] * people[second]).astype(np.int64)
+    members, groups = seat(people[first], wanted - people[first], people[second], turn, store.max_agents)
+    low, high = apart
+    return Draw(
+        clips=np.stack([plain.clips[first, 0], plain.clips[second, 0]], axis=1),
+        starts=np.stack([plain.starts[first, 0], plain.starts[second, 0]], axis=1),
+        members=members,
+        groups=groups,
+        mirrored=np.zeros(count, dtype=bool),
+        placing=np.stack([u[:, 2] * 2 * np.pi, u[:, 3] * 2 * np.pi, low + u[:, 4] * (high - low)], axis=1),
+    )

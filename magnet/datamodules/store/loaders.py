@@ -1,0 +1,179 @@
+"""Loaders that yield whole batches as `Scene`; random access is one gather, so there are no worker processes.
+
+They are plain iterables rather than torch DataLoaders: gathering from tensors in memory is far faster than
+passing batches between processes, Lightning leaves the shards that they cut themselves alone
+(`use_distributed_sampler` has no effect on them), and their state is one number. What reads from disk reads ahead
+in threads: copying out of maps holds no lock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+from magnet.datamodules.store.memory import Draw
+from magnet.motion.scene import Scene
+
+Gather = Callable[[Draw], Scene]
+Place = tuple[int, int]
+"""Epoch, and batch in it."""
+
+
+class Ahead:
+    """Batches that threads begin before they are asked for. What is asked for decides; what was begun in vain is lost.
+
+    Args:
+        make: a place's batch; depends on the place alone, and may be called by several threads at once.
+        after: the place that follows.
+        depth: batches begun while the last one given is used, each in a thread of its own.
+    """
+
+    def __init__(self, make: Callable[[Place], Any], after: Callable[[Place], Place], depth: int) -> None:
+        self.make, self.after, self.depth = make, after, depth
+        self.begun: deque[tuple[Place, Future[Any]]] = deque()
+        self.threads: ThreadPoolExecutor | None = None
+
+    def get(self, place: Place) -> Any:
+        """The batch of a place. Whatever went wrong when it was made is raised here."""
+        if self.begun and self.begun[0][0] != place:  # a state was loaded
+            self._forget()
+        self._begin(place, 1)
+        _, future = self.begun.popleft()
+        self._begin(self.after(place), self.depth)
+        try:
+            return future.result()
+        except BaseException:
+            self.begun.clear()
+            raise
+
+    def close(self) -> None:
+        """End the threads, once they have done what they are at; the next batch that is asked for begins new ones."""
+        self._forget()
+        if self.threads is not None:
+            self.threads.shutdown()
+            self.threads = None
+
+    def _forget(self) -> None:
+        for _, future in self.begun:
+            future.cancel()
+        self.begun.clear()
+
+    def _begin(self, place: Place, count: int) -> None:
+        """Have so many batches under way."""
+        self.threads = self.threads or ThreadPoolExecutor(self.depth, thread_name_prefix="read-ahead")
+        while len(self.begun) < count:
+            place = self.after(self.begun[-1][0]) if self.begun else place
+            self.begun.append((place, self.threads.submit(self.make, place)))
+
+
+class TrainLoader:
+    """An endless stream of epochs: each pass yields the rest of the current epoch, the next pass the next epoch.
+
+    Global batch g of an epoch covers its samples g * world * batch_size and on; each rank takes its own part
+    of them, so that the samples seen do not depend on how many processes share the work. Where every process
+    draws from clips of its own, its samples are numbered on their own.
+
+    Args:
+        draw: (epoch, first sample, count) to the windows drawn.
+        gather: what `fetch` gave to the batch; without it, windows drawn to the batch.
+        batch_size: scenes a batch and process.
+        epoch_size: samples an epoch, over all processes; rounded down to whole batches, at least one.
+        rank: of this process.
+        world: number of processes.
+        shared: `draw` numbers the samples of this process alone.
+        fetch: windows drawn to what `gather` takes; the part that threads do ahead. Its result must depend on the
+            windows alone.
+        ahead: batches fetched ahead; 0: each when it is asked for. They are no part of the state before they are seen.
+    """
+
+    def __init__(
+        self,
+        draw: Callable[[int, int, int], Draw],
+        gather: Callable[[Any], Scene],
+        batch_size: int,
+        epoch_size: int,
+        rank: int = 0,
+        world: int = 1,
+        shared: bool = False,
+        fetch: Callable[[Draw], Any] | None = None,
+        ahead: int = 0,
+    ) -> None:
+        self.draw, self.gather, self.shared = draw, gather, shared
+        self.fetch = fetch or (lambda draw: draw)
+        self.ahead = Ahead(self._fetched, self._after, ahead) if ahead else None
+        self.batch_size, self.rank, self.world = batch_size, rank, world
+        self.batches = max(1, epoch_size // (batch_size * world))
+        self.epoch, self.batch = 0, 0
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Scene]:
+        # Lightning makes the iterator before it restores anything: read the place only when asked for a batch.
+        while True:
+            place = (self.epoch, self.batch)
+            batch = self.gather(self.ahead.get(place) if self.ahead else self._fetched(place))
+            self.epoch, self.batch = self._after(place)
+            yield batch
+            if self._after(place)[1] == 0:
+                return
+
+    def _fetched(self, place: Place) -> Any:
+        epoch, batch = place
+        block = batch if self.shared else batch * self.world + self.rank
+        return self.fetch(self.draw(epoch, block * self.batch_size, self.batch_size))
+
+    def _after(self, place: Place) -> Place:
+        epoch, batch = place
+        return (epoch, batch + 1) if batch + 1 < self.batches else (epoch + 1, 0)
+
+    def close(self) -> None:
+        """End the threads that read ahead."""
+        if self.ahead:
+            self.ahead.close()
+
+    def state_dict(self) -> dict[str, int]:
+        """Where the stream stands: what comes next is this sample of this epoch."""
+        return {"epoch": self.epoch, "sample": self.batch * self.batch_size * self.world}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on from there; with another number of processes or batch size, from the batch that it lies in."""
+        self.epoch, self.batch = state["epoch"], state["sample"] // (self.batch_size * self.world)
+        if self.batch >= self.batches:
+            self.epoch, self.batch = self.epoch + 1, 0
+
+
+class FixedLoader:
+    """The same windows in the same order at every pass; process r of n takes every n-th, none twice.
+
+    All processes get equally many batches, at least one each: a model that talks to its copies in every
+    step (DDP does, where there are buffers) would otherwise wait for ever.
+
+    Args:
+        draw: all windows.
+        gather: windows drawn to the batch.
+        batch_size: scenes a batch and process at most; one more where shards of odd sizes need it.
+        rank: of this process.
+        world: number of processes.
+
+    Raises:
+        ValueError: fewer windows than processes.
+    """
+
+    def __init__(self, draw: Draw, gather: Gather, batch_size: int, rank: int = 0, world: int = 1) -> None:
+        if len(draw) < world:
+            raise ValueError(f"{len(draw)} windows for {world} processes; use at most {len(draw)} devices")
+        self.mine, self.gather = draw[slice(rank, None, world)], gather
+        smallest, largest = len(draw) // world, -(-len(draw) // world)
+        self.batches = min(smallest, -(-largest // batch_size))
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Scene]:
+        ends = [len(self.mine) * k // self.batches for k in range(self.batches + 1)]
+        for first, end in pairwise(ends):
+            yield self.gather(self.mine[first:end])

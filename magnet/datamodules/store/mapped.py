@@ -1,0 +1,280 @@
+"""A split of prepared stores as training sees it: frames stay on disk, a batch touches only its own rows."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body import MIRROR
+from magnet.datamodules.clip import Clip, Ints, Split
+from magnet.datamodules.store.memory import Draw, Store
+from magnet.datamodules.store.reader import Folder, Part
+from magnet.datamodules.store.rows import ROW, SCALE, encode, matrices
+from magnet.motion.frames import rigid
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+UNEVEN = 0.1
+"""Shares of processes may differ by so much; else everybody draws from everything."""
+QUAT = 4 * ROW["rotations"].subdtype[0].itemsize  # type: ignore[index]
+"""Bytes of a rotation."""
+PELVIS: int = ROW.fields["pelvis"][1]  # type: ignore[index]
+"""Byte of a row at which the pelvis's place begins."""
+OTHER_SIDE = [joint - 1 for joint in MIRROR[1:]]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Clips of one split as rows, and what is known of them besides."""
+
+    part: Part
+    sources: list[str]
+    fps: float
+    body: str
+    seats: Ints  # (C, P) which person of a clip is shown as its first, second and so on
+    bad: Mapping[int, NDArray[np.bool_]]  # clips with invalid frames: which are valid (T,)
+
+    @staticmethod
+    def stored(folder: Folder, split: Split, roles: Sequence[str] = ()) -> Piece:
+        """Of a prepared store, people in the order of `roles`; may be empty."""
+        part = folder.split(split)
+        sources = [folder.manifest["name"]] * len(part.name)
+        return Piece(part, sources, folder.fps, folder.body, part.seats(roles), {})
+
+    @staticmethod
+    def encoded(clips: Sequence[Clip]) -> Piece:
+        """Of clips in memory, as a store would hold them; at least one."""
+        rows = [encode(clip.scene) for clip in clips]
+        part = Part(
+            name=[clip.name for clip in clips],
+            take=[clip.name for clip in clips],
+            frames=np.array([clip.frames for clip in clips], dtype=np.int64),
+            people=np.array([clip.agents for clip in clips], dtype=np.int64),
+            betas=np.concatenate([clip.scene.betas[0].float().cpu().numpy() for clip in clips]),
+            files=[Path("in memory")],
+            ends=np.array([sum(map(len, rows))], dtype=np.int64),
+            maps={0: np.concatenate(rows)},
+        )
+        goods = {c: good for c, clip in enumerate(clips) if not (good := clip.good()).all()}
+        first = clips[0].scene
+        return Piece(part, [clip.source for clip in clips], first.fps, first.body, part.seats(()), goods)
+
+    @staticmethod
+    def joined(pieces: Sequence[Piece]) -> Piece:
+        """One after the other.
+
+        Raises:
+            ValueError: bodies or rates differ.
+        """
+        first, clips = pieces[0], 0
+        bad: dict[int, NDArray[np.bool_]] = {}
+        most = max(piece.seats.shape[1] for piece in pieces)
+        for piece in pieces:
+            if (piece.fps, piece.body) != (first.fps, first.body):
+                raise ValueError(
+                    f"clip {piece.part.name[0]}: {piece.fps:g} fps and body {piece.body}, but clip "
+                    f"{first.part.name[0]} has {first.fps:g} fps and body {first.body}"
+                )
+            bad |= {clips + c: good for c, good in piece.bad.items()}
+            clips += len(piece.sources)
+        part = Part.joined([piece.part for piece in pieces])
+        seats = np.concatenate([np.pad(piece.seats, ((0, 0), (0, most - piece.seats.shape[1]))) for piece in pieces])
+        return Piece(part, [s for piece in pieces for s in piece.sources], first.fps, first.body, seats, bad)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A batch as it lies on disk: what one process reads ahead, and another device decodes."""
+
+    draw: Draw
+    raw: Tensor  # (B, T, P, bytes of a row) uint8
+    betas: Tensor  # (B, P, 10)
+    present: Tensor  # (B, P) bool
+    valid: Tensor  # (B, T) bool
+    names: tuple[str, ...]
+
+
+class MappedStore(Store):
+    """Like `Store`, with rows read through memory maps and decoded on `device`.
+
+    Only the index is held in memory: some hundred bytes a clip. Rows travel to the device as they lie on disk.
+
+    Args:
+        piece: the clips; at least one.
+        max_agents: slots P of every batch.
+        spread: let each process read a length of every source of its own, where there are enough clips.
+
+    Raises:
+        ValueError: a clip has more people than slots.
+        StoreError: a file is missing or damaged.
+    """
+
+    def __init__(self, piece: Piece, max_agents: int, spread: bool = True) -> None:
+        self.part = part = piece.part
+        self.seats, self.bad = piece.seats, piece.bad
+        self._index(
+            names=part.name,
+            sources=piece.sources,
+            length=part.frames,
+            people=part.people,
+            whole=[c not in self.bad for c in range(len(part.name))],
+            max_agents=max_agents,
+            fps=piece.fps,
+            body=piece.body,
+        )
+        self.shards: dict[int, NDArray[np.void]] = {}
+        self.device = torch.device("cpu")
+        self.spread = spread
+        # Missing files are found now, not in the middle of an epoch. A map takes addresses alone until it is read.
+        for number in range(len(part.files)):
+            part.shard(number)
+
+    def to(self, device: torch.device | str) -> MappedStore:
+        """The same clips, decoded on another device."""
+        other = copy.copy(self)
+        other.device = torch.device(device)
+        return other
+
+    def good(self, clip: int) -> NDArray[np.bool_]:
+        """Which frames of a clip are valid; stores hold no others. (T,) bool"""
+        return self.bad[clip] if clip in self.bad else np.ones(int(self.length[clip]), dtype=bool)
+
+    def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
+        """Which process reads each clip: every source cut into equally likely lengths, one a process. (C,)
+
+        A process reads from the shards of its lengths alone, of which it shares the first and the last with its
+        neighbours. None where clips are too few for loads within a tenth of each other: then all draw from all.
+        """
+        owner = np.zeros(len(mass), dtype=np.int64)
+        for source in set(self.sources):
+            mine = np.where(self.sources == source, mass, 0.0)
+            middle = (np.cumsum(mine) - mine / 2) / (mine.sum() or 1.0)
+            owner = np.where(self.sources == source, np.minimum((middle * world).astype(np.int64), world - 1), owner)
+        load = np.bincount(owner, mass, world)
+        return owner if self.spread and np.ptp(load) <= UNEVEN / world else None
+
+    # -- from disk -----------------------------------------------------------------------------
+
+    def fetch(self, draw: Draw, frames: int, clearance: float = 0.0) -> Rows | Scene:
+        """All that a CPU has to do for a batch: rows in pinned memory for a GPU; without one, the batch itself."""
+        rows = self.read(draw, frames)
+        return self.decoded(rows, clearance) if self.device.type == "cpu" else rows
+
+    def finish(self, fetched: Rows | Scene, clearance: float = 0.0) -> Scene:
+        """What `fetch` gave, as a batch on `device`."""
+        return fetched if isinstance(fetched, Scene) else self.decoded(fetched, clearance)
+
+    def gather(self, draw: Draw, frames: int, clearance: float = 0.0) -> Scene:
+        """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
+
+        Beyond a clip's end its last frame is repeated with `valid` False.
+        """
+        return self.finish(self.fetch(draw, frames, clearance), clearance)
+
+    def read(self, draw: Draw, frames: int) -> Rows:
+        """Copy the windows drawn out of the maps; computes nothing."""
+        B, P = draw.members.shape
+        present = draw.members >= 0
+        clip = np.take_along_axis(np.maximum(draw.clips, 0), draw.groups, 1)  # (B, P)
+        start = np.take_along_axis(draw.starts, draw.groups, 1)
+        member = self.seats[clip, np.maximum(draw.members, 0)]
+        row = self.part.first[clip] + member * self.length[clip] + start
+        count = np.minimum(frames, self.length[clip] - start)
+        shard = np.searchsorted(self.part.ends, row, side="right")
+        row -= np.concatenate([[0], self.part.ends])[shard]
+
+        raw = self._room(B, frames, P)
+        out = raw.numpy().view(BYTES)[..., 0]
+        if not present.all():
+            out.transpose(0, 2, 1)[~present] = NOBODY
+        scenes, slots = present.nonzero()
+        windows = zip(scenes.tolist(), slots.tolist(), *(x[present].tolist() for x in (shard, row, count)), strict=True)
+        for b, p, number, first, n in windows:
+            out[b, :n, p] = self._shard(number)[first : first + n]
+            if n < frames:
+                out[b, n:, p] = out[b, n - 1, p]
+
+        person = self.part.last_person[clip] - self.part.people[clip] + member
+        betas = np.where(present[..., None], self.part.betas[person], np.float32(0))
+        return Rows(
+            draw=draw,
+            raw=raw,
+            betas=torch.from_numpy(betas),
+            present=torch.from_numpy(present),
+            valid=torch.from_numpy(self._valid(draw, frames)),
+            names=self.labels(draw, frames),
+        )
+
+    def _shard(self, number: int) -> NDArray[np.void]:
+        if number not in self.shards:
+            self.shards[number] = np.asarray(self.part.shard(number)).view(BYTES)
+        return self.shards[number]
+
+    def _room(self, *shape: int) -> Tensor:
+        on_gpu = self.device.type == "cuda"
+        # A thread that pins memory would else open a context on the first GPU, whichever this process computes on.
+        with torch.cuda.device(self.device) if on_gpu else nullcontext():
+            return torch.empty(*shape, ROW.itemsize, dtype=torch.uint8, pin_memory=on_gpu)
+
+    def _valid(self, draw: Draw, frames: int) -> NDArray[np.bool_]:
+        """Frames at which all clips of a scene are there and valid. (B, T)"""
+        clips = np.maximum(draw.clips, 0)
+        frame = draw.starts[..., None] + np.arange(frames)  # (B, 2, T)
+        good = (frame < self.length[clips][..., None]) | (draw.clips < 0)[..., None]
+        if self.bad:
+            for b, k in np.argwhere(~self.whole[clips] & (draw.clips >= 0)).tolist():
+                mask = self.bad[int(clips[b, k])]
+                good[b, k] &= mask[np.minimum(frame[b, k], len(mask) - 1)]
+        return np.logical_and(good[:, 0], good[:, 1])
+
+    # -- on the device -------------------------------------------------------------------------
+
+    def decoded(self, rows: Rows, clearance: float) -> Scene:
+        """Rows to the batch that they are, on `device`."""
+        raw = rows.raw.to(self.device, non_blocking=True)
+        present, groups = rows.present.to(self.device), torch.from_numpy(rows.draw.groups).to(self.device)
+        root = raw[..., :QUAT].contiguous().view(torch.int16)
+        pelvis = raw[..., PELVIS:].contiguous().view(torch.float32)
+        body = raw[..., QUAT:PELVIS].contiguous().view(torch.int16).unflatten(-1, (BODY_JOINTS - 1, 4))
+        T_world_root = self._compose(rigid(matrices(root), pelvis), present, groups, rows.draw, clearance)
+        chosen = np.flatnonzero(rows.draw.mirrored)
+        if len(chosen):
+            index = torch.from_numpy(chosen).to(self.device)
+            body.index_copy_(0, index, mirrored(body[index]))
+            flip = torch.tensor([-1.0, 1.0, 1.0, 1.0], device=self.device)
+            T_world_root.index_copy_(0, index, T_world_root[index] * (flip[:, None] * flip))
+        return Scene(
+            body_rot=matrices(body),
+            T_world_root=T_world_root,
+            betas=rows.betas.to(self.device),
+            present=present,
+            fps=self.fps,
+            body=self.body,
+            valid=rows.valid.to(self.device),
+            names=rows.names,
+        )
+
+
+BYTES = np.dtype((np.void, ROW.itemsize))
+NOBODY = np.zeros((), dtype=ROW)
+NOBODY["rotations"][:, 3] = SCALE
+NOBODY = NOBODY.view(BYTES)
+
+
+def mirrored(body: Tensor) -> Tensor:
+    """Joints' quaternions seen in the plane x = 0, left and right exchanged: `mirror_scene` on eight bytes a joint.
+
+    Args:
+        body: (..., 21, 4) int16, xyzw.
+    """
+    whole = body.view(torch.int64)[..., 0]
+    swapped = whole[..., OTHER_SIDE].unsqueeze(-1).view(torch.int16)
+    swapped[..., 1:3].neg_()
+    return swapped

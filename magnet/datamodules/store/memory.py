@@ -1,0 +1,241 @@
+"""Clips of a split: their index, and flat rows of all frames, from which batches of windows are gathered."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.body.mirror import mirror_scene
+from magnet.checks import require_whole
+from magnet.datamodules.clip import Clip, Ints
+from magnet.datamodules.store.compose import place_apart
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What a batch of B windows shows: up to two clips each and who stands in which of the P slots."""
+
+    clips: Ints  # (B, 2) index of the clip; the second is -1 unless the scene is composed
+    starts: Ints  # (B, 2) first frame
+    members: Ints  # (B, P) which person of the clip a slot shows, -1: nobody
+    groups: Ints  # (B, P) which of the two clips the person comes from
+    mirrored: NDArray[np.bool_]  # (B,)
+    placing: NDArray[np.float64]  # (B, 3) of the second group: yaw, direction in radians, distance in metres
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, part: slice) -> Draw:
+        return Draw(*(getattr(self, f)[part] for f in self.__dataclass_fields__))
+
+    @staticmethod
+    def concatenate(draws: Sequence[Draw]) -> Draw:
+        return Draw(*(np.concatenate([getattr(d, f) for d in draws]) for f in Draw.__dataclass_fields__))
+
+
+class Store:
+    """All clips of a split as flat tensors on one device; rows are frames of one person.
+
+    Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there. What
+    keeps its frames elsewhere overrides `gather`, `good`, `to` and `__init__`, and calls `_index`.
+
+    Args:
+        clips: at least one, all of one fps and body.
+        max_agents: slots P of every batch.
+
+    Raises:
+        ValueError: a clip has more people than slots, or another fps or body than the first.
+    """
+
+    def __init__(self, clips: Sequence[Clip], max_agents: int) -> None:
+        self.clips = list(clips)
+        first = self.clips[0]
+        for clip in self.clips:
+            for field in ("fps", "body"):
+                got, want = getattr(clip.scene, field), getattr(first.scene, field)
+                if got != want:
+                    raise ValueError(f"clip {clip.name}: {field} is {got}, but clip {first.name} has {want}")
+        goods = [clip.good() for clip in self.clips]
+        self._index(
+            names=[clip.name for clip in self.clips],
+            sources=[clip.source for clip in self.clips],
+            length=[clip.frames for clip in self.clips],
+            people=[clip.agents for clip in self.clips],
+            whole=[bool(good.all()) for good in goods],
+            max_agents=max_agents,
+            fps=first.scene.fps,
+            body=first.scene.body,
+        )
+        self.tensors = {"valid": torch.from_numpy(np.concatenate(goods)), **self._first_rows(), **self._flatten()}
+        self.device = self.tensors["body_rot"].device
+
+    def _index(
+        self,
+        names: Sequence[str],
+        sources: Sequence[str],
+        length: Sequence[int] | Ints,
+        people: Sequence[int] | Ints,
+        whole: Sequence[bool] | NDArray[np.bool_],
+        max_agents: int,
+        fps: float,
+        body: str,
+    ) -> None:
+        """What is known of each clip besides its frames."""
+        self.names, self.sources = list(names), np.array(sources, dtype=object)
+        self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
+        self.whole = np.array(whole, dtype=bool)  # every frame is valid
+        self.max_agents, self.fps, self.body = max_agents, fps, body
+        most = int(self.people.argmax())
+        if self.people[most] > max_agents:
+            raise ValueError(
+                f"clip {self.names[most]} has {self.people[most]} people, but max_agents is {max_agents}; raise"
+                " max_agents"
+            )
+
+    def _first_rows(self) -> dict[str, Tensor]:
+        """Where each clip's people begin: person after person, one row a frame, from row 1 on."""
+        rows = self.length * self.people
+        slot = np.arange(self.max_agents)
+        there = slot < self.people[:, None]
+        first_row = 1 + (np.cumsum(rows) - rows)[:, None] + slot * self.length[:, None]
+        person = 1 + (np.cumsum(self.people) - self.people)[:, None] + slot
+        return {
+            "first_row": torch.from_numpy(np.where(there, first_row, 0)),
+            "person": torch.from_numpy(np.where(there, person, 0)),
+            "length": torch.from_numpy(self.length),
+            "first_frame": torch.from_numpy(np.cumsum(self.length) - self.length),
+        }
+
+    def _flatten(self) -> dict[str, Tensor]:
+        eye = torch.eye(4)
+        rot = [eye[:3, :3].expand(1, BODY_JOINTS - 1, 3, 3)]
+        root, betas = [eye[None]], [torch.zeros(1, 10)]
+        for clip in self.clips:
+            scene = clip.scene.to("cpu")
+            for p in range(clip.agents):
+                rot.append(scene.body_rot[0, :, p].float())
+                root.append(scene.T_world_root[0, :, p].float())
+                betas.append(scene.betas[:, p].float())
+        return {"body_rot": torch.cat(rot), "T_world_root": torch.cat(root), "betas": torch.cat(betas)}
+
+    def good(self, clip: int) -> NDArray[np.bool_]:
+        """Which frames of a clip are valid. (T,) bool"""
+        return self.clips[clip].good()
+
+    def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
+        """Which of `world` processes draws from each clip, given how likely each is; None: all draw from all. (C,)"""
+        return None
+
+    def to(self, device: torch.device | str) -> Store:
+        """The same clips on another device; itself when they are there already."""
+        if torch.device(device) == self.device:
+            return self
+        other = copy.copy(self)
+        other.device = torch.device(device)
+        other.tensors = {name: tensor.to(device) for name, tensor in self.tensors.items()}
+        return other
+
+    def gather(self, draw: Draw, frames: int, clearance: float = 0.0) -> Scene:
+        """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
+
+        Beyond a clip's end its last frame is repeated with `valid` False.
+        """
+        t = self.tensors
+
+        def to_index(array: Ints) -> Tensor:
+            return torch.from_numpy(array).to(self.device, non_blocking=True)
+
+        clips, starts = to_index(np.maximum(draw.clips, 0)), to_index(draw.starts)
+        members, groups = to_index(draw.members), to_index(draw.groups)
+        there, member = members >= 0, members.clamp_min(0)
+
+        wanted = starts[..., None] + torch.arange(frames, device=self.device)  # (B, 2, T)
+        last = t["length"][clips][..., None] - 1
+        frame = torch.minimum(wanted, last)
+        good = (wanted <= last) & t["valid"][t["first_frame"][clips][..., None] + frame]
+        valid = (good | to_index(draw.clips)[..., None].lt(0)).all(dim=1)
+
+        clip = clips.gather(1, groups)  # (B, P)
+        frame_of_slot = frame.gather(1, groups[..., None].expand(-1, -1, frames))  # (B, P, T)
+        rows = torch.where(there[..., None], t["first_row"][clip, member][..., None] + frame_of_slot, 0)
+        rows = rows.transpose(1, 2)
+        T_world_root = t["T_world_root"].index_select(0, rows.flatten()).unflatten(0, rows.shape)
+        scene = Scene(
+            body_rot=t["body_rot"].index_select(0, rows.flatten()).unflatten(0, rows.shape),
+            T_world_root=self._compose(T_world_root, there, groups, draw, clearance),
+            betas=t["betas"][torch.where(there, t["person"][clip, member], 0)],
+            present=there,
+            fps=self.fps,
+            body=self.body,
+            valid=valid,
+            names=self.labels(draw, frames),
+        )
+        return self._mirror(scene, draw)
+
+    def _compose(self, T_world_root: Tensor, there: Tensor, groups: Tensor, draw: Draw, clearance: float) -> Tensor:
+        chosen = torch.from_numpy(np.flatnonzero(draw.clips[:, 1] >= 0)).to(self.device)
+        if not len(chosen):
+            return T_world_root
+        placing = torch.from_numpy(draw.placing).to(self.device, T_world_root.dtype)[chosen]
+        moved = place_apart(T_world_root[chosen], there[chosen], groups[chosen] == 1, placing, clearance)
+        return T_world_root.index_copy_(0, chosen, moved)
+
+    def _mirror(self, scene: Scene, draw: Draw) -> Scene:
+        # Only the chosen half is computed, in place: on a CPU, moving the numbers is what a batch costs.
+        chosen = np.flatnonzero(draw.mirrored)
+        if len(chosen):
+            index = torch.from_numpy(chosen).to(self.device)
+            half = mirror_scene(scene.replace(**{n: v[index] for n, v in scene.tensors().items()}, names=()))
+            scene.body_rot.index_copy_(0, index, half.body_rot)
+            scene.T_world_root.index_copy_(0, index, half.T_world_root)
+        return scene
+
+    def labels(self, draw: Draw, frames: int) -> tuple[str, ...]:
+        """A label a scene: clip and frames, such as "60_05+61_05 [120:302]"; composed ones say so."""
+
+        def label(clip: int, start: int) -> str:
+            return f"{self.names[clip]} [{start}:{min(start + frames, self.length[clip])}]"
+
+        return tuple(
+            label(a, s) if b < 0 else f"composed: {label(a, s)} + {label(b, z)}"
+            for (a, b), (s, z) in zip(draw.clips.tolist(), draw.starts.tolist(), strict=True)
+        )
+
+
+def all_starts(good: NDArray[np.bool_], frames: int) -> Ints:
+    """First frames of every window of a clip to train on. good: (T,) bool
+
+    Windows that hold an invalid frame are left out, unless the clip has no other: then the best ones stay.
+    A clip shorter than the window has one, which starts at 0.
+    """
+    if len(good) <= frames:
+        return np.zeros(1 if good.any() else 0, dtype=np.int64)
+    total = np.concatenate([[0], np.cumsum(good)])
+    count = total[frames:] - total[:-frames]
+    best = count.max()
+    return np.flatnonzero(count == best) if best else np.zeros(0, dtype=np.int64)
+
+
+def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
+    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool
+
+    Raises:
+        ValueError: the stride is less than a frame.
+    """
+    require_whole("stride", stride, 1)
+    starts, start = [], 0
+    while start + frames <= len(good):
+        bad = np.flatnonzero(~good[start : start + frames])
+        if len(bad):
+            start += int(bad[-1]) + 1
+        else:
+            starts.append(start)
+            start += stride
+    return np.array(starts, dtype=np.int64)

@@ -1,0 +1,104 @@
+"""Which files are people of one scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from magnet.datamodules.reading.own_files import Group, by_names, by_pattern, by_table, files_of
+from magnet.datamodules.reading.recording import DataError
+
+
+def made(root: Path, *names: str) -> list[Path]:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    return files_of(root, (".bvh",))
+
+
+def told(groups: list[Group]) -> dict[str, list[str]]:
+    return {group.scene: [seat.person for seat in group.seats] for group in groups}
+
+
+@pytest.mark.parametrize(
+    ("names", "scenes"),
+    [
+        (["dance_A.bvh", "dance_B.bvh"], {"dance": ["A", "B"]}),
+        (["dance-a.bvh", "dance-b.bvh", "dance-c.bvh"], {"dance": ["a", "b", "c"]}),
+        (["x person1.bvh", "x person2.bvh"], {"x": ["person1", "person2"]}),
+        (["x.leader.bvh", "x.follower.bvh"], {"x": ["follower", "leader"]}),
+        (["day/one_P1.BVH", "day/one_P2.bvh", "one_P1.bvh"], {"day/one": ["P1", "P2"], "one_P1": [""]}),
+        (["duel/A.bvh", "duel/B.bvh", "walk/A.bvh"], {"duel": ["A", "B"], "walk/A": [""]}),
+        (["take_1.bvh", "take_2.bvh", "take_10.bvh"], {"take_1": [""], "take_2": [""], "take_10": [""]}),
+        (["anna.bvh", "ben.bvh"], {"anna": [""], "ben": [""]}),
+        (["A.bvh", "B.bvh"], {"scene": ["A", "B"]}),
+        (["x_A.bvh", "x_B.bvh", "x.bvh"], {"x": ["A", "B"], "x.bvh": [""]}),
+        ([".trash/x_A.bvh", "x_B.bvh", "notes.txt"], {"x_B": [""]}),
+    ],
+)
+def test_names_tell_who_was_recorded_together(names: list[str], scenes: dict[str, list[str]], tmp_path: Path) -> None:
+    assert told(by_names(tmp_path, made(tmp_path, *names))) == scenes
+
+
+def test_one_of_several_who_lacks_the_others_is_known_as_such(tmp_path: Path) -> None:
+    groups = by_names(tmp_path, made(tmp_path, "dance_A.bvh", "walk.bvh"))
+    assert {group.scene: group.alone for group in groups} == {"dance_A": True, "walk": False}
+
+
+@pytest.mark.parametrize(
+    ("pattern", "scenes"),
+    [
+        ("{scene}/{person}", {"s1": ["anna", "ben"], "s2/more": ["anna", "ben"]}),
+        ("{person}-{scene}", {}),
+        ("s*/{scene}/{person}", {"more": ["anna", "ben"]}),
+        ("{person}/{scene}", {"anna": ["s1"], "ben": ["s1"], "more/anna": ["s2"], "more/ben": ["s2"]}),
+    ],
+)
+def test_a_pattern_of_the_path_tells_it_too(pattern: str, scenes: dict[str, list[str]], tmp_path: Path) -> None:
+    files = made(tmp_path, "s1/anna.bvh", "s1/ben.bvh", "s2/more/anna.bvh", "s2/more/ben.bvh")
+    groups, left = by_pattern(tmp_path, files, pattern)
+    assert told(groups) == scenes
+    assert len(left) == len(files) - sum(map(len, scenes.values()))
+
+
+@pytest.mark.parametrize("pattern", ["{scene}", "{scene}/{person}/{person}", "what"])
+def test_a_pattern_without_both_words_is_refused(pattern: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="once each"):
+        by_pattern(tmp_path, [], pattern)
+
+
+def test_a_table_tells_people_roles_and_when_they_begin(tmp_path: Path) -> None:
+    made(tmp_path, "a.bvh", "sub/b.bvh", "c.bvh")
+    table = tmp_path / "mine.csv"
+    table.write_text("Scene;file;Person;role;start\ntango;a.bvh;anna;leader;\ntango;sub/b.bvh;ben;follower;1.5\n\n")
+    (group,) = by_table(tmp_path, table, (".bvh",))
+    assert [(seat.person, seat.file.name, seat.start) for seat in group.seats] == [
+        ("anna leader", "a.bvh", 0.0),
+        ("ben follower", "b.bvh", 1.5),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"line 1: the columns are none"),
+        ("scene,person\ntango,anna\n", r"line 1: the columns are scene, person; expected scene, file"),
+        ("scene,file,shoes\n", r"line 1: the columns are scene, file, shoes"),
+        ("scene,file\n", r"lists no file"),
+        ("scene,file\ntango\n", r"line 2: got 'tango', expected scene, file"),
+        ("scene,file\ntango,z.bvh\n", r"line 2: z\.bvh: no such file under .*relative to that folder"),
+        ("scene,file\ntango,../a.bvh\n", r"line 2: \.\./a\.bvh lies outside"),
+        ("scene,file\ntango,/etc/a.bvh\n", r"line 2: /etc/a\.bvh lies outside"),
+        ("scene,file\ntango,a.txt\n", r"line 2: a\.txt is no \.bvh file"),
+        ("scene,file\ntango,a.bvh\nwaltz,a.bvh\n", r"line 3: a\.bvh is named in line 2 already"),
+        ("scene,file,start\ntango,a.bvh,soon\n", r"line 2: start is 'soon', expected seconds"),
+        ("scene,file,start\ntango,a.bvh,nan\n", r"line 2: start is 'nan', expected seconds"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_said_with_its_line(text: str, message: str, tmp_path: Path) -> None:
+    made(tmp_path, "a.bvh")
+    (tmp_path / "mine.csv").write_text(text)
+    with pytest.raises(DataError, match=message) as caught:
+        by_table(tmp_path, tmp_path / "mine.csv", (".bvh",))
+    assert "mine.csv" in str(caught.value)

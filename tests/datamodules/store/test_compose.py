@@ -1,0 +1,123 @@
+"""Laws of composed scenes: two groups on one floor that keep apart and stay what they were."""
+
+import math
+import re
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.datamodules.store.compose import place_apart
+from magnet.motion.frames import inverse
+from magnet.motion.scene import Scene, concatenate
+from magnet.testing import random_scene
+from tests.datamodules.fakes import FakeData, couples_and_singles, random_clip
+
+CLEARANCE = 0.9
+
+
+def closest(T_world_root: Tensor, ours: list[int], theirs: list[int]) -> float:
+    """Smallest distance on the ground between people of two groups of one scene, pair by pair. (T, P, 4, 4)"""
+    ground = T_world_root[:, :, [0, 2], 3]
+    return min(float((ground[:, i] - ground[:, j]).norm(dim=-1).min()) for i in ours for j in theirs)
+
+
+@pytest.fixture
+def groups(generator: torch.Generator) -> tuple[Scene, Tensor, Tensor]:
+    """200 scenes of couple and couple in four slots, how to place them, and who is second."""
+    scene = random_scene(200, 64, 4, generator)
+    placing = torch.rand(200, 3, generator=generator) * torch.tensor([2 * math.pi, 2 * math.pi, 3.0])
+    second = torch.tensor([False, True, False, True]).expand(200, 4)
+    return scene, placing, second
+
+
+def test_groups_never_come_closer_than_the_clearance(groups: tuple[Scene, Tensor, Tensor]) -> None:
+    scene, placing, second = groups
+    placed = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    distances = [closest(T, [0, 2], [1, 3]) for T in placed]
+    assert min(distances) > CLEARANCE - 1e-4
+    assert sum(d < CLEARANCE + 1e-3 for d in distances) > 20  # no further apart than needed
+
+
+def test_far_enough_groups_stand_as_far_apart_as_drawn(groups: tuple[Scene, Tensor, Tensor]) -> None:
+    scene, placing, second = groups
+    placing[:, 2] = 20.0
+    ground = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)[..., [0, 2], 3]
+    between = ground[:, :, [1, 3]].mean(dim=(1, 2)) - ground[:, :, [0, 2]].mean(dim=(1, 2))
+    heading = torch.stack([placing[:, 1].sin(), placing[:, 1].cos()], dim=-1)
+    torch.testing.assert_close(between, 20 * heading, atol=1e-4, rtol=0)
+
+
+def test_a_group_moves_as_one_on_the_floor(groups: tuple[Scene, Tensor, Tensor]) -> None:
+    scene, placing, second = groups
+    before, after = scene.T_world_root, place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    assert torch.equal(after[:, :, [0, 2]], before[:, :, [0, 2]])
+    torch.testing.assert_close(after[..., 1, 3], before[..., 1, 3])
+    motion = after[:, :, [1, 3]] @ inverse(before[:, :, [1, 3]])
+    torch.testing.assert_close(motion, motion[:, :1, :1].expand_as(motion), atol=1e-4, rtol=0)
+    yaw = torch.atan2(motion[:, 0, 0, 0, 2], motion[:, 0, 0, 0, 0])
+    torch.testing.assert_close((yaw - placing[:, 0]).cos(), torch.ones(200))
+
+
+def test_absent_agents_neither_push_nor_move(groups: tuple[Scene, Tensor, Tensor]) -> None:
+    scene, placing, second = groups
+    scene = scene.cut(0).replace(present=torch.tensor([True, True, False, False]).expand(200, 4))
+    placed = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    elsewhere = scene.T_world_root.clone()
+    elsewhere[:, :, 2:, :3, 3] += 5.0
+    again = place_apart(elsewhere, scene.present, second, placing, CLEARANCE)
+    assert torch.equal(again[:, :, :2], placed[:, :, :2]) and torch.equal(again[:, :, 2:], elsewhere[:, :, 2:])
+
+
+@pytest.mark.parametrize(("slots", "sizes"), [(2, {1, 2}), (3, {1, 2, 3}), (4, {1, 2, 3, 4})])
+def test_training_composes_where_there_is_room(slots: int, sizes: set[int]) -> None:
+    data = FakeData(couples_and_singles(), max_agents=slots, compose=0.5, drop_agent=0.0, epoch_size=512)
+    batch = concatenate(list(data.train_dataloader()))
+    people = batch.present.sum(dim=1)
+    assert set(people.tolist()) == sizes
+    composed = torch.tensor([name.startswith("composed: ") for name in batch.names])
+    assert torch.equal(composed, people >= 3)
+    if slots == 4:
+        assert 0.25 < composed.float().mean().item() < 0.5  # single and single are not composed, nor a clip with itself
+
+
+@pytest.mark.parametrize("drop", [0.0, 1.0])
+def test_composed_training_scenes_show_two_clips_apart(drop: float) -> None:
+    clips = couples_and_singles()
+    people = {clip.name: clip.scene.betas[0] for clip in clips}
+    data = FakeData(clips, max_agents=4, compose=1.0, drop_agent=drop, epoch_size=256)
+    batch = concatenate(list(data.train_dataloader()))
+    seen = 0
+    for b, name in enumerate(batch.names):
+        there = [int(p) for p in batch.present[b].nonzero()[:, 0]]
+        first, *second = re.findall(r"(\w+) \[", name)
+        owner = {p: next(c for c in people if (people[c] == batch.betas[b, p]).all(dim=-1).any()) for p in there}
+        assert set(owner.values()) == {first, *second}
+        if name.startswith("composed"):
+            seen += 1
+            groups = [[p for p in there if owner[p] == clip] for clip in (first, second[0])]
+            assert closest(batch.T_world_root[b], *groups) > CLEARANCE - 1e-3
+    assert seen > 64
+
+
+def test_composed_test_scenes_come_last_and_say_so() -> None:
+    data = FakeData(
+        couples_and_singles("test"), max_agents=4, context_frames=16, horizon_frames=64, composed_test=6, test_limit=3
+    )
+    batch = concatenate(list(data.test_dataloader()))
+    assert [name.startswith("composed: ") for name in batch.names] == [False] * 3 + [True] * 6
+    assert batch.present.sum(dim=1)[3:].tolist() == [3, 4, 3, 4, 3, 4]
+    again = concatenate(list(data.test_dataloader()))
+    assert torch.equal(again.T_world_root, batch.T_world_root) and again.names == batch.names
+
+
+def test_couples_alone_still_make_three() -> None:
+    clips = [random_clip(n, 100, split="test") for n in "ab"]
+    data = FakeData(clips, max_agents=4, context_frames=16, horizon_frames=64, composed_test=2)
+    assert concatenate(list(data.test_dataloader())).present.sum(dim=1).tolist() == [2, 2, 3, 4]
+
+
+def test_composing_one_clip_with_itself_is_refused() -> None:
+    data = FakeData([random_clip("a", 400, split="test")], max_agents=4, composed_test=2)
+    with pytest.raises(ValueError, match="composed_test=2: needs max_agents of 3 or more"):
+        data.test_dataloader()
