@@ -88,7 +88,7 @@ class Replaced(Evaluation):
                 known[: scene.frames, : scene.agents, None, None].to(scene.device)
                 | ~scene.present[:, None, :, None, None]
             )
-            other = scene.pick(torch.arange(scene.scenes).roll(1))
+            other = scene.select(torch.arange(scene.scenes).roll(1))
             return predict(
                 scene.replace(
                     body_rot=torch.where(keep[..., None], scene.body_rot, other.body_rot.flip(1)),

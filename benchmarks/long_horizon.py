@@ -45,7 +45,7 @@ HEAD, FEET = 15, (10, 11)
 def windows(data: CMU, split: str, stride: int = 30) -> Scene:
     """All recorded windows of a split, placed at their first frame."""
     scenes = [
-        clip.scene.cut(start, start + WINDOW).replace(valid=None, names=())
+        clip.scene.slice(start, start + WINDOW).replace(valid=None, names=())
         for clip in data.clips(split)  # type: ignore[arg-type]
         for start in range(0, clip.frames - WINDOW + 1, stride)
     ]
@@ -90,7 +90,7 @@ def measured(long: Scene, body: Body, reference: FrechetDistance) -> list[dict[s
     curve: list[dict[str, Any]] = []
     so_far: list[Tensor] = []
     for start in range(CONTEXT, long.frames - WINDOW + 1, WINDOW):
-        window = aligned(long.cut(start, start + WINDOW), 0)
+        window = aligned(long.slice(start, start + WINDOW), 0)
         joints = body.joints(window)
         so_far.append(joints)
         cumulative = torch.cat(so_far)
@@ -122,7 +122,7 @@ def main() -> None:
     body, model = load_body(), Denoiser.load(given.ckpt_path)
     data = CMU(singles=False, max_agents=model.layout.agents)
     starts = [
-        clip.scene.cut(k * WINDOW, k * WINDOW + CONTEXT).replace(names=(f"{clip.name} [{k * WINDOW}]",), valid=None)
+        clip.scene.slice(k * WINDOW, k * WINDOW + CONTEXT).replace(names=(f"{clip.name} [{k * WINDOW}]",), valid=None)
         for clip in data.clips("test")
         for k in range(clip.frames // WINDOW)
     ]
@@ -154,7 +154,7 @@ def main() -> None:
     draw(curve, floor, given.out / "curve.png")
     for b in range(min(2, long.scenes)):
         moments_shown = [CONTEXT + round(i * (given.frames - 1) / 8) for i in range(9)]
-        one = long.pick([b])
+        one = long.select([b])
         contact_sheet(
             [("", one)], given.out / f"strip_{b}.png", frames=moments_shown, context_frames=CONTEXT, body=body
         )

@@ -30,7 +30,7 @@ def main() -> None:
         past = model.generate(people=2, frames=32, seed=0)
         partner = model.partner(past, agents=0, seed=0)
         for frames in (4, 8):
-            coming = past.cut(past.frames - frames)
+            coming = past.slice(past.frames - frames)
             partner.answer(coming)
             took = []
             for _ in range(given.rounds):

@@ -22,7 +22,7 @@ from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.canvas import Health
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.seams import joined
+from magnet.denoiser.seams import cat_time
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid
@@ -96,10 +96,10 @@ def measure(options: argparse.Namespace) -> None:
         f"plan {(planned - empty) / MIB:.0f} MiB, grown {(most - planned) / MIB:.0f} MiB, "
         f"peak {peak() / MIB:.0f} MiB, finite {finite}, {health.means()}"
     )
-    for name, piece in (("first", first.cut(context)), ("last", last)):
+    for name, piece in (("first", first.slice(context)), ("last", last)):
         print(f"  {name} piece: {looks(piece)}")
     if options.save:
-        print(f"  saved: {joined(kept).save(options.save)}")
+        print(f"  saved: {cat_time(kept).save(options.save)}")
 
 
 def given_later(task: Task, context: int) -> bool:
@@ -115,7 +115,7 @@ def recorded(options: argparse.Namespace, frames: int) -> Scene:
         return random_scene(1, frames, 2, torch.Generator().manual_seed(1))
     clip = max(frames, CLIP)
     data = Synthetic(couplings=[options.coupling], people=[options.people], test_clips=1, clip_frames=clip)
-    return data.clips("test")[0].scene.cut(0, frames)
+    return data.clips("test")[0].scene.slice(0, frames)
 
 
 def looks(scene: Scene) -> str:

@@ -19,7 +19,7 @@ from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
-from magnet.motion.scene import FPS, Scene, absent, require_rate
+from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.partner import Partner
 from magnet.tasks import registry
@@ -158,7 +158,7 @@ class Motion(Scene):
             raise ValueError(f"player: got {player!r}, expected {' or '.join(get_args(Player))}")
         if scene is not None:
             require_whole("scene", scene, 0, self.scenes - 1)
-        shown = self if scene is None else Motion.of(self.pick([scene]), self.model)
+        shown = self if scene is None else Motion.of(self.select([scene]), self.model)
         with tempfile.TemporaryDirectory() as folder:
             kind = {"page": ".html", "film": ".webp"}[player]
             if player == "film":
@@ -224,7 +224,7 @@ class Model:
             ValueError: more people than the model has room for.
         """
         require_whole("people", people, 1, self.most_people)
-        empty = absent(1, STRIDE, people, torch.zeros(()))
+        empty = empty_scene(1, STRIDE, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
         return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples)
 
@@ -247,7 +247,7 @@ class Model:
         given = given // STRIDE * STRIDE
         if given < STRIDE:
             raise ValueError(f"to go on, the model needs {STRIDE} frames or more; got {max(given, 0)}")
-        scene = scene.cut(scene.frames - given)
+        scene = scene.slice(scene.frames - given)
         return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
 
     def inpaint(
@@ -347,7 +347,7 @@ class Model:
         generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
         sampled = self.denoiser.generate(plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
-        shown = sampled.order(torch.arange(slots))
+        shown = sampled.permute_agents(torch.arange(slots))
         return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
 
     def _generator(self, seed: int | None) -> torch.Generator:

@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.scene is not None:
         if not 0 <= options.scene < scene.scenes:
             raise CommandError(f"--scene {options.scene}: the file has scenes 0 to {scene.scenes - 1}")
-        scene = scene.pick([options.scene])
+        scene = scene.select([options.scene])
     if options.person:
         scene = only(scene, options.person)
     print(described(scene))

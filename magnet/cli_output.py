@@ -94,11 +94,11 @@ def write_scenes(
     number = 0
     for batch in predicted:
         for first in range(0, batch.scenes, evaluation.samples):
-            scene = batch.pick(slice(first, first + evaluation.samples)).to("cpu")
+            scene = batch.select(slice(first, first + evaluation.samples)).to("cpu")
             name = f"{rank}{number:04d}{_safe(scene)}"
             scene.save(folder / "scenes" / f"{name}.npz")
             if picture != "none" and number < pictures and model.global_rank == 0:
-                shown = [(f"sample {i + 1}", scene.pick([i])) for i in range(min(PANELS, scene.scenes))]
+                shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
                 look = {"context_frames": data.context_frames, "body": data.body.to("cpu")}
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))

@@ -147,7 +147,7 @@ def perform(
     sampled.save(out / f"{show.name}.npz")
     rows = {show.words: sampled}
     if sampled.given is not None and sampled.given.any() and sampled.frames <= truth.frames:
-        rows = {"recorded": truth.cut(0, sampled.frames).replace(given=sampled.given)} | rows
+        rows = {"recorded": truth.slice(0, sampled.frames).replace(given=sampled.given)} | rows
     written = picture(show, rows, data.body.to("cpu"), out)
     pace = sampled.frames / seconds
     return [
@@ -162,7 +162,7 @@ def picture(show: Show, rows: dict[str, Scene], body: Body, out: Path) -> list[P
     moments = [round(i * (frames - 1) / (COLUMNS - 1)) for i in range(COLUMNS)]
     sheet = contact_sheet(rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, body=body)
     first = max(0, frames - round(30 * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
-    end = {words: scene.cut(first) for words, scene in rows.items()}
+    end = {words: scene.slice(first) for words, scene in rows.items()}
     paint: Callable[..., Path] = render_video
     moving = paint(
         end,
@@ -181,4 +181,4 @@ def test_scene(data: Synthetic, coupling: str, people: int) -> Scene:
     if coupling == MADE:
         return Scene.load(weights.FOLDER / "duet" / "scenes" / f"{coupling}.npz").pad_agents(data.max_agents)
     kind = data.kinds.index((coupling, people))
-    return aligned(data.scene("test", kind).scene.pad_agents(data.max_agents).cut(0, CONTEXT + HORIZON), CONTEXT - 1)
+    return aligned(data.scene("test", kind).scene.pad_agents(data.max_agents).slice(0, CONTEXT + HORIZON), CONTEXT - 1)

@@ -162,7 +162,7 @@ class Evaluation:
         def predict(scene: Scene, samples: int, generators: Generators) -> Tensor:
             whole = self.sample(model, scene, samples, generators)
             with torch.autocast(scene.device.type, enabled=False):
-                return joints_of(in_slots(whole.cut(self.context), scene.agents), self.body, samples)
+                return joints_of(in_slots(whole.slice(self.context), scene.agents), self.body, samples)
 
         return predict
 
@@ -227,7 +227,7 @@ class Evaluation:
     def _measure(self, batch: Scene, answers: dict[str, Tensor], scored: Tensor, numbers: list[int]) -> None:
         """answers: (S, B, horizon, P, 22, 3) by method, scored (horizon, P) bool, numbers of the scenes"""
         T_shared_world = shared_world(batch, self.now)
-        future = self.body.joints(batch.cut(self.context).moved(T_shared_world))
+        future = self.body.joints(batch.slice(self.context).transformed(T_shared_world))
         units = torch.tensor([self.unit_of.get(name, -1) for name in batch.names or ("",) * batch.scenes])
         here: dict[str, Any] = {"agents": scored[None], "units": units.to(batch.device)}
         for name, joints in answers.items():
@@ -325,13 +325,13 @@ class Evaluation:
 def in_slots(scene: Scene, slots: int) -> Scene:
     """The same people in so many slots: free ones are added behind, or left out."""
     if slots < scene.agents:
-        return scene.order(torch.arange(slots, device=scene.device))
+        return scene.permute_agents(torch.arange(slots, device=scene.device))
     return scene.pad_agents(slots)
 
 
 def aligned(scene: Scene, frame: int) -> Scene:
     """The same motion in a world that all test scenes share: see `shared_world`."""
-    return scene.moved(shared_world(scene, frame))
+    return scene.transformed(shared_world(scene, frame))
 
 
 def shared_world(scene: Scene, frame: int) -> Tensor:

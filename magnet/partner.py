@@ -10,7 +10,7 @@ from magnet.denoiser.fed import FedStream
 from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.inputs import check_request
 from magnet.denoiser.module import Denoiser
-from magnet.motion.scene import Scene, joined, require_rate
+from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl, chosen
@@ -51,15 +51,15 @@ class Partner:
         self.options, self.generator = options or SamplerOptions(), generator
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present = past.present
-        whole = past.cut(past.frames % STRIDE).replace(valid=None, given=None)
+        whole = past.slice(past.frames % STRIDE).replace(valid=None, given=None)
         self._stream = FedStream(denoiser, whole, self.task, self.options, generator)
 
     @property
     def past(self) -> Scene:
         """The last frames of everybody, given and answered, as far back as the model or its decoder still looks."""
         canvas = self._stream.canvas
-        held = canvas.given.cut(0, canvas.shown * STRIDE)
-        return held.order(torch.arange(self._present.shape[1]))
+        held = canvas.given.slice(0, canvas.shown * STRIDE)
+        return held.permute_agents(torch.arange(self._present.shape[1]))
 
     def answer(self, frames: Scene) -> Scene:
         """The same frames with the answer in them, final; what is given in them comes back as it is.
@@ -81,6 +81,6 @@ class Partner:
         if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
         # Block by block: what has been fed beyond a block is not to be read in it.
-        answers = [self._stream.feed(frames.cut(first, first + block)) for first in range(0, frames.frames, block)]
-        answer = joined(answers).replace(names=frames.names)
-        return answer.order(torch.arange(frames.agents)).to(str(frames.device))
+        answers = [self._stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        answer = cat_time(answers).replace(names=frames.names)
+        return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))

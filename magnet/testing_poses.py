@@ -14,7 +14,7 @@ from torch import Tensor
 
 from magnet.denoiser.generation import SamplerOptions, task_sight
 from magnet.denoiser.stream import Stream
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
@@ -135,7 +135,7 @@ class Run:
         stream = Stream(self.model, scene, self.task, context, frames, 1, self.options, generator, None, None, piece=1)
         if other is not None:
             stream.noise = OtherNoise(stream.noise, other)
-        return joined(list(itertools.islice(stream.pieces(), min(rows + AFTER, self.grid.tokens))))
+        return cat_time(list(itertools.islice(stream.pieces(), min(rows + AFTER, self.grid.tokens))))
 
 
 def replaced(scene: Scene, other: Scene, tokens: Tensor) -> Scene:

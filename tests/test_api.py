@@ -16,7 +16,7 @@ from magnet.api import Model, Motion
 from magnet.body import load_body
 from magnet.denoiser.generation import SamplerOptions
 from magnet.export import resampled, save_bvh
-from magnet.motion.scene import Scene, concatenate, joined
+from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
@@ -102,7 +102,7 @@ def test_who_is_added_is_of_average_shape_whatever_the_empty_slot_holds(model: M
 
 
 def test_somebody_alone_is_given_a_partner(model: Model, duet: Scene):
-    solo = duet.order(torch.tensor([0]))
+    solo = duet.permute_agents(torch.tensor([0]))
     pair = model.inpaint(solo, agent=1, seed=1)
     assert pair.agents == 2 and pair.present.all()
     assert torch.allclose(pair.T_world_root[:, :, 0], solo.T_world_root[:, :48, 0], atol=1e-5)
@@ -132,12 +132,12 @@ def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
 
 def test_scenes_keep_what_they_know_when_cut_and_ordered(model: Model, duet: Scene):
     longer = model.continue_(duet, frames=12, seed=1)
-    part = longer.cut(40, 56)
+    part = longer.slice(40, 56)
     assert isinstance(part, Motion) and part.context == 8
-    assert isinstance(longer.pick([0]), Motion) and longer.pick([0]).context == 48
-    filled = model.inpaint(duet, agent=0, seed=1).order(torch.tensor([1, 0]))
+    assert isinstance(longer.select([0]), Motion) and longer.select([0]).context == 48
+    filled = model.inpaint(duet, agent=0, seed=1).permute_agents(torch.tensor([1, 0]))
     assert filled.given is not None and filled.given[0].all(dim=0).tolist() == [True, False]
-    assert longer.pad_agents(3).agents == 3 and longer.held(2).frames == 64
+    assert longer.pad_agents(3).agents == 3 and longer.pad_frames(2).frames == 64
     assert longer.joints().shape == (1, 60, 2, 22, 3)
 
 
@@ -233,7 +233,9 @@ CARELESS = {
     "the scene: got NoneType, expected a Scene": lambda model, duet: model.predict(None),
     "past: got Tensor, expected a Scene": lambda model, duet: model.partner(duet.body_rot),
     "frames: got NoneType, expected a Scene": lambda model, duet: model.partner(duet).answer(None),
-    "body differ: open-1 and mine": lambda model, duet: model.partner(duet).answer(duet.cut(0, 4).replace(body="mine")),
+    "body differ: open-1 and mine": lambda model, duet: model.partner(duet).answer(
+        duet.slice(0, 4).replace(body="mine")
+    ),
     "context: got 16.0, expected a whole number": lambda model, duet: model.continue_(duet, context=16.0),
     "context: got '32', expected a whole number": lambda model, duet: model.predict(duet, context="32"),
     "context: got -4, expected at least 0": lambda model, duet: model.predict(duet, context=-4),
@@ -257,8 +259,8 @@ CARELESS = {
     ).save("a.glb"),
     "fps: got inf": lambda model, duet: resampled(duet, math.inf),
     "fps: got 0, expected over 0": lambda model, duet: duet.replace(fps=0.0),
-    "fps differ: 30.0 and 60.0": lambda model, duet: joined([duet, duet.replace(fps=60.0)]),
-    "agents differ: 2 and 3": lambda model, duet: joined([duet, duet.pad_agents(3)]),
+    "fps differ: 30.0 and 60.0": lambda model, duet: cat_time([duet, duet.replace(fps=60.0)]),
+    "agents differ: 2 and 3": lambda model, duet: cat_time([duet, duet.pad_agents(3)]),
     "got no scenes to put together": lambda model, duet: concatenate([]),
     "betas: got ndarray, expected a tensor": lambda model, duet: duet.replace(betas=duet.betas.numpy()),
 }

@@ -44,7 +44,7 @@ def test_one_person_of_several_is_written_alone(stored: Path, capsys: pytest.Cap
 
 
 def test_skeletons_of_two_people_become_one_scene(stored: Path, capsys: pytest.CaptureFixture[str]):
-    scene, body = Scene.load(stored).pick([0]), load_body()
+    scene, body = Scene.load(stored).select([0]), load_body()
     paths = [str(path) for path in save_bvh(scene, stored.with_name("a.bvh"), body, unit="cm")]
     out = stored.with_name("back.npz")
     assert cli.main(["export", *paths, str(out), "--fps", "60"]) == 0
@@ -59,7 +59,7 @@ def test_smplx_keys_and_back(stored: Path):
     assert cli.main(["export", str(stored), str(out), "--scene", "0", "--smplx"]) == 0
     assert cli.main(["export", str(out), str(again)]) == 0
     body = load_body()
-    assert (body.joints(Scene.load(again)) - body.joints(Scene.load(stored).pick([0]))).abs().max() < 1e-4
+    assert (body.joints(Scene.load(again)) - body.joints(Scene.load(stored).select([0]))).abs().max() < 1e-4
 
 
 @pytest.mark.parametrize("suffix", ["npz", "bvh", "glb", "csv", "mp4", "gif", "png", "html"])
@@ -75,7 +75,7 @@ def test_every_suffix_is_written_by_the_command(suffix: str, stored: Path, capsy
 
 @pytest.mark.parametrize(("naming", "metres", "up"), [("biped", 0.0254, "z"), ("mixamo", 0.01, "y")])
 def test_a_skeleton_of_other_names_pose_unit_and_axis_comes_in(naming, metres, up, stored: Path, capsys):
-    scene, body = Scene.load(stored).pick([0]), load_body()
+    scene, body = Scene.load(stored).select([0]), load_body()
     spread = np.zeros((22, 3))
     spread[[1, 2, 16, 17], 2] = np.radians([8.0, -8.0, -45.0, 45.0])  # an A pose is the file's zero
     local = Rotation.from_rotvec(spread).as_matrix()
@@ -157,6 +157,6 @@ def test_people_are_put_on_the_floor_where_one_asks_for_it(tmp_path: Path, capsy
 
 
 def test_a_file_without_scenes_is_named(tmp_path: Path, capsys):
-    empty = random_scene(1, 8, 1, torch.Generator().manual_seed(0)).pick([]).save(tmp_path / "none.npz")
+    empty = random_scene(1, 8, 1, torch.Generator().manual_seed(0)).select([]).save(tmp_path / "none.npz")
     assert cli.main(["export", str(empty), str(tmp_path / "o.glb")]) == 2
     assert "none.npz: holds no scenes" in capsys.readouterr().err

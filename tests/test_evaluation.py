@@ -186,7 +186,7 @@ def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
 
 
 def test_aligned_scenes_share_one_world(scene):
-    seen = aligned(scene.moved(from_planar(torch.tensor(1.0), torch.tensor([3.0, 2.0]))), 20)
+    seen = aligned(scene.transformed(from_planar(torch.tensor(1.0), torch.tensor([3.0, 2.0]))), 20)
     yaw, ground = to_planar(canonical_frame(seen.T_world_root)[:, 20])
     assert ground.mean(dim=1).abs().max() < 1e-5
     assert yaw[:, 0].abs().max() < 1e-5

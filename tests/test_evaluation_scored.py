@@ -66,7 +66,7 @@ def sampled(task: object) -> tuple[Evaluation, Denoiser, Scene, Scene]:
 
 def mean_error(evaluation: Evaluation, made: Scene, batch: Scene, scored: Tensor) -> float:
     """Distance of 21 joints over what is scored, as MPJPE has it. made (9 * S scenes, horizon)"""
-    truth = evaluation.body.joints(batch.cut(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
+    truth = evaluation.body.joints(batch.slice(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
     error = (evaluation.body.joints(made) - truth)[..., 1:, :].norm(dim=-1).mean(dim=-1)  # (9 S, T, P)
     return float(error[:, scored].mean())
 
@@ -82,7 +82,7 @@ def test_none_of_the_copied_truth_counts(task: object, scored: Tensor) -> None:
     evaluation, model, batch, whole = sampled(task)
     evaluation.step(model, batch, 0)
     row = evaluation.metrics[MODEL].compute()
-    made = whole.cut(CONTEXT)
+    made = whole.slice(CONTEXT)
     assert float(row["mpjpe"]) == pytest.approx(mean_error(evaluation, made, batch, scored), rel=1e-4)
     people = torch.tensor([True, True, False]).expand(HORIZON, 3)
     assert float(row["mpjpe"]) > 1.05 * mean_error(evaluation, made, batch, people)
@@ -104,7 +104,7 @@ def test_baselines_are_scored_over_the_same_frames(task: object, scored: Tensor)
     datamodule = data(test_batch_size=9)
     batch = next(iter(datamodule.test_dataloader()))
     ran = run(datamodule, task=task)
-    still = batch.picked(torch.full((HORIZON,), CONTEXT - 1))
+    still = batch.frames_at(torch.full((HORIZON,), CONTEXT - 1))
     expected = mean_error(ran, still, batch, scored)
     assert ran.results.rows["zero velocity"]["mpjpe"] == pytest.approx(expected, rel=1e-4)
 
@@ -194,7 +194,7 @@ def test_intervals_go_by_recordings_where_there_are_enough() -> None:
 def test_a_worlds_middle_is_that_of_the_people_present() -> None:
     scene = next(iter(data().test_dataloader()))
     T_shared_world = shared_world(scene, CONTEXT - 1)
-    there = scene.moved(T_shared_world).T_world_root[:, CONTEXT - 1, :2, :3, 3]
+    there = scene.transformed(T_shared_world).T_world_root[:, CONTEXT - 1, :2, :3, 3]
     assert there.mean(dim=1)[:, [0, 2]].abs().max() < 1e-5
 
 

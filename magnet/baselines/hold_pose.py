@@ -12,7 +12,7 @@ class HoldPose:
         self, context: Scene, horizon: int, samples: int = 1, generator: torch.Generator | None = None
     ) -> Scene:
         """-> (B * samples, horizon, P), sample s of scene b at b * samples + s; draws nothing from `generator`."""
-        last = context.cut(context.frames - 1).repeat(samples)
+        last = context.slice(context.frames - 1).repeat(samples)
         return last.replace(
             body_rot=last.body_rot.expand(-1, horizon, -1, -1, -1, -1).clone(),
             T_world_root=last.T_world_root.expand(-1, horizon, -1, -1, -1).clone(),

@@ -69,7 +69,7 @@ class NearestNeighbour(Retrieval):
         for n in sorted(set(people.tolist())):
             for scenes in (people == n).nonzero()[:, 0].split(QUERIES):
                 here = present[scenes].nonzero()[:, 1].view(len(scenes), n)
-                look = _look(context.pick(scenes.to(context.device)).to(self.train.device))
+                look = _look(context.select(scenes.to(context.device)).to(self.train.device))
                 query = Look(look.own * self._scales.own, look.pair * self._scales.pair).seated(here)
                 chosen[scenes], slots[scenes[:, None], here] = self._search(query, self.candidates(n))
         return chosen, slots
@@ -103,8 +103,8 @@ class NearestNeighbour(Retrieval):
         """Look at the first `frames` frames of all training stretches; once for each length of context."""
         if frames == self._frames:
             return
-        begin = self.train.cut(0, frames)
-        looks = [_look(begin.pick(slice(i, i + CHUNK))) for i in range(0, begin.scenes, CHUNK)]
+        begin = self.train.slice(0, frames)
+        looks = [_look(begin.select(slice(i, i + CHUNK))) for i in range(0, begin.scenes, CHUNK)]
         own, pair = torch.cat([look.own for look in looks]), torch.cat([look.pair for look in looks])
         present = self.train.present
         other = ~torch.eye(self.train.agents, dtype=torch.bool, device=present.device)

@@ -57,10 +57,10 @@ class SceneBaseline:
         self.context, self.horizon = context, horizon
 
     def __call__(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
-        past, first = scene.cut(0, self.context), generators[::samples]
+        past, first = scene.slice(0, self.context), generators[::samples]
         with torch.autocast(scene.device.type, enabled=False):
             if self.draws:
-                each = [self.method(past.pick([b]), self.horizon, samples, first[b]) for b in range(past.scenes)]
+                each = [self.method(past.select([b]), self.horizon, samples, first[b]) for b in range(past.scenes)]
                 return joints_of(concatenate(each), self.body, samples)
             return joints_of(self.method(past, self.horizon, samples), self.body, samples)
 
@@ -79,5 +79,5 @@ class JointBaseline:
 
     def __call__(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
         with torch.autocast(scene.device.type, enabled=False):
-            made = self.method(scene.cut(0, self.context), self.horizon)
+            made = self.method(scene.slice(0, self.context), self.horizon)
         return made.expand(samples, *made.shape)

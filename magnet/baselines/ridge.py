@@ -88,7 +88,7 @@ class RidgeRegression:
         for n in sorted(set(people.tolist()) - {0}):
             scenes = (people == n).nonzero()[:, 0]
             fit = self.fit(n)
-            few = Windows.of([context.pick(scenes).replace(valid=None)], train.body, train.context)
+            few = Windows.of([context.select(scenes).replace(valid=None)], train.body, train.context)
             examples = Examples.of(few, torch.arange(len(scenes), device=scenes.device), n)
             values = fit.offset + (examples.features - fit.mean) @ fit.weights
             seen = values.unflatten(-1, (train.horizon, -1, 3))[:, :horizon] + examples.last[:, None]

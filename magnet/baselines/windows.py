@@ -48,7 +48,7 @@ class Windows:
         scene = None
         for scene in scenes:
             kept = torch.ones_like(scene.present[:, 0]) if scene.valid is None else scene.valid.all(dim=1)
-            part = scene if bool(kept.all()) else scene.pick(kept)
+            part = scene if bool(kept.all()) else scene.select(kept)
             names = part.names or tuple(f"{len(recordings)}:{k}" for k in range(part.scenes))
             for turned in (False, True) if mirror else (False,):
                 seen = mirror_scene(part) if turned else part

@@ -81,7 +81,7 @@ def on_floor(scene: Scene, body: Body | None = None) -> Scene:
     heights = standing(lowest(scene, body), counts).nan_to_num(nan=torch.inf).amin(dim=1)  # (B,)
     T_new_world = torch.eye(4, dtype=scene.T_world_root.dtype, device=scene.device).repeat(scene.scenes, 1, 1, 1, 1)
     T_new_world[:, 0, 0, 1, 3] = -torch.where(heights.isfinite(), heights, 0.0).to(T_new_world)
-    return scene.moved(T_new_world)
+    return scene.transformed(T_new_world)
 
 
 def level(scene: Scene, body: Body | None = None) -> float:

@@ -50,7 +50,7 @@ class BvhTrack:
     def frames(self) -> int:
         return self.file.frames
 
-    def cut(self, start: int, stop: int) -> BvhTrack:
+    def slice(self, start: int, stop: int) -> BvhTrack:
         part = slice(start, stop)
         return replace(self, file=replace(self.file, place=self.file.place[part], local=self.file.local[part]))
 

@@ -56,7 +56,7 @@ class PosedTrack:
     def frames(self) -> int:
         return len(self.poses)
 
-    def cut(self, start: int, stop: int) -> PosedTrack:
+    def slice(self, start: int, stop: int) -> PosedTrack:
         part = slice(start, stop)
         return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part])
 

@@ -38,7 +38,7 @@ def decoded_losses(
     """
     signal = alpha_bar(levels)
     chosen = surest(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
-    few, kind = scene.pick(chosen), model.device.type
+    few, kind = scene.select(chosen), model.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
     people, true_pose = few.present, pose_features(few)
 

@@ -26,7 +26,7 @@ from magnet.motion.frames import (
     shift_onto,
     to_9d,
 )
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE, by_frame, by_token, relations_by_frame, relations_by_token
 from magnet.sampling.schedule import MaskSchedule
 
@@ -130,7 +130,7 @@ class Canvas:
     def extend(self, given: Scene, known: Tensor) -> None:
         """Take in more rows at the end. given (B, 4 n), known (n, P)"""
         given = given.repeat(self.samples)
-        self.given = joined([self.given, given])
+        self.given = cat_time([self.given, given])
         self.known, self.placed = torch.cat([self.known, known]), torch.cat([self.placed, known])
         self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
 
@@ -142,7 +142,7 @@ class Canvas:
         self.shown, self.released = max(self.shown - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
         self.T_world_can = self.T_world_can[:, frames:].clone()
-        kept = self.given.cut(frames)
+        kept = self.given.slice(frames)
         self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
     def settle(self, canvas: Tensor, finished: Tensor, apart: bool = False) -> Tensor:
@@ -364,12 +364,12 @@ class Canvas:
         latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas[:, near]))
         features = self.model.tokenizer.decode(latent, self.given.betas, steps)
         frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
-        given = self.given.cut(low * STRIDE, high * STRIDE)
+        given = self.given.slice(low * STRIDE, high * STRIDE)
         T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
         decoded = posed(features[:, frames], T_world_can, given)
         if self.options.paste:
             decoded = paste(decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend)
-        decoded = decoded.cut((first - low) * STRIDE, (stop - low) * STRIDE)
+        decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
         return hold(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.denoiser.generation import SamplerOptions, reach, scrub
 from magnet.denoiser.inputs import check_given
 from magnet.denoiser.stream import PIECE, Generators, Stream
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 
 if TYPE_CHECKING:
@@ -71,11 +71,11 @@ class FedStream(Stream):
             ValueError: motion that is not finite, or no rotation.
         """
         begins, ends = self.made, self.made + frames.frames // STRIDE
-        fed = frames.replace(given=None, valid=None, names=()).single().to(self.model.device)
+        fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
         fed = fed.pad_agents(self.model.layout.agents)
         # Where the floor is was seen in the past: an answer must not fail because somebody jumps or is carried.
         check_given(fed, self._known(begins, ends), any_floor=True)
-        self.scene, self.there = joined([self.scene.replace(valid=None, names=()), fed]), ends
+        self.scene, self.there = cat_time([self.scene.replace(valid=None, names=()), fed]), ends
         return self._advance(begins)
 
     def _advance(self, begins: int = 0) -> Scene:
@@ -89,7 +89,7 @@ class FedStream(Stream):
         made = self._decoded(begins, self.made, None, needed)
         old = max(self.stop - reach(self.model)[0] - 1, 0) - self.base
         if old > 0:
-            kept = self.scene.cut(old * STRIDE)
+            kept = self.scene.slice(old * STRIDE)
             self.scene = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
             self.base += old
         return made

@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.denoiser.presets import preset_fields
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
-from magnet.motion.scene import Scene, absent
+from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import STRIDE, by_token, relations_by_token
 from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
 from magnet.sampling.guidance import Guidance
@@ -164,8 +164,8 @@ def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) 
     if needed * STRIDE > scene.frames:
         raise ValueError(f"the task needs {needed * STRIDE} frames, the scene has {scene.frames}")
     stop = len(known) if stop is None else stop
-    part = scene.cut(first * STRIDE, min(stop, needed) * STRIDE)
-    blank = absent(scene.scenes, (stop - first) * STRIDE, scene.agents, scene.T_world_root)
+    part = scene.slice(first * STRIDE, min(stop, needed) * STRIDE)
+    blank = empty_scene(scene.scenes, (stop - first) * STRIDE, scene.agents, scene.T_world_root)
     keep = known[first : min(stop, needed)].repeat_interleave(STRIDE, dim=0).to(scene.device)  # (T, P)
     keep = keep[:, :, None, None] & scene.present[:, None, :, None, None]
     body_rot, T_world_root = blank.body_rot.clone(), blank.T_world_root.clone()
@@ -228,9 +228,9 @@ def known_tokens(
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
     steps = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
     for start, stop, agents in stretches(known):
-        part = given.cut(start * STRIDE, stop * STRIDE).order(torch.tensor(agents, device=like.device))
+        part = given.slice(start * STRIDE, stop * STRIDE).permute_agents(torch.tensor(agents, device=like.device))
         for low, first, last, cut, those in encodings(start, stop, agents, cuts, reach(model)[0]):
-            seen = given.cut(low * STRIDE, cut * STRIDE).order(torch.tensor(those, device=like.device))
+            seen = given.slice(low * STRIDE, cut * STRIDE).permute_agents(torch.tensor(those, device=like.device))
             latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
         own = by_token(to_9d(canonical_steps(canonical_frame(part.T_world_root))))
         if start > 0:

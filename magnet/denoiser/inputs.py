@@ -63,7 +63,7 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     rows = keep.any(dim=1).nonzero()[:, 0]
     if not len(rows):
         return
-    part = scene.picked(rows)
+    part = scene.frames_at(rows)
     counts = keep[rows] & scene.present[:, None]  # (B, F, P)
     if not bool(counts.any()):
         return
@@ -78,7 +78,7 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     if any_floor:
         return
     few = torch.linspace(0, len(rows) - 1, min(len(rows), MOMENTS), device=scene.device).long()
-    off = off_floor(lowest(part.picked(few)), counts[:, few], counts.sum(dim=1))
+    off = off_floor(lowest(part.frames_at(few)), counts[:, few], counts.sum(dim=1))
     if bool((off != 0).any()):
         b = int(off.abs().argmax())
         metres = float(off[b])

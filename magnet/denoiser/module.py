@@ -242,7 +242,7 @@ class Denoiser(L.LightningModule):
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         """
-        people = self.tokenizer.encode_scene(scene.people().held(STRIDE), self.quantised).float()[:, 1:-1, 0]
+        people = self.tokenizer.encode_scene(scene.people().pad_frames(STRIDE), self.quantised).float()[:, 1:-1, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)

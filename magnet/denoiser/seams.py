@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar, turn
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 
 SPRING = 2.5
 """How fast `go_on` fades, against the frames over which a seam is to: the slower, the smoother, and the longer feet
@@ -179,7 +179,7 @@ def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
     if bool(there.all()):
         return scene
     if before is not None:
-        whole = joined([before, scene])
-        return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).cut(1)
+        whole = cat_time([before, scene])
+        return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).slice(1)
     last, agents = last_known(there), torch.arange(there.shape[1], device=there.device)
     return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])

@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.denoiser.generation import reach
 from magnet.denoiser.seams import go_on, hold
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Stage
 
@@ -93,11 +93,11 @@ def show(canvas: Canvas, tokens: Tensor, stop: int, near: int, expected: tuple[T
 
 def seen(canvas: Canvas, tokens: Tensor, first: int, stop: int) -> Scene:
     """Rows [first, stop) as they have been shown, and from there on as they would be."""
-    known = canvas.given.cut(first * STRIDE, max(min(canvas.shown, stop), first) * STRIDE)
+    known = canvas.given.slice(first * STRIDE, max(min(canvas.shown, stop), first) * STRIDE)
     if canvas.shown >= stop:
         return known
     rest = bodies(canvas, tokens, max(canvas.shown, first), stop, stop)
-    return joined([known, rest]) if known.frames else rest
+    return cat_time([known, rest]) if known.frames else rest
 
 
 def bodies(
@@ -119,12 +119,12 @@ def bodies(
     frames = slice(first * STRIDE - lead, stop * STRIDE)
     features = model.tokenizer.decode(latent, canvas.given.betas, steps)
     features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
-    given, T_world_can = canvas.given.cut(frames.start, frames.stop), canvas.T_world_can[:, frames]
+    given, T_world_can = canvas.given.slice(frames.start, frames.stop), canvas.T_world_can[:, frames]
     keep = canvas.by_frame(canvas.known[first:stop] & options.paste)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([canvas.by_frame(canvas.placed[first - 1 : first])[:lead], keep])
-    made = go_on(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).cut(lead)
-    before = canvas.given.cut(first * STRIDE - 1, first * STRIDE) if first else None
+    made = go_on(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
+    before = canvas.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
     return hold(made, canvas.by_frame(canvas.placed[first:stop]), before)
 
 

@@ -24,7 +24,7 @@ from magnet.denoiser.inputs import check_given, check_request
 from magnet.denoiser.plan import endless, planned
 from magnet.denoiser.showing import Expected, own_view, show
 from magnet.denoiser.transformer import without_dropout
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.sampler import begin, run_stages
@@ -75,7 +75,7 @@ def generate(
         ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
-    return joined(list(stream(model, scene, task, context, frames, samples, options, generator, progress, health)))
+    return cat_time(list(stream(model, scene, task, context, frames, samples, options, generator, progress, health)))
 
 
 def stream(
@@ -135,7 +135,7 @@ class Stream:
         check_request(model, scene, context, frames, samples)
         layout = model.layout
         self.model, self.options, self.piece = model, options or SamplerOptions(), piece
-        self.scene = scene.replace(given=None).single().to(model.device).pad_agents(layout.agents)
+        self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.health = samples, progress, health or Health()
         self.frames = None if frames is None else context + frames
         if self.frames is not None and scene.frames >= self.frames:
@@ -186,8 +186,8 @@ class Stream:
                 while start < self.rows and ready >= min(start + self.piece, self.rows):
                     stop = int(min(start + self.piece, self.rows))
                     made = self._decoded(start, stop, before, needed)
-                    yield made if self.frames is None else made.cut(0, self.frames - start * STRIDE)
-                    start, before = stop, made.cut(made.frames - 1)
+                    yield made if self.frames is None else made.slice(0, self.frames - start * STRIDE)
+                    start, before = stop, made.slice(made.frames - 1)
 
     def _ready(self, final: int) -> Iterator[float]:
         """Rows before which bodies can be handed out, given those before which nothing is generated or moved again.
@@ -290,7 +290,7 @@ class Stream:
             self.tokens = torch.cat([self.tokens, new], dim=1)
             self.history = None if self.history is None else self.history.extend(new)
             self.veil = torch.cat([self.veil, veil], dim=1)
-            self.canvas.extend(given.cut(part.start * STRIDE, part.stop * STRIDE), known[part])
+            self.canvas.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last
 
     def _given(self, low: int, high: int) -> Scene:

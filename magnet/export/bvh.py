@@ -49,7 +49,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m")
         ValueError: more than one scene, nobody present, another body's, or no such unit.
     """
     if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to files of its own")
+        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
     if unit not in PER_METRE:

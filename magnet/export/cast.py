@@ -53,7 +53,7 @@ class Cast:
 
     def vertices(self, frame: int) -> Array:
         """(P, V, 3)"""
-        return self.body.vertices(self.scene.cut(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
+        return self.body.vertices(self.scene.slice(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
 
     def draw(self, canvas: Canvas, frame: int) -> None:
         """Put everybody on the canvas; nothing is painted yet."""
@@ -78,7 +78,7 @@ def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None)
     label = f"scene {scene.names[0]!r}" if scene.names else "scene"
     if not len(slots):
         raise ValueError(f"{label}: nobody is present, so there is nothing to draw")
-    shown = scene.order(slots)
+    shown = scene.permute_agents(slots)
     joints = body.joints(shown)[0].detach().cpu().numpy().astype(np.float64)
     broken = ~np.isfinite(joints).all(axis=(1, 2, 3))
     if broken.any():
@@ -119,11 +119,11 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
     if isinstance(scenes, Scene):
         names = scenes.names or ("",) * scenes.scenes
         labels = [f"{name} · {b + 1}" if name and names.count(name) > 1 else name for b, name in enumerate(names)]
-        pairs = [(label, scenes.pick([b])) for b, label in enumerate(labels)]
+        pairs = [(label, scenes.select([b])) for b, label in enumerate(labels)]
     else:
         items = list(scenes.items()) if isinstance(scenes, dict) else list(scenes)
         pairs = [
-            (label if scene.scenes == 1 else f"{label} {b + 1}", scene.pick([b]))
+            (label if scene.scenes == 1 else f"{label} {b + 1}", scene.select([b]))
             for label, scene in items
             for b in range(scene.scenes)
         ]

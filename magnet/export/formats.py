@@ -233,7 +233,7 @@ def write(
     if scene.scenes == 1:
         return each[suffix](scene, path)
     places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]
-    return [written for b, place in enumerate(places) for written in each[suffix](scene.pick([b]), place)]
+    return [written for b, place in enumerate(places) for written in each[suffix](scene.select([b]), place)]
 
 
 def _require_finite(scene: Scene) -> None:

@@ -50,7 +50,7 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned) -> Path:
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
     if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to a file of its own")
+        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
     slots = scene.present[0].nonzero()[:, 0].tolist()

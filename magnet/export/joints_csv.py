@@ -31,7 +31,7 @@ def save_csv(scene: Scene, path: str | Path, body: Posed) -> Path:
         table.writerow(COLUMNS)
         for b in range(scene.scenes):
             slots = scene.present[b].nonzero()[:, 0].tolist()
-            joints = body.joints(scene.pick([b]))[0].detach().flatten(-2).double().cpu().numpy()  # (T, P, 66)
+            joints = body.joints(scene.select([b]))[0].detach().flatten(-2).double().cpu().numpy()  # (T, P, 66)
             for t, frame in enumerate(joints):
                 for p in slots:
                     table.writerow([b, t, f"{t / scene.fps:.6f}", p, *(f"{metres:.5f}" for metres in frame[p])])

@@ -44,10 +44,10 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
         ValueError: more than one scene, or another body's.
     """
     if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each of scene.pick([b]) to a file of its own")
+        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
-    scene = scene.order(scene.present[0].nonzero()[:, 0])
+    scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
     rotations = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
     poses = torch.zeros(*rotations.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)

@@ -86,7 +86,7 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
             f"lengths differ: {_each(labels, [f'{person.frames} frames' for person in people])}; people of one scene "
             f"share their frames: cut all to the shortest with --trim (trim=True)"
         )
-    people = [person.cut(0, shortest) for person in people]
+    people = [person.slice(0, shortest) for person in people]
     valid = None
     if any(person.valid is not None for person in people):
         all_good = torch.ones(1, shortest, dtype=torch.bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import dataclasses
 import json
 import zipfile
@@ -111,18 +112,18 @@ class Scene:
         """The same scene on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
 
-    def single(self) -> Scene:
+    def to_float32(self) -> Scene:
         """The same scene in float32, as models take it."""
         floats = {name: value.float() for name, value in self.tensors().items() if value.dtype != torch.bool}
         return self if all(value is getattr(self, name) for name, value in floats.items()) else self.replace(**floats)
 
-    def cut(self, start: int, stop: int | None = None) -> Scene:
+    def slice(self, start: int, stop: int | None = None) -> Scene:
         """Frames `start:stop` of every scene."""
-        return self.picked(slice(start, stop))
+        return self.frames_at(builtins.slice(start, stop))
 
-    def pick(self, scenes: Tensor | Sequence[int] | slice) -> Scene:
+    def select(self, scenes: Tensor | Sequence[int] | builtins.slice) -> Scene:
         """Some of the B scenes, in the order given."""
-        if not isinstance(scenes, slice):
+        if not isinstance(scenes, builtins.slice):
             empty = not isinstance(scenes, Tensor) and not len(scenes)
             scenes = torch.as_tensor(scenes, device=self.device, dtype=torch.long if empty else None)
             if scenes.dtype == torch.bool:
@@ -134,9 +135,9 @@ class Scene:
     def repeat(self, samples: int) -> Scene:
         """Each scene `samples` times in a row: scene b becomes b * samples ... b * samples + samples - 1."""
         index = torch.arange(self.scenes, device=self.device).repeat_interleave(samples)
-        return self.pick(index)
+        return self.select(index)
 
-    def order(self, agents: Tensor) -> Scene:
+    def permute_agents(self, agents: Tensor) -> Scene:
         """Agents in another order, one for all scenes. agents: (P,) int"""
         return self.replace(
             body_rot=self.body_rot[:, :, agents],
@@ -160,12 +161,12 @@ class Scene:
             given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
         )
 
-    def held(self, frames: int) -> Scene:
+    def pad_frames(self, frames: int) -> Scene:
         """The scene with its first and its last frame held for so many frames more, in front and behind."""
         T = self.frames
-        return self.picked(torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1))
+        return self.frames_at(torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1))
 
-    def picked(self, frames: slice | Tensor) -> Scene:
+    def frames_at(self, frames: builtins.slice | Tensor) -> Scene:
         """Some of the frames, in the order given. frames (F,) int, or a slice"""
         timed = ("body_rot", "T_world_root", "valid", "given")
         return self.replace(**{name: value[:, frames] for name, value in self.tensors().items() if name in timed})
@@ -181,7 +182,7 @@ class Scene:
             raise ValueError(f"the scene has {self.agents} agents, but room was asked for {agents}")
         if extra == 0:
             return self
-        empty = absent(self.scenes, self.frames, extra, self.T_world_root)
+        empty = empty_scene(self.scenes, self.frames, extra, self.T_world_root)
         return self.replace(
             body_rot=torch.cat([self.body_rot, empty.body_rot], dim=2),
             T_world_root=torch.cat([self.T_world_root, empty.T_world_root], dim=2),
@@ -190,7 +191,7 @@ class Scene:
             given=None if self.given is None else torch.nn.functional.pad(self.given, (0, extra)),
         )
 
-    def moved(self, T_new_world: Tensor) -> Scene:
+    def transformed(self, T_new_world: Tensor) -> Scene:
         """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
         moved = T_new_world @ self.T_world_root
         keep = self.present[:, None, :, None, None]
@@ -227,7 +228,7 @@ class Scene:
         return Scene(**arrays)
 
 
-def absent(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:
+def empty_scene(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:
     """Slots with nobody in them, with the dtype and device of `like`."""
     eye3 = torch.eye(3, dtype=like.dtype, device=like.device)
     eye4 = torch.eye(4, dtype=like.dtype, device=like.device)
@@ -267,7 +268,7 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
     )
 
 
-def joined(pieces: Sequence[Scene]) -> Scene:
+def cat_time(pieces: Sequence[Scene]) -> Scene:
     """Consecutive pieces of the same scenes as one; what was given is kept if all of them say it.
 
     Raises:

@@ -33,7 +33,7 @@ def features(scene: Scene) -> Features:
         ValueError: another frame rate than the model's.
     """
     require_rate(scene)
-    scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
+    scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
     # Mixed precision would round the products of transforms.
     with torch.autocast(scene.device.type, enabled=False):
         pose, steps = pose_features(scene), scene_steps(scene)

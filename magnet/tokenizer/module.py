@@ -166,7 +166,7 @@ class Tokenizer(L.LightningModule):
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
-        scene = scene.cut(0, scene.frames - scene.frames % STRIDE)
+        scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
         seen = features(scene)
         latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
         return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
@@ -281,7 +281,7 @@ class Tokenizer(L.LightningModule):
             if self.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
                 logged |= {f"train/{name}": value for name, value in by_level(quantised.counts).items()}
                 scenes = slice(0, GLANCE)
-                error, _ = self._joint_errors(pose.detach()[scenes], batch.pick(scenes))
+                error, _ = self._joint_errors(pose.detach()[scenes], batch.select(scenes))
                 logged["train/mpjpe_cm"] = 100 * masked_mean(error, seen.counts[scenes])
             self.log_dict(logged, batch_size=batch.scenes)
         return losses["loss"]
@@ -316,7 +316,7 @@ class Tokenizer(L.LightningModule):
         """Mean distance in metres of the 21 joints beside the pelvis, (B, T, P): in the world with the root's
         canonical frame given, and with pelvis position and turn taken out."""
         body = self._require_body()
-        scene = scene.cut(0, pose.shape[1])
+        scene = scene.slice(0, pose.shape[1])
         decoded = put(pose, scene)
         world = body.joints(decoded) - body.joints(scene)
         still = torch.eye(4, device=pose.device)

@@ -148,7 +148,7 @@ class Keys:
                 self._drop(entry)
         self.made += 1
         server, name = self.playground.server, f"/stage/key_{self.made}"
-        scene = self.live.scene.cut(0, 1).order(key_slot(key))
+        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(key))
         statue = add_people(
             server, f"{name}_pose", self.playground.body, scene, "skeleton", agent_colours((key.agent,)), opacity=0.55
         )
@@ -212,8 +212,8 @@ class Keys:
     def _pose(self, entry: Entry) -> None:
         """Stand the statue where the keyframe is."""
         first = dataclasses.replace(entry.key, agent=0, frame=0)
-        scene = self.live.scene.cut(0, 1).order(key_slot(entry.key)).held(4).cut(0, 4)
-        turns, places = bone_poses(self.playground.body, with_keyframes(scene, [first]).cut(0, 1))
+        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(entry.key)).pad_frames(4).slice(0, 4)
+        turns, places = bone_poses(self.playground.body, with_keyframes(scene, [first]).slice(0, 1))
         with self.playground.server.atomic():
             entry.statue.pose(turns[0], places[0])
 

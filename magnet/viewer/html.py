@@ -75,7 +75,7 @@ def page(
     """What `save_html` writes, for a notebook's inline frame; the same arguments."""
     shown = numbered(takes(scene, title or "scene", context, scene.scenes) if isinstance(scene, Scene) else list(scene))
     if truth is not None and truth.scenes != 1:
-        raise ValueError(f"truth: got {truth.scenes} scenes, expected one: truth.pick([b])")
+        raise ValueError(f"truth: got {truth.scenes} scenes, expected one: truth.select([b])")
     rates = sorted({each.scene.fps for each in shown})
     if len(rates) != 1:
         raise ValueError(f"takes of {rates or 'no'} frames a second, expected one rate: magnet export --fps")
@@ -159,7 +159,7 @@ def _poses(body: Body, scene: Scene) -> tuple[NDArray[np.int16], NDArray[np.floa
     """World turns (T, P, 22, 4) in 1 / 32767, without jumps to the opposite sign, and roots (T, P, 3) metres."""
     turns, roots = [], []
     for first in range(0, scene.frames, CHUNK):
-        part_turns, part_places = bone_poses(body, scene.cut(first, first + CHUNK))
+        part_turns, part_places = bone_poses(body, scene.slice(first, first + CHUNK))
         turns.append(part_turns)
         roots.append(part_places[..., 0, :])
     wxyz = np.concatenate(turns)

@@ -18,7 +18,7 @@ from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.inputs import check_given
 from magnet.denoiser.module import Denoiser
 from magnet.motion.frames import canonical_frame
-from magnet.motion.scene import Scene, absent, joined, require_rate
+from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.schedule import Grid
@@ -122,8 +122,8 @@ class Live:
             scene = self._from_nothing(people)
         else:
             self._check(start)
-            scene = start.order(start.present[0].nonzero()[:, 0])
-            scene = scene.cut(0, start.frames // STRIDE * STRIDE).replace(valid=None)
+            scene = start.permute_agents(start.present[0].nonzero()[:, 0])
+            scene = scene.slice(0, start.frames // STRIDE * STRIDE).replace(valid=None)
             if scene.given is None:
                 scene = scene.replace(given=torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool))
         with self.lock:
@@ -137,7 +137,7 @@ class Live:
         slots = self.model.layout.agents
         if not 1 <= people <= slots:
             raise ValueError(f"people: got {people}, expected 1 to {slots}, the slots that the model has")
-        empty = absent(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
+        empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
         made = self._sample(empty, Generation(), 0, FIRST)
         return made.replace(given=torch.zeros(1, FIRST, people, dtype=torch.bool))
 
@@ -157,7 +157,7 @@ class Live:
         """Forget what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
         with self.lock:
             keep = max(min(frame // STRIDE * STRIDE, self.scene.frames), CONTEXT)
-            self.scene = self.scene.cut(0, keep)
+            self.scene = self.scene.slice(0, keep)
             self.version += 1
             return keep
 
@@ -204,7 +204,7 @@ class Live:
             scene, version = self.scene, self.version
             task = self.task()
             frames = self._length(type(task))
-        past = scene.cut(scene.frames - CONTEXT)
+        past = scene.slice(scene.frames - CONTEXT)
         grid = Grid((CONTEXT + frames) // STRIDE, scene.agents, CONTEXT // STRIDE, self.settings.steps)
         known = task.schedule(grid).known
         if not bool(known[: grid.context].all()):
@@ -213,7 +213,7 @@ class Live:
                 "try joint_future, motion_control or inbetweening"
             )
         given = self._future(past, scene.frames, known, frames)
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).cut(CONTEXT)
+        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return self._append(scene, piece, version, begun)
 
     def between(self) -> Piece:
@@ -226,12 +226,12 @@ class Live:
         with self.lock:
             keys, version = sorted(self.keys, key=lambda key: key.frame), self.version
             start = self.between_from()
-            scene = self.scene.cut(0, start)
+            scene = self.scene.slice(0, start)
         frames = keys[-1].frame + STRIDE - start
         shifted = [dataclasses.replace(key, frame=key.frame - start + CONTEXT) for key in keys]
-        given = with_keyframes(self._held(scene.cut(start - CONTEXT), frames), shifted)
+        given = with_keyframes(self._held(scene.slice(start - CONTEXT), frames), shifted)
         task = Inbetweening(pairs=tuple((key.agent, key.frame // STRIDE) for key in shifted))
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).cut(CONTEXT)
+        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return dataclasses.replace(self._append(scene, piece, version, begun, anew=True), between=True)
 
     def between_from(self) -> int:
@@ -256,7 +256,7 @@ class Live:
             took = time.perf_counter() - begun
             if version != self.version:  # what this piece continues is no longer there
                 return Piece(self.scene.frames, 0, took)
-            self.scene = joined([scene, piece])
+            self.scene = cat_time([scene, piece])
             self.version += anew
             self.made, self.spent = self.made + piece.frames, self.spent + took
             return Piece(scene.frames, piece.frames, took)
@@ -268,7 +268,7 @@ class Live:
         own: dict[str, Any] = {"steps": settings.steps, "guidance": settings.guidance, "rolling": 0, "any_floor": True}
         options = dataclasses.replace(settings.sampler, **own)
         longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
-        return longer.order(torch.arange(scene.agents)).to("cpu").replace(names=())
+        return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
 
     def _length(self, kind: type) -> int:
         return REACH if kind is Inbetweening else max(self.settings.piece // STRIDE, 1) * STRIDE
@@ -280,7 +280,7 @@ class Live:
 
     def _held(self, past: Scene, frames: int) -> Scene:
         """The past, and its last frame for so many frames more, which nobody was given."""
-        scene = past.held(frames).cut(frames)
+        scene = past.pad_frames(frames).slice(frames)
         known = (torch.arange(scene.frames) < past.frames)[None, :, None]
         return scene.replace(given=known.expand(scene.T_world_root.shape[:3]))
 
@@ -298,7 +298,7 @@ class Live:
     def _lead(self, scene: Scene, past: Scene, now: int, agents: Tensor, frames: int) -> Scene:
         """Fill in the whole future of some agents before the task runs. agents (P,) bool"""
         if self.partner is not None and self.partner.frames >= now + frames:
-            source = self.partner.cut(now - CONTEXT, now + frames)
+            source = self.partner.slice(now - CONTEXT, now + frames)
             source = source.replace(given=torch.ones(source.T_world_root.shape[:3], dtype=torch.bool))
         else:
             steered = [agent for agent in self._steered() if bool(agents[agent])]
@@ -310,7 +310,7 @@ class Live:
                 task = Inbetweening(pairs=tuple((agent, last // STRIDE) for agent in steered))
                 goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
             made = self._sample(goals, task, CONTEXT, length).replace(given=goals.given)
-            source = made.cut(0, CONTEXT + frames)
+            source = made.slice(0, CONTEXT + frames)
         chosen = agents[None, None, :, None, None]
         assert scene.given is not None and source.given is not None
         return scene.replace(

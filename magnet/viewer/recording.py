@@ -19,7 +19,7 @@ from magnet.checks import require_whole
 from magnet.denoiser.showing import own_view
 from magnet.denoiser.stream import Stream
 from magnet.files import load_npz
-from magnet.motion.scene import Scene, joined, require_rate
+from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Stage, initial_levels
@@ -64,10 +64,10 @@ class Recording:
 
     def at(self, step: int) -> Scene:
         """The scene as it was expected to become after a step: B = 1, frames up to the end of its window."""
-        start, estimate = int(self.start[step]), self.estimates.pick([step])
+        start, estimate = int(self.start[step]), self.estimates.select([step])
         stop = min(start + estimate.frames, self.scene.frames)
-        front, window = self.scene.cut(0, start), estimate.cut(0, stop - start)
-        return joined([front, window])
+        front, window = self.scene.slice(0, start), estimate.slice(0, stop - start)
+        return cat_time([front, window])
 
     def save(self, path: str | Path) -> Path:
         """Write one npz that needs no unpickling. Returns the path written."""
@@ -137,17 +137,18 @@ def record(
         ValueError: several scenes, another frame rate than the model's, or whatever `Denoiser.generate` refuses.
     """
     if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; record each of scene.pick([b])")
+        raise ValueError(f"got {scene.scenes} scenes, expected one; record each of scene.select([b])")
     require_rate(scene)
     require_whole("frames", frames, 1)
     require_whole("every", every, 1)
     stream = RecordedStream(model, scene, task, context, frames, options, generator, every)
     with torch.no_grad():
-        done = joined(list(stream.pieces())).to("cpu")
+        done = cat_time(list(stream.pieces())).to("cpu")
     slots = torch.arange(scene.agents)
     longest = max(window.frames for window in stream.windows)
-    windows = [window.order(slots).held(longest).cut(longest, 2 * longest) for window in stream.windows]
-    finished = done.order(slots)
+    padded = [window.permute_agents(slots).pad_frames(longest) for window in stream.windows]
+    windows = [window.slice(longest, 2 * longest) for window in padded]
+    finished = done.permute_agents(slots)
     estimates = finished.repeat(len(windows)).replace(
         body_rot=torch.cat([window.body_rot for window in windows]),
         T_world_root=torch.cat([window.T_world_root for window in windows]),

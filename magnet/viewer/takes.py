@@ -67,7 +67,7 @@ def take(label: str, scene: Scene, context: int = 0, recording: Recording | None
     slots = scene.present[0].nonzero()[:, 0]
     if not len(slots) or not scene.frames:
         raise ValueError(f"{label}: {scene.frames} frames of {len(slots)} people, so there is nothing to see")
-    shown = (scene if len(slots) == scene.agents else scene.order(slots)).to("cpu")
+    shown = (scene if len(slots) == scene.agents else scene.permute_agents(slots)).to("cpu")
     for name in ("T_world_root", "body_rot"):
         broken = ~getattr(shown, name)[0].flatten(1).isfinite().all(dim=1)
         if bool(broken.any()):
@@ -85,7 +85,7 @@ def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLE
     names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
     many = scene.scenes > 1
     return [
-        take(f"{names[b]} · {b + 1}" if many else names[b], scene.pick([b]), context)
+        take(f"{names[b]} · {b + 1}" if many else names[b], scene.select([b]), context)
         for b in range(min(scene.scenes, samples))
     ]
 
@@ -155,7 +155,7 @@ def same_length(one: Take, other: Take) -> Scene:
     """The scene of `one`, cut or held so that it has the frames of `other`."""
     frame = torch.arange(other.frames).clamp(max=one.frames - 1)
     scene = one.scene
-    return scene.picked(frame)
+    return scene.frames_at(frame)
 
 
 def in_a_row(takes: Sequence[Take]) -> list[Array]:

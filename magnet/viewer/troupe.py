@@ -106,13 +106,13 @@ class Troupe:
         scene = self.estimate or self.take.scene
         now = min(frame, scene.frames - 1)
         start = max(now - 1, 0)
-        turns, places = bone_poses(self.body, scene.cut(start, now + 1))
+        turns, places = bone_poses(self.body, scene.slice(start, now + 1))
         self.people.pose(turns[-1], places[-1])
         known = self.take.known[min(now, len(self.take.known) - 1)]
         self.people.paint(np.where(known[:, None], pale(self.own), self.own))
         if self.ghosts is not None and self.truth is not None:
             at = min(now, self.truth.frames - 1)
-            ghost_turns, ghost_places = bone_poses(self.body, self.truth.cut(at, at + 1))
+            ghost_turns, ghost_places = bone_poses(self.body, self.truth.slice(at, at + 1))
             self.ghosts.pose(ghost_turns[-1], ghost_places[-1])
         if self.trails is not None:
             self.trails.show(self._ways(scene, now))

@@ -56,47 +56,47 @@ def same(a: Scene, b: Scene, tolerance: float = 1e-5) -> None:
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
 def test_nearest_neighbour_of_a_training_context_is_its_own_continuation(train: Scene, people: int) -> None:
-    known = train.pick(range(30 * (people - 1), 30 * people, 7))
+    known = train.select(range(30 * (people - 1), 30 * people, 7))
     for aligned in (True, False):
-        found = NearestNeighbour(train, aligned)(known.cut(0, CONTEXT), HORIZON)
-        same(found, known.cut(CONTEXT))
+        found = NearestNeighbour(train, aligned)(known.slice(0, CONTEXT), HORIZON)
+        same(found, known.slice(CONTEXT))
 
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
 def test_nearest_neighbour_finds_and_follows_a_scene_that_was_moved(train: Scene, people: int) -> None:
-    known = train.pick(range(30 * (people - 1), 30 * people, 7))
-    moved = known.moved(somewhere_else(known.scenes))
+    known = train.select(range(30 * (people - 1), 30 * people, 7))
+    moved = known.transformed(somewhere_else(known.scenes))
     nearest = NearestNeighbour(train)
-    chosen, _ = nearest.nearest(moved.cut(0, CONTEXT))
+    chosen, _ = nearest.nearest(moved.slice(0, CONTEXT))
     assert chosen.tolist() == list(range(30 * (people - 1), 30 * people, 7))
-    same(nearest(moved.cut(0, CONTEXT), HORIZON), moved.cut(CONTEXT))
-    same(NearestNeighbour(train, aligned=False)(moved.cut(0, CONTEXT), HORIZON), known.cut(CONTEXT))
+    same(nearest(moved.slice(0, CONTEXT), HORIZON), moved.slice(CONTEXT))
+    same(NearestNeighbour(train, aligned=False)(moved.slice(0, CONTEXT), HORIZON), known.slice(CONTEXT))
 
 
 @pytest.mark.parametrize("people", [2, 3, 4])
 def test_nearest_neighbour_finds_people_in_any_order_and_any_slots(train: Scene, people: int) -> None:
-    known = train.pick(range(30 * (people - 1), 30 * people, 7))
+    known = train.select(range(30 * (people - 1), 30 * people, 7))
     order = torch.tensor([2, 0, 3, 1])
-    shuffled = known.order(order)
-    same(NearestNeighbour(train)(shuffled.cut(0, CONTEXT), HORIZON), shuffled.cut(CONTEXT))
+    shuffled = known.permute_agents(order)
+    same(NearestNeighbour(train)(shuffled.slice(0, CONTEXT), HORIZON), shuffled.slice(CONTEXT))
 
 
 def test_nearest_neighbour_survives_a_little_noise(train: Scene) -> None:
-    known = train.pick([35, 70, 95])
+    known = train.select([35, 70, 95])
     shake = 0.01 * torch.randn(3, CONTEXT + HORIZON, 4, 21, 6, generator=torch.Generator().manual_seed(0))
     shaken = known.replace(body_rot=from_6d(to_6d(known.body_rot) + shake))
-    chosen, _ = NearestNeighbour(train).nearest(shaken.cut(0, CONTEXT))
+    chosen, _ = NearestNeighbour(train).nearest(shaken.slice(0, CONTEXT))
     assert chosen.tolist() == [35, 70, 95]
 
 
 def test_nearest_is_nearest_by_a_slow_reference(train: Scene) -> None:
     """Same choice as a plain loop over stretches, orders, people and frames."""
-    context = wander(4, 3, seed=77).cut(0, CONTEXT)
+    context = wander(4, 3, seed=77).slice(0, CONTEXT)
     nearest = NearestNeighbour(train)
     chosen, slots = nearest.nearest(context)
     among = nearest.candidates(3)
-    begin = train.pick(among).cut(0, CONTEXT)
-    whole = train.cut(0, CONTEXT)
+    begin = train.select(among).slice(0, CONTEXT)
+    whole = train.slice(0, CONTEXT)
 
     def kinds(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
         T = canonical_frame(scene.T_world_root)
@@ -133,14 +133,14 @@ def test_nearest_is_nearest_by_a_slow_reference(train: Scene) -> None:
 
 
 def test_an_aligned_random_sample_starts_where_the_context_ends(train: Scene) -> None:
-    context = train.pick([3]).moved(somewhere_else(1)).cut(0, CONTEXT)
-    only = RandomSample(train.pick([3]))
-    expected = train.pick([3]).moved(somewhere_else(1)).cut(CONTEXT)
+    context = train.select([3]).transformed(somewhere_else(1)).slice(0, CONTEXT)
+    only = RandomSample(train.select([3]))
+    expected = train.select([3]).transformed(somewhere_else(1)).slice(CONTEXT)
     same(only(context, HORIZON, samples=2), expected.repeat(2))
 
 
 def test_random_samples_repeat_with_the_generator_and_differ_without(train: Scene) -> None:
-    context = wander(5, 2, seed=9).cut(0, CONTEXT).pad_agents(3)
+    context = wander(5, 2, seed=9).slice(0, CONTEXT).pad_agents(3)
     baseline = RandomSample(train)
     one, two, other = (
         baseline(context, HORIZON, samples=3, generator=torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)
@@ -151,17 +151,17 @@ def test_random_samples_repeat_with_the_generator_and_differ_without(train: Scen
 
 
 def test_unaligned_random_samples_are_training_motion_untouched(train: Scene) -> None:
-    context = wander(3, 2, seed=9).cut(0, CONTEXT)
+    context = wander(3, 2, seed=9).slice(0, CONTEXT)
     got = RandomSample(train, aligned=False)(context, HORIZON, 4, torch.Generator().manual_seed(0))
-    futures = train.pick(range(30, 60)).cut(CONTEXT)
+    futures = train.select(range(30, 60)).slice(CONTEXT)
     for scene in got.T_world_root:
         assert any(torch.equal(scene, recorded[:, :2]) for recorded in futures.T_world_root)
 
 
 @pytest.mark.parametrize("which", ["nearest", "random", "hold"])
 def test_what_comes_back_has_the_contexts_people(train: Scene, which: str) -> None:
-    context = concatenate([wander(2, 2, seed=11), wander(3, 4, seed=12)]).cut(0, CONTEXT)
-    context = context.order(torch.tensor([3, 1, 0, 2])).replace(names=tuple("abcde"))
+    context = concatenate([wander(2, 2, seed=11), wander(3, 4, seed=12)]).slice(0, CONTEXT)
+    context = context.permute_agents(torch.tensor([3, 1, 0, 2])).replace(names=tuple("abcde"))
     baseline = {"nearest": NearestNeighbour(train), "random": RandomSample(train), "hold": HoldPose()}[which]
     got = baseline(context, HORIZON, samples=3, generator=torch.Generator().manual_seed(0))
     assert got.T_world_root.shape == (15, HORIZON, 4, 4, 4)
@@ -176,7 +176,7 @@ def test_what_comes_back_has_the_contexts_people(train: Scene, which: str) -> No
 
 
 def test_held_pose_is_the_last_known_frame() -> None:
-    context = wander(2, 2, seed=1).cut(0, CONTEXT)
+    context = wander(2, 2, seed=1).slice(0, CONTEXT)
     held = HoldPose()(context, 5)
     for t in range(5):
         assert torch.equal(held.T_world_root[:, t], context.T_world_root[:, -1])
@@ -217,10 +217,10 @@ def test_stretches_with_masked_frames_are_never_drawn(train: Scene) -> None:
 
 
 def test_what_does_not_fit_is_named(train: Scene) -> None:
-    context = wander(1, 2, seed=9).cut(0, CONTEXT)
+    context = wander(1, 2, seed=9).slice(0, CONTEXT)
     for baseline in (RandomSample(train), NearestNeighbour(train)):
         with pytest.raises(ValueError, match="5 people"):
-            baseline(wander(1, 5, seed=9).cut(0, CONTEXT), HORIZON)
+            baseline(wander(1, 5, seed=9).slice(0, CONTEXT), HORIZON)
         with pytest.raises(ValueError, match="need 33"):
             baseline(context, HORIZON + 1)
         with pytest.raises(ValueError, match="fps"):

@@ -36,9 +36,9 @@ def test_straight_walks_are_continued(people: int) -> None:
     """A position is the last one and the last step so many times: linear, so nothing but the penalty is in the way."""
     made = RidgeRegression(windows(walking(120, people, seed=1)))
     seen = walking(7, people, seed=2)
-    future = BODY.joints(seen.cut(CONTEXT))
-    error = (made(seen.cut(0, CONTEXT), HORIZON) - future).norm(dim=-1).mean()
-    held = (BODY.joints(seen.cut(CONTEXT - 1, CONTEXT)) - future).norm(dim=-1).mean()
+    future = BODY.joints(seen.slice(CONTEXT))
+    error = (made(seen.slice(0, CONTEXT), HORIZON) - future).norm(dim=-1).mean()
+    held = (BODY.joints(seen.slice(CONTEXT - 1, CONTEXT)) - future).norm(dim=-1).mean()
     assert error < 0.02 * held
 
 
@@ -78,21 +78,21 @@ def test_weights_solve_the_penalised_problem_of_the_textbook() -> None:
 @pytest.mark.parametrize("people", [1, 2, 3])
 def test_a_moved_world_and_other_slots_move_the_answer_along(people: int) -> None:
     regression = RidgeRegression(windows(wander(40, people, seed=4).pad_agents(4)))
-    seen = wander(3, people, seed=5).cut(0, CONTEXT)
+    seen = wander(3, people, seed=5).slice(0, CONTEXT)
     answer = regression(seen, HORIZON)
     T_new_world = somewhere_else(3)
     moved = answer @ T_new_world[:, :, :, None, :3, :3].mT.squeeze(3) + T_new_world[..., :3, 3][..., None, :]
-    torch.testing.assert_close(regression(seen.moved(T_new_world), HORIZON), moved, atol=1e-4, rtol=0)
+    torch.testing.assert_close(regression(seen.transformed(T_new_world), HORIZON), moved, atol=1e-4, rtol=0)
     order = torch.tensor([3, 0, 2, 1])
     padded = seen.pad_agents(4)
-    shuffled = regression(padded.order(order), HORIZON)
+    shuffled = regression(padded.permute_agents(order), HORIZON)
     torch.testing.assert_close(shuffled, regression(padded, HORIZON)[:, :, order], atol=1e-5, rtol=0)
-    assert not shuffled[:, :, ~padded.order(order).present[0]].any()
+    assert not shuffled[:, :, ~padded.permute_agents(order).present[0]].any()
 
 
 def test_scenes_of_several_sizes_are_answered_as_each_alone() -> None:
     regression = RidgeRegression(windows(concatenate([wander(30, people, seed=people) for people in (1, 2)])))
-    one, two = (wander(2, people, seed=9).cut(0, CONTEXT).pad_agents(2) for people in (1, 2))
+    one, two = (wander(2, people, seed=9).slice(0, CONTEXT).pad_agents(2) for people in (1, 2))
     both = regression(concatenate([one, two]), HORIZON)
     alone = torch.cat([regression(one, HORIZON), regression(two, HORIZON)])
     torch.testing.assert_close(both, alone, atol=1e-5, rtol=0)
@@ -136,13 +136,13 @@ def test_windows_with_a_masked_frame_are_left_out() -> None:
 
 def test_misfits_are_named() -> None:
     regression = RidgeRegression(windows(wander(8, 2, seed=1)))
-    seen = wander(1, 2, seed=2).cut(0, CONTEXT)
+    seen = wander(1, 2, seed=2).slice(0, CONTEXT)
     for context, horizon, match in (
         (seen, HORIZON + 1, "horizon: got 21 frames, training windows have 20"),
-        (seen.cut(1), HORIZON, "context frames: the context has 11, training windows 12"),
+        (seen.slice(1), HORIZON, "context frames: the context has 11, training windows 12"),
         (seen.replace(fps=60.0), HORIZON, r"fps: the context has 60\.0, training windows 30\.0"),
         (seen.replace(body="smplx-neutral"), HORIZON, "body: the context has smplx-neutral, training windows open"),
-        (wander(1, 3, seed=2).cut(0, CONTEXT), HORIZON, r"has 3 people, training windows have \[2\]"),
+        (wander(1, 3, seed=2).slice(0, CONTEXT), HORIZON, r"has 3 people, training windows have \[2\]"),
     ):
         with pytest.raises(ValueError, match=match):
             regression(context, horizon)

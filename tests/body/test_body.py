@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from magnet.body import JOINT_NAMES, MIRROR, PARENTS, load_body
-from magnet.motion.scene import Scene, absent
+from magnet.motion.scene import Scene, empty_scene
 
 PARENTS_55 = (*PARENTS, 15, 15, 15, 20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38,
               21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53)  # fmt: skip
@@ -118,14 +118,14 @@ def test_vertices_follow_a_rigid_move_of_the_world():
     move = torch.eye(4)
     move[:3, :3], move[:3, 3] = random_rotations(1)[0], torch.tensor([1.0, 2.0, 3.0])
     want = body.vertices(scene) @ move[:3, :3].T + move[:3, 3]
-    torch.testing.assert_close(body.vertices(scene.moved(move)), want, atol=2e-5, rtol=0)
+    torch.testing.assert_close(body.vertices(scene.transformed(move)), want, atol=2e-5, rtol=0)
 
 
 def test_an_absent_agent_does_not_disturb_the_others():
     body, scene = load_body(), random_scene(1, 2, 2)
     padded = scene.pad_agents(4)
     torch.testing.assert_close(body.joints(padded)[:, :, :2], body.joints(scene))
-    assert body.joints(absent(1, 2, 1, scene.betas)).isfinite().all()
+    assert body.joints(empty_scene(1, 2, 1, scene.betas)).isfinite().all()
 
 
 # -- the open body -----------------------------------------------------------------------------

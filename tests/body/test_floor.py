@@ -16,7 +16,7 @@ from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.synthetic import Synthetic
 from magnet.export.bvh_read import read_bvh
 from magnet.motion.frames import from_planar
-from magnet.motion.scene import Scene, absent
+from magnet.motion.scene import Scene, empty_scene
 from magnet.synthesis import COUPLINGS
 
 BODY = load_body()
@@ -24,12 +24,12 @@ CONTEXTS = (4, 8, JUMP - 1, JUMP, 32)
 
 
 def lifted(scene: Scene, metres: float) -> Scene:
-    return scene.moved(torch.eye(4) + metres * torch.eye(4)[1][:, None] * torch.eye(4)[3])
+    return scene.transformed(torch.eye(4) + metres * torch.eye(4)[1][:, None] * torch.eye(4)[3])
 
 
 def still(rotation: list[float], height: float, frames: int = 40) -> Scene:
     """Somebody in the rest pose, turned by a rotation vector, pelvis at a height."""
-    scene = absent(1, frames, 1, torch.zeros(())).replace(present=torch.ones(1, 1, dtype=torch.bool))
+    scene = empty_scene(1, frames, 1, torch.zeros(())).replace(present=torch.ones(1, 1, dtype=torch.bool))
     T = scene.T_world_root.clone()
     T[..., :3, :3] = roma.rotvec_to_rotmat(torch.tensor(rotation, dtype=torch.float32))
     T[..., 1, 3] = height
@@ -70,9 +70,9 @@ def test_wherever_the_feet_are_whoever_touches_the_floor_is_on_it(rotation, heig
 
 def test_somebody_in_the_air_is_not_off_the_floor_unless_for_longer_than_anybody_jumps():
     jump = lifted(still([0, 0, 0], 0.93), 0.7)
-    assert off(jump.cut(0, JUMP - 1)) == 0.0
-    assert off(jump.cut(0, JUMP)) == pytest.approx(0.7, abs=0.05)
-    assert off(lifted(still([0, 0, 0], 0.93), -0.7).cut(0, 4)) == pytest.approx(-0.7, abs=0.05)  # nobody sinks
+    assert off(jump.slice(0, JUMP - 1)) == 0.0
+    assert off(jump.slice(0, JUMP)) == pytest.approx(0.7, abs=0.05)
+    assert off(lifted(still([0, 0, 0], 0.93), -0.7).slice(0, 4)) == pytest.approx(-0.7, abs=0.05)  # nobody sinks
 
 
 def test_one_person_on_the_floor_clears_the_scene():
@@ -86,9 +86,9 @@ def test_one_person_on_the_floor_clears_the_scene():
 
 
 def test_scenes_are_put_on_the_floor_each_by_itself():
-    scene = Synthetic(test_clips=1).scene("test", 0).scene.cut(0, 60)
+    scene = Synthetic(test_clips=1).scene("test", 0).scene.slice(0, 60)
     both = torch.tensor([1.0, -0.5])
-    high = scene.repeat(2).moved(from_planar(torch.zeros(2), torch.zeros(2, 2))[:, None, None])
+    high = scene.repeat(2).transformed(from_planar(torch.zeros(2), torch.zeros(2, 2))[:, None, None])
     T = high.T_world_root.clone()
     T[..., 1, 3] += both[:, None, None]
     placed = on_floor(high.replace(T_world_root=T))
@@ -99,9 +99,9 @@ def test_scenes_are_put_on_the_floor_each_by_itself():
 
 
 def test_nobody_and_nothing_is_put_nowhere():
-    nobody = absent(2, 4, 2, torch.zeros(()))
+    nobody = empty_scene(2, 4, 2, torch.zeros(()))
     assert torch.equal(on_floor(nobody).T_world_root, nobody.T_world_root)
-    assert on_floor(nobody.cut(0, 0)).frames == 0
+    assert on_floor(nobody.slice(0, 0)).frames == 0
 
 
 def test_shapes_of_another_body_are_taken_for_average_ones():

@@ -17,7 +17,7 @@ def test_joints_of_the_mirrored_scene_are_the_mirrored_joints_swapped(scene):
 
 
 def test_skin_of_the_mirrored_scene_is_the_mirrored_skin(scene):
-    body, scene = load_body(), scene.cut(0, 2)
+    body, scene = load_body(), scene.slice(0, 2)
     flip = torch.tensor([-1.0, 1.0, 1.0])
     key = [tuple(v) for v in (body.v_template * 1e5).round().int().tolist()]
     index = {v: i for i, v in enumerate(key)}

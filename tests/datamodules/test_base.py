@@ -33,8 +33,8 @@ def test_a_window_is_the_frames_it_names() -> None:
     assert batch.frames == 64 and batch.agents == 3 and batch.scenes == 64
     for b, name in enumerate(batch.names):
         clip, start, stop = shown(name)
-        window = by_name[clip].cut(start, stop).pad_agents(3)
-        got = batch.pick([b])
+        window = by_name[clip].slice(start, stop).pad_agents(3)
+        got = batch.select([b])
         for field in ("body_rot", "T_world_root", "betas", "present"):
             assert torch.equal(getattr(got, field), getattr(window, field)), (name, field)
         assert bool(got.valid.all())
@@ -96,7 +96,7 @@ def test_agent_order_permutes_everything_of_a_person() -> None:
     shuffled = one_epoch(FakeData(couples_and_singles(), **{**options, "shuffle_agents": True}))
     moved = 0
     for b in range(ordered.scenes):
-        left, right = ordered.pick([b]), shuffled.pick([b])
+        left, right = ordered.select([b]), shuffled.select([b])
         assert int(left.present.sum()) == int(right.present.sum())
         mine = [int(p) for p in left.present[0].nonzero()[:, 0]]
         theirs = [
@@ -108,7 +108,7 @@ def test_agent_order_permutes_everything_of_a_person() -> None:
         rest_r = [q for q in range(4) if q not in theirs]
         order = torch.empty(4, dtype=torch.long)
         order[mine + rest_l] = torch.tensor(theirs + rest_r)
-        again = right.order(order)
+        again = right.permute_agents(order)
         # Placing a second group sums over people, so another order may round differently.
         torch.testing.assert_close(again.T_world_root, left.T_world_root, atol=1e-5, rtol=0)
         assert torch.equal(again.body_rot, left.body_rot) and torch.equal(again.present, left.present)
@@ -180,8 +180,8 @@ def test_half_of_the_windows_are_mirror_images() -> None:
     batch = one_epoch(FakeData(clips, epoch_size=256, **{**PLAIN, "mirror": True}))
     mirrored = (plain.T_world_root != batch.T_world_root).flatten(1).any(dim=1)
     assert 0.4 < mirrored.float().mean().item() < 0.6
-    assert same(batch.pick(mirrored), mirror_scene(plain.pick(mirrored)))
-    assert same(batch.pick(~mirrored), plain.pick(~mirrored))
+    assert same(batch.select(mirrored), mirror_scene(plain.select(mirrored)))
+    assert same(batch.select(~mirrored), plain.select(~mirrored))
 
 
 # -- validation, test, all of training ---------------------------------------------------------

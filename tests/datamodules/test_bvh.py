@@ -46,7 +46,7 @@ def test_what_a_file_means_is_said_in_its_notes(made: Path) -> None:
 
 def test_a_skeleton_of_the_bodys_own_comes_back_exactly(tmp_path: Path) -> None:
     body = load_body()
-    scene = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), body).scene.cut(0, 64)
+    scene = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), body).scene.slice(0, 64)
     save_bvh(scene, tmp_path / "walk.bvh", body, unit="cm")
     reader = BVHReader(tmp_path, pattern="{scene}_{person}")
     made = to_clips(whole(reader), body, "walk", "bvh", "train", "positions", Steps(trust_fps=True))

@@ -76,7 +76,7 @@ FORMS: dict[str, tuple[str, Callable[[int], Any], tuple[int, ...]]] = {
 
 def made() -> Scene:
     """A scene of the open body's."""
-    return synthesize("follow", 2, 120, torch.Generator().manual_seed(1), load_body()).scene.cut(0, 40)
+    return synthesize("follow", 2, 120, torch.Generator().manual_seed(1), load_body()).scene.slice(0, 40)
 
 
 def write(path: Path, held: Any) -> None:

@@ -67,8 +67,8 @@ def test_settling_changes_nothing_but_what_it_is_told_of(model, scene):
 def test_whoever_has_ended_stands_as_in_the_frame_before(scene):
     there = torch.ones(8, 3, dtype=torch.bool)
     there[3:, 1], there[:, 2] = False, False
-    part = scene.cut(20, 28)
-    held = hold(part, there, scene.cut(19, 20))
+    part = scene.slice(20, 28)
+    held = hold(part, there, scene.slice(19, 20))
     assert torch.equal(held.T_world_root[:, :, 0], part.T_world_root[:, :, 0])
     assert torch.equal(held.T_world_root[:, 3:, 1], part.T_world_root[:, 2:3, 1].expand(-1, 5, -1, -1))
     assert torch.equal(held.body_rot[:, :, 2], scene.body_rot[:, 19:20, 2].expand(-1, 8, -1, -1, -1))
@@ -97,7 +97,7 @@ def told(
     schedule = task.schedule(Grid(TOKENS, 3, context, 4, 8, 2))
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, options, 1, **about)
-    truth = known_tokens(model, scene.cut(0, 4 * TOKENS), torch.ones_like(schedule.known))
+    truth = known_tokens(model, scene.slice(0, 4 * TOKENS), torch.ones_like(schedule.known))
     truth = truth if wrong is None else truth + wrong
     position = iter([stage for stage in schedule.stages for _ in range(len(stage.levels) - 1)])
 
@@ -113,7 +113,7 @@ def told(
 
 def off(canvas: Canvas, scene: Scene, free: bool) -> torch.Tensor:
     """Metres and radians that placed people are away from where they were; `free`: the scene may stand anywhere."""
-    true, placed = canonical_frame(scene.cut(0, 4 * TOKENS).T_world_root), canvas.T_world_can
+    true, placed = canonical_frame(scene.slice(0, 4 * TOKENS).T_world_root), canvas.T_world_can
     if free:
         lead = torch.arange(scene.scenes), 0, scene.present.int().argmax(dim=1)
         true, placed = (inverse(T[lead])[:, None, None] @ T for T in (true, placed))

@@ -36,8 +36,8 @@ def same(a: Scene, b: Scene) -> bool:
 def test_given_frames_come_back_and_the_future_has_the_length_asked_for(model, scene):
     whole = run(model, scene)
     assert whole.frames == 50
-    assert torch.equal(whole.cut(0, 16).body_rot, scene.cut(0, 16).body_rot)
-    assert torch.equal(whole.cut(0, 16).T_world_root, scene.cut(0, 16).T_world_root)
+    assert torch.equal(whole.slice(0, 16).body_rot, scene.slice(0, 16).body_rot)
+    assert torch.equal(whole.slice(0, 16).T_world_root, scene.slice(0, 16).T_world_root)
 
 
 def test_nothing_but_the_context_reaches_the_sample(model, scene, generator):
@@ -49,13 +49,13 @@ def test_nothing_but_the_context_reaches_the_sample(model, scene, generator):
     )
     plain = run(model, scene)
     assert same(plain, run(model, future_is_noise))
-    assert same(plain, run(model, scene.cut(0, 16)))
+    assert same(plain, run(model, scene.slice(0, 16)))
 
 
 def unknown_replaced(scene: Scene, known: torch.Tensor, generator: torch.Generator) -> Scene:
     """Noise wherever the schedule knows nothing. known (N, P) bool"""
     keep = known.repeat_interleave(4, dim=0)[:, :, None, None]
-    scene = scene.cut(0, len(keep))
+    scene = scene.slice(0, len(keep))
     noise = random_scene(scene.scenes, scene.frames, scene.agents, generator)
     return scene.replace(
         body_rot=torch.where(keep[..., None], scene.body_rot, noise.body_rot),
@@ -110,14 +110,14 @@ def test_holding_the_last_pose_keeps_the_last_known_token_nearer_to_what_it_woul
 
     def embedded(scene: Scene, hold: int) -> torch.Tensor:
         """Before quantisation, which would hide how near two vectors are."""
-        part = features(scene.people().held(4 * hold))
+        part = features(scene.people().pad_frames(4 * hold))
         vectors = model.tokenizer._embed(part.pose, part.betas, part.steps, part.valid)[:, :, 0]
         return vectors[:, hold : vectors.shape[1] - hold]
 
-    away = [(embedded(scene, hold)[:, 7] - embedded(scene.cut(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]
+    away = [(embedded(scene, hold)[:, 7] - embedded(scene.slice(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]
     assert away[1] < 0.8 * away[0]
-    held = embedded(scene.cut(0, 32), 1).unflatten(0, (8, 2)).transpose(1, 2)
-    assert torch.equal(model.encode(scene.cut(0, 32)), model.tokenizer.requantise(held))
+    held = embedded(scene.slice(0, 32), 1).unflatten(0, (8, 2)).transpose(1, 2)
+    assert torch.equal(model.encode(scene.slice(0, 32)), model.tokenizer.requantise(held))
 
 
 def test_generation_reads_nothing_at_all(model, scene, generator):
@@ -169,8 +169,8 @@ def test_moving_the_world_moves_the_sample(model, scene):
     T = torch.eye(4)
     T[0, 0], T[0, 2], T[2, 0], T[2, 2] = 0.6, 0.8, -0.8, 0.6
     T[0, 3] = 4.0
-    moved = run(model, scene.moved(T))
-    assert torch.allclose(run(model, scene).moved(T).T_world_root, moved.T_world_root, atol=2e-3)
+    moved = run(model, scene.transformed(T))
+    assert torch.allclose(run(model, scene).transformed(T).T_world_root, moved.T_world_root, atol=2e-3)
 
 
 def test_moving_the_world_moves_the_sample_before_a_keyframe_of_somebody_lying_on_the_side(model, scene):
@@ -185,7 +185,7 @@ def test_moving_the_world_moves_the_sample_before_a_keyframe_of_somebody_lying_o
     def between(scene: Scene) -> Scene:
         return run(model, scene, frames=32, task=Inbetweening(keys=(8,)))
 
-    here, there = between(scene).moved(move), between(scene.moved(move))
+    here, there = between(scene).transformed(move), between(scene.transformed(move))
     assert (here.T_world_root - there.T_world_root).abs().max() < 1e-4
 
 
@@ -224,7 +224,7 @@ def test_health_tells_how_far_latents_are_from_codes_and_relations_from_the_worl
     assert (health.snaps, health.drifts) == (2 * 9 * 3, 2 * 9 * 3 * 2)
     assert health.means()["snap"] > 0 and health.means()["drift"] > 0
     anchored = Health()
-    two = scene.cut(0, 64).order(torch.tensor([0, 1]))
+    two = scene.slice(0, 64).permute_agents(torch.tensor([0, 1]))
     options = SamplerOptions(steps=3, stride=2, placement="anchor")
     model.generate(two, JointFuture(), 16, 34, 1, options, torch.Generator().manual_seed(0), health=anchored)
     assert anchored.drifts == 2 * 9 * 2
@@ -281,7 +281,7 @@ def test_bad_requests_are_named(model, scene):
     with pytest.raises(ValueError, match="context of 15 frames is not a multiple of 4"):
         run(model, scene, context=15)
     with pytest.raises(ValueError, match="the task needs 16 frames, the scene has 12"):
-        run(model, scene.cut(0, 12))
+        run(model, scene.slice(0, 12))
     with pytest.raises(ValueError, match="the scene has 4 agents, the model was built for 3"):
         run(model, scene.pad_agents(4))
 

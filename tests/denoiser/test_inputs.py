@@ -38,8 +38,8 @@ def duet() -> Scene:
 
 
 def answered(model: Denoiser, scene: Scene) -> Scene:
-    partner = Partner(model, scene.cut(0, CONTEXT), (1,), FAST)
-    return partner.answer(scene.cut(CONTEXT, CONTEXT + 4))
+    partner = Partner(model, scene.slice(0, CONTEXT), (1,), FAST)
+    return partner.answer(scene.slice(CONTEXT, CONTEXT + 4))
 
 
 WAYS: dict[str, Callable[[Denoiser, Scene], Any]] = {
@@ -98,17 +98,17 @@ def test_another_floor_is_refused_at_every_way_in(way, metres, model, duet):
 @pytest.mark.parametrize("way", set(WAYS) - {"live", "live partner"})
 def test_an_empty_batch_is_refused_at_every_way_in(way, model, duet):
     with pytest.raises(ValueError, match=r"^got an empty batch of 0 scenes|^got 0 scenes, expected one"):
-        WAYS[way](model, duet.pick([]))
+        WAYS[way](model, duet.select([]))
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_nobody_at_all_is_refused_at_every_way_in(way, model, duet):
     with pytest.raises(ValueError, match=r"nobody|name some|expected|no such|the grid has|at least 1"):
-        WAYS[way](model, duet.order(torch.tensor([], dtype=torch.long)))
+        WAYS[way](model, duet.permute_agents(torch.tensor([], dtype=torch.long)))
 
 
 def test_no_frames_are_refused_wherever_some_are_needed(model, duet):
-    nothing = duet.cut(0, 0)
+    nothing = duet.slice(0, 0)
     for way in set(WAYS) - {"inpaint"}:
         with pytest.raises(ValueError, match=r"needs 32 frames|needs 4 frames|none to sample|at least|expected 1"):
             WAYS[way](model, nothing)
@@ -207,12 +207,12 @@ def test_people_who_really_are_up_there_are_taken_if_one_says_so(model, duet):
     options = dataclasses.replace(FAST, any_floor=True)
     got = model.generate(high, JointFuture(), CONTEXT, FRAMES, options=options)
     assert torch.equal(got.T_world_root[:, :CONTEXT, :2], high.T_world_root[:, :CONTEXT])
-    assert Partner(model, high.cut(0, CONTEXT), (1,), options).past.frames == CONTEXT
+    assert Partner(model, high.slice(0, CONTEXT), (1,), options).past.frames == CONTEXT
 
 
 def test_a_jump_does_not_end_an_answer(model, duet):
-    partner = Partner(model, duet.cut(0, CONTEXT), (1,), FAST)
-    assert partner.answer(lifted(duet, 1.2).cut(CONTEXT, CONTEXT + 4)).frames == 4
+    partner = Partner(model, duet.slice(0, CONTEXT), (1,), FAST)
+    assert partner.answer(lifted(duet, 1.2).slice(CONTEXT, CONTEXT + 4)).frames == 4
 
 
 def test_only_those_who_are_given_are_asked_where_their_floor_is(model, duet):

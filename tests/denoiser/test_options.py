@@ -38,7 +38,7 @@ def generate(
 def test_every_task_runs_with_every_option(model: Denoiser, scene: Scene, name: str):
     made = generate(model, scene, registry.get(name)(), context=0 if name == "generation" else 16)
     assert made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
-    assert torch.equal(made.T_world_root[made.given], scene.cut(0, 40).T_world_root[made.given])
+    assert torch.equal(made.T_world_root[made.given], scene.slice(0, 40).T_world_root[made.given])
 
 
 def test_options_come_back_with_a_checkpoint(model: Denoiser, tmp_path):
@@ -117,7 +117,7 @@ def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, mon
     from magnet.denoiser import objective
 
     plain, weighted = tiny_denoiser(), tiny_denoiser(weighting="min_snr", snr_most=3.0)
-    scene = scene.cut(0, 32)
+    scene = scene.slice(0, 32)
     for level in (0, 300, 600, 900, 1000):
         at = torch.full((2, 8, 3), level)
         monkeypatch.setattr(objective, "draw_levels", lambda *_, at=at: at)

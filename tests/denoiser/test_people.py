@@ -5,7 +5,7 @@ import torch
 
 from magnet.denoiser.canvas import Canvas, Health
 from magnet.denoiser.generation import SamplerOptions, known_tokens, occupied, planning_grid, scrub
-from magnet.denoiser.seams import joined
+from magnet.denoiser.seams import cat_time
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample
@@ -94,8 +94,8 @@ def test_fewer_people_beside_more_in_a_batch_move_as_alone(model, task):
     scene = people([[True, True, False], [True, True, True]])
     context = 0 if isinstance(task, Generation) else 8
     both = run(model, scene, task, context)
-    assert close(run(model, scene.pick([0]), task, context), both.pick([0]))
-    assert close(run(model, scene.pick([1]), task, context, seed=1), both.pick([1]))
+    assert close(run(model, scene.select([0]), task, context), both.select([0]))
+    assert close(run(model, scene.select([1]), task, context, seed=1), both.select([1]))
 
 
 def test_slots_in_use_are_those_up_to_the_last_person():
@@ -124,5 +124,5 @@ def test_a_stream_without_end_waits_for_nobody(model):
     scene = people([[True, True]], 8)
     begun = model.stream(scene, AgenticAsync(), 8, None, 1, FAST, torch.Generator().manual_seed(0), piece=4)
     ended = model.stream(scene, AgenticAsync(), 8, 400, 1, FAST, torch.Generator().manual_seed(0), piece=4)
-    a, b = (joined([next(pieces) for _ in range(3)]) for pieces in (begun, ended))
+    a, b = (cat_time([next(pieces) for _ in range(3)]) for pieces in (begun, ended))
     assert close(a, b)

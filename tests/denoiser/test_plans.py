@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from magnet.denoiser.generation import SamplerOptions
-from magnet.motion.scene import Scene, joined
+from magnet.motion.scene import Scene, cat_time
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_denoiser
@@ -32,18 +32,18 @@ def test_every_task_samples_whole_scenes_by_these_plans(model, scene, name, opti
     if options is PYRAMID and name in CANNOT_ROLL:
         pytest.skip("refuses to roll, with a reason: tests/tasks/test_laws.py")
     context = 0 if name == "generation" else 16
-    made = joined(list(run(model, scene, registry.get(name)(), options, context, 48 - context)))
+    made = cat_time(list(run(model, scene, registry.get(name)(), options, context, 48 - context)))
     assert made.T_world_root.isfinite().all()
-    assert torch.equal(made.T_world_root[made.given], scene.cut(0, 48).T_world_root[made.given])
+    assert torch.equal(made.T_world_root[made.given], scene.slice(0, 48).T_world_root[made.given])
 
 
 @pytest.mark.parametrize("options", [PYRAMID, INDEPENDENT], ids=["pyramid", "independent"])
 def test_scenes_without_end_begin_as_long_ones_do(model, options):
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(4))
-    whole = joined(list(run(model, scene, JointFuture(), options, frames=120, piece=4)))
+    whole = cat_time(list(run(model, scene, JointFuture(), options, frames=120, piece=4)))
     pieces = run(model, scene, JointFuture(), options, frames=None, piece=4)
-    begun = joined(list(itertools.islice(pieces, 6)))
-    assert torch.allclose(begun.T_world_root, whole.cut(0, begun.frames).T_world_root, atol=1e-5)
+    begun = cat_time(list(itertools.islice(pieces, 6)))
+    assert torch.allclose(begun.T_world_root, whole.slice(0, begun.frames).T_world_root, atol=1e-5)
 
 
 def test_what_the_target_did_before_is_given_and_what_it_does_after_is_not_read(model, scene, generator):
@@ -55,7 +55,7 @@ def test_what_the_target_did_before_is_given_and_what_it_does_after_is_not_read(
     )
     mixed = scene.replace(body_rot=scene.body_rot.clone(), T_world_root=scene.T_world_root.clone())
     mixed.body_rot[:, :, 1], mixed.T_world_root[:, :, 1] = other.body_rot[:, :, 1], other.T_world_root[:, :, 1]
-    a, b = (joined(list(run(model, s, task, PYRAMID))) for s in (scene, mixed))
+    a, b = (cat_time(list(run(model, s, task, PYRAMID))) for s in (scene, mixed))
     assert torch.equal(a.T_world_root, b.T_world_root) and torch.equal(a.body_rot, b.body_rot)
     assert a.given[0, :16].all() and a.given[0, 16:].float().mean(dim=0).tolist() == [1, 0, 1]
     assert torch.equal(a.T_world_root[:, :16], scene.T_world_root[:, :16])

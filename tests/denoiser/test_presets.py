@@ -54,7 +54,7 @@ def test_every_task_is_sampled_the_papers_way_and_given_frames_come_back(name: s
     options = SamplerOptions.preset("paper", steps=2)
     made = model.generate(scene, registry.get(name)(), context, 40 - context, 1, options)
     assert made.T_world_root.isfinite().all() and made.given is not None
-    assert torch.equal(made.T_world_root[made.given], scene.cut(0, 40).T_world_root[made.given])
+    assert torch.equal(made.T_world_root[made.given], scene.slice(0, 40).T_world_root[made.given])
 
 
 def test_fields_replace_those_of_a_preset():

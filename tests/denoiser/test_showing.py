@@ -48,7 +48,7 @@ def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
     canvas, tokens = finished(model, scene, BARE)
     made = bodies(canvas, tokens, 6, 8, 8)
     latent, steps, _ = model.layout.unpack(model.statistics.restore(tokens[:, :8]))
-    clip = posed(model.tokenizer.decode(latent, scene.betas, steps), canvas.T_world_can[:, :32], scene.cut(0, 32))
+    clip = posed(model.tokenizer.decode(latent, scene.betas, steps), canvas.T_world_can[:, :32], scene.slice(0, 32))
     assert torch.allclose(made.body_rot, clip.body_rot[:, 24:], atol=1e-5)
     assert torch.allclose(made.T_world_root, clip.T_world_root[:, 24:], atol=1e-5)
 
@@ -79,11 +79,11 @@ def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene)
 def test_what_has_been_shown_is_given_and_the_next_block_goes_on_from_there(model, scene):
     canvas, tokens = finished(model, scene, SamplerOptions(steps=2))
     show(canvas, tokens, 6, 6, None)
-    first = canvas.given.cut(0, 24)
+    first = canvas.given.slice(0, 24)
     first = first.replace(body_rot=first.body_rot.clone(), T_world_root=first.T_world_root.clone())
     tokens = tokens + 0.5 * torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1))
     show(canvas, tokens, 7, 7, None)
-    assert same(canvas.given.cut(0, 24), first)
+    assert same(canvas.given.slice(0, 24), first)
     assert torch.equal(canvas.given.body_rot[:, :28, 1:], scene.body_rot[:, :28, 1:])  # given, as it was
     step = canvas.given.T_world_root[:, :28, 0, :3, 3].diff(dim=1).norm(dim=-1)
     assert step[:, 23].max() < 2 * step[:, 16:23].max()

@@ -5,7 +5,7 @@ import torch
 
 from magnet.denoiser.canvas import Canvas
 from magnet.denoiser.generation import SamplerOptions, encodings, known_tokens, scrub, sight, task_sight
-from magnet.denoiser.seams import joined
+from magnet.denoiser.seams import cat_time
 from magnet.motion.scene import Scene
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
@@ -104,7 +104,7 @@ def test_codes_are_those_of_a_recording_that_ends_where_they_look_to(model, reco
     tokens = known_tokens(model, scrub(recording, known), known, cuts=cuts)
     latent = model.layout.unpack(model.statistics.restore(tokens))[0]
     for row in range(TOKENS):
-        live = model.encode(recording.cut(0, 4 * int(cuts[row, 1])))
+        live = model.encode(recording.slice(0, 4 * int(cuts[row, 1])))
         assert torch.allclose(latent[:, row, 1:], live[:, row, 1:], atol=1e-5)
 
 
@@ -138,7 +138,7 @@ def test_streams_do_not_leak_either(model, recording, block, piece):
     end = PAST + 2 * block
     other = replaced(recording, end, 1)
     a, b = (
-        joined(
+        cat_time(
             list(
                 model.stream(
                     scene,

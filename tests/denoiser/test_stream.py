@@ -8,7 +8,7 @@ import torch
 from magnet.denoiser.canvas import Canvas, Health
 from magnet.denoiser.generation import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
 from magnet.denoiser.plan import endless, lows
-from magnet.denoiser.seams import joined
+from magnet.denoiser.seams import cat_time
 from magnet.denoiser.stream import Stream
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
@@ -62,7 +62,7 @@ def at_once(model, scene: Scene, task, context: int, frames: int, options: Sampl
     how = {"guidance": options.guidance, "noise": noise, "solver": options.solver}
     out = sample(model.denoise, schedule, start, given.present, model.layout, settle=canvas.settle, **how)
     with torch.no_grad():
-        return canvas.scene(out).cut(0, context + frames)
+        return canvas.scene(out).slice(0, context + frames)
 
 
 def streamed(model, scene: Scene, task, context: int, frames: int | None, piece: int, options=FAST, seed: int = 0):
@@ -95,7 +95,7 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
     frames = 4 * TOKENS - context - 3
     pieces = list(streamed(model, recording, TASKS[name], context, frames, piece))
     assert [made.frames for made in pieces[:-1]] == [4 * piece] * (len(pieces) - 1)
-    whole = joined(pieces)
+    whole = cat_time(pieces)
     assert whole.frames == context + frames
     assert close(at_once(model, recording, TASKS[name], context, frames, FAST), whole)
 
@@ -104,7 +104,7 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
 def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(model, recording, name):
     """Nor on when rows are let go: one piece holds them all."""
     whole, pieces, rows = (
-        joined(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, piece))) for piece in (64, 5, 1)
+        cat_time(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, piece))) for piece in (64, 5, 1)
     )
     assert same(whole, pieces) and same(whole, rows)
 
@@ -112,8 +112,8 @@ def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(model, r
 @pytest.mark.parametrize("name", CAUSAL)
 def test_the_same_happens_however_long_a_causal_scene_goes_on(model, recording, name):
     """Live, nobody knows where it ends."""
-    long, short = (joined(list(streamed(model, recording, TASKS[name], 8, frames, 64))) for frames in (160, 96))
-    assert same(long.cut(0, short.frames), short)
+    long, short = (cat_time(list(streamed(model, recording, TASKS[name], 8, frames, 64))) for frames in (160, 96))
+    assert same(long.slice(0, short.frames), short)
 
 
 @pytest.mark.parametrize("name", CAUSAL)
@@ -147,7 +147,7 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
 def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, options):
     for task in (JointFuture(), PartnerInpainting((1,))):
         pieces = list(streamed(model, recording, task, 8, 141, 5, options))
-        assert close(at_once(model, recording, task, 8, 141, options), joined(pieces))
+        assert close(at_once(model, recording, task, 8, 141, options), cat_time(pieces))
 
 
 def test_generate_returns_the_pieces_of_a_stream_bit_for_bit(model, recording):
@@ -155,7 +155,7 @@ def test_generate_returns_the_pieces_of_a_stream_bit_for_bit(model, recording):
     for task in (JointFuture(), PartnerInpainting()):
         pieces = list(streamed(model, long, task, 8, 392, 64))
         assert [made.frames for made in pieces] == [256, 144]
-        assert same(joined(pieces), model.generate(long, task, 8, 392, 1, FAST, torch.Generator().manual_seed(0)))
+        assert same(cat_time(pieces), model.generate(long, task, 8, 392, 1, FAST, torch.Generator().manual_seed(0)))
 
 
 @pytest.mark.parametrize("causal", [False, True])
@@ -179,12 +179,12 @@ def test_long_given_stretches_are_encoded_in_pieces_as_they_are_whole(causal, de
             model.tokenizer.requantise = kept
 
     whole = embedded(scene)
-    part = embedded(scene.cut(4 * (40 - before), 4 * (50 + after)))[:, before : before + 10]
+    part = embedded(scene.slice(4 * (40 - before), 4 * (50 + after)))[:, before : before + 10]
     assert torch.allclose(whole[:, 40:50], part, atol=1e-5)
 
 
 def test_whoever_ends_stands_still_across_pieces(model, recording):
-    whole = joined(list(streamed(model, recording, PartnerPrediction((0,)), 8, 100, 4)))
+    whole = cat_time(list(streamed(model, recording, PartnerPrediction((0,)), 8, 100, 4)))
     still = whole.T_world_root[:, 8:, 1:]
     assert torch.equal(still, still[:, :1].expand_as(still))
 
@@ -263,9 +263,9 @@ GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partn
 def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, rolling):
     context = context_of(name)
     options = SamplerOptions(steps=1 + 3 * bool(rolling), stride=4, rolling=rolling)
-    short = recording.cut(0, context).pick([0])
+    short = recording.slice(0, context).select([0])
     ended, begun = (
-        joined(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 8)))
+        cat_time(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 8)))
         for frames in (400, None)
     )
     assert begun.frames == 8 * 32
@@ -311,8 +311,8 @@ def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model,
 
     batch = run(recording, range(4), 2)
     for number in range(4):
-        single = run(recording.pick([number // 2]), range(number, number + 1), 1)
-        assert close(single, batch.pick([number]))
+        single = run(recording.select([number // 2]), range(number, number + 1), 1)
+        assert close(single, batch.select([number]))
 
 
 def test_as_many_generators_as_scenes_are_needed(model, recording):
@@ -357,4 +357,4 @@ def test_a_scene_that_ends_within_a_token_is_enough_for_tasks_given_all_of_it(na
     out = model.generate(scene, registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))
     assert out.frames == 34
     with pytest.raises(ValueError, match="the task needs"):
-        model.generate(scene.cut(0, 30), registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))
+        model.generate(scene.slice(0, 30), registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))

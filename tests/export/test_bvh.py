@@ -139,7 +139,7 @@ def test_a_file_cut_anywhere_is_refused(share, trio: Scene, body: Body, tmp_path
 
 
 def test_a_damaged_file_is_read_or_refused_but_never_breaks_the_reader(trio: Scene, body: Body, tmp_path: Path):
-    path = save_bvh(trio.cut(0, 3), tmp_path / "trio.bvh", body)[0]
+    path = save_bvh(trio.slice(0, 3), tmp_path / "trio.bvh", body)[0]
     text, draw = path.read_text(), np.random.default_rng(0)
     refused = 0
     for _ in range(150):

@@ -28,7 +28,7 @@ def test_what_can_be_read_back_holds_the_same_joints(name, smplx, duet: Scene, b
 
 @pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s not in (".mp4",)])
 def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_path: Path):
-    written = formats.write(duet.cut(0, 3), tmp_path / f"deep/a{suffix}", body, style="skeleton")
+    written = formats.write(duet.slice(0, 3), tmp_path / f"deep/a{suffix}", body, style="skeleton")
     assert written and all(path.exists() and path.suffix == suffix for path in written)
     begins = {".npz": b"PK", ".bvh": b"HIERARCHY", ".glb": b"glTF", ".csv": b"scene,frame", ".gif": b"GIF89a",
               ".webp": b"RIFF", ".png": b"\x89PNG"}  # fmt: skip
@@ -44,7 +44,7 @@ def test_a_page_can_be_light_and_a_film_says_that_it_cannot(duet: Scene, body: B
 
 def test_mp4_is_written_where_its_package_is(duet: Scene, body: Body, tmp_path: Path):
     pytest.importorskip("av", reason="PyAV is not installed")
-    (path,) = formats.write(duet.cut(0, 3), tmp_path / "a.mp4", body, style="skeleton")
+    (path,) = formats.write(duet.slice(0, 3), tmp_path / "a.mp4", body, style="skeleton")
     assert b"ftyp" in path.read_bytes()[:16]
 
 
@@ -147,7 +147,7 @@ def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, bo
     assert torch.equal(known_frames(said, 3), given[0])
     twice = resampled(said, 60.0).given
     assert twice is not None and twice[0].sum(dim=0).tolist() == [11, 0]  # frame 5.5 is half generated
-    both = formats.together([said.order([0]), duet.order([1])], ["a", "b"])
+    both = formats.together([said.permute_agents([0]), duet.permute_agents([1])], ["a", "b"])
     assert torch.equal(both.given, given)  # type: ignore[arg-type]
 
 

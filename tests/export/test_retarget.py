@@ -164,8 +164,8 @@ def test_people_keep_their_places_and_stand_on_the_floor(truth: Truth, body: Bod
 
 def test_files_of_other_rates_and_lengths_need_a_word(body: Body, tmp_path: Path):
     duo = random_scene(1, 30, 2, torch.Generator().manual_seed(2))
-    a = save_bvh(duo.order(torch.tensor([0])), tmp_path / "a.bvh", body)[0]
-    b = save_bvh(duo.order(torch.tensor([1])).replace(fps=60.0), tmp_path / "b.bvh", body)[0]
+    a = save_bvh(duo.permute_agents(torch.tensor([0])), tmp_path / "a.bvh", body)[0]
+    b = save_bvh(duo.permute_agents(torch.tensor([1])).replace(fps=60.0), tmp_path / "b.bvh", body)[0]
     with pytest.raises(ValueError, match=r"a\.bvh 30 fps, .*b\.bvh 60 fps; bring all to one with --fps 30"):
         load_bvh([a, b], body)
     with pytest.raises(ValueError, match=r"a\.bvh 30 frames, .*b\.bvh 15 frames.*--trim"):
@@ -270,7 +270,7 @@ def test_recorded_dancers_as_bvh_fit_as_well_as_their_own_reader_does(take, cmu_
 
 
 def test_a_single_frame_is_enough(truth: Truth, body: Body, tmp_path: Path):
-    still = Truth(truth.scene.cut(3, 4), truth.world[3:4], truth.joints[3:4])
+    still = Truth(truth.scene.slice(3, 4), truth.world[3:4], truth.joints[3:4])
     found = load_bvh(stranger(still, body, tmp_path / "a.bvh", "rigify"), body, keep_floor=True)
     distance, _ = errors(found, still, body)
     assert found.scene.frames == 1 and distance[LIMBS].max() < 0.015

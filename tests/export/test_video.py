@@ -150,7 +150,7 @@ def test_panels_stand_side_by_side_with_ghosts_behind(duet: Scene, body: Body, p
     for i in range(3):
         panel = image.crop((160 * i, 10, 160 * i + 160, 110))
         assert pixels_like(panel, AGENTS[0]) > 60 and pixels_like(panel, AGENTS[1]) > 60
-    moved = duet.moved(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1.0], [0, 0, 0, 1]]))
+    moved = duet.transformed(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1.0], [0, 0, 0, 1]]))
     assert film(duet, body, ghosts=moved).draw(8).tobytes() != film(duet, body, ghosts=duet).draw(8).tobytes()
 
 
@@ -179,9 +179,9 @@ def test_bad_input_is_named_and_leaves_no_file(duet: Scene, body: Body, tmp_path
     with pytest.raises(ValueError, match=r"context_frames: got 13, expected 0 to 12"):
         render(context=13)
     with pytest.raises(ValueError, match=r"\[11, 12\] frames"):
-        render({"a": duet, "b": duet.cut(0, 11)})
+        render({"a": duet, "b": duet.slice(0, 11)})
     with pytest.raises(ValueError, match="ghosts have 11 frames"):
-        render(ghosts=duet.cut(0, 11))
+        render(ghosts=duet.slice(0, 11))
     T_world_root = duet.T_world_root.clone()
     T_world_root[0, 7, 1, 0, 3] = torch.nan
     with pytest.raises(ValueError, match=r"1 of 12 frames.*the first is frame 7"):

@@ -26,17 +26,17 @@ def train() -> Scene:
 def measured(train: Scene, scenes: Scene, made: Tensor | None = None, agents: Tensor | None = None) -> float:
     """Of futures that are given as scenes, or as joints (S, B, T, P, 22, 3) in the world that all share."""
     metric = NearestTraining(Windows.of([train], BODY, CONTEXT))
-    truth = BODY.joints(aligned(scenes, CONTEXT - 1).cut(CONTEXT))
+    truth = BODY.joints(aligned(scenes, CONTEXT - 1).slice(CONTEXT))
     metric.update(truth[None] if made is None else made, truth, scenes.present, agents)
     return float(metric.compute().get("nearest_training", math.nan))
 
 
 @pytest.mark.parametrize("people", [1, 2, 3])
 def test_a_training_window_is_found_again_moved_and_in_other_slots(train: Scene, people: int) -> None:
-    known = train.pick([5 * people - 4, 5 * people - 1])
-    again = known.order(torch.tensor([2, 0, 1])).moved(somewhere_else(2))
+    known = train.select([5 * people - 4, 5 * people - 1])
+    again = known.permute_agents(torch.tensor([2, 0, 1])).transformed(somewhere_else(2))
     assert measured(train, again) < 1e-5
-    assert measured(train.pick([k for k in range(15) if k not in (5 * people - 4, 5 * people - 1)]), again) > 0.05
+    assert measured(train.select([k for k in range(15) if k not in (5 * people - 4, 5 * people - 1)]), again) > 0.05
 
 
 def slow(train: Scene, made: Tensor, scored: Tensor) -> float:
@@ -47,8 +47,8 @@ def slow(train: Scene, made: Tensor, scored: Tensor) -> float:
             continue
         for order in itertools.permutations(range(people)):
             rest = [slot for slot in range(train.agents) if slot >= people]
-            seen = aligned(train.pick([window]).order(torch.tensor([*order, *rest])), CONTEXT - 1)
-            joints = BODY.joints(seen.cut(CONTEXT))[0]
+            seen = aligned(train.select([window]).permute_agents(torch.tensor([*order, *rest])), CONTEXT - 1)
+            joints = BODY.joints(seen.slice(CONTEXT))[0]
             parts = [
                 float((joints[t, p, j] - made[t, p, j]).square().sum().sqrt())
                 for t in range(0, HORIZON, 3)
@@ -65,7 +65,7 @@ def test_distance_equals_a_plain_loop_over_windows_orders_frames_and_joints(
 ) -> None:
     monkeypatch.setattr(memorisation, "CHUNK", 3)
     scene = wander(1, 2, seed=11)
-    truth = BODY.joints(aligned(scene, CONTEXT - 1).cut(CONTEXT))
+    truth = BODY.joints(aligned(scene, CONTEXT - 1).slice(CONTEXT))
     made = truth + 0.3 * torch.randn(2, *truth.shape, generator=torch.Generator().manual_seed(0))
     scored = torch.ones(HORIZON, 2, dtype=torch.bool)
     scored[4:11, 0] = False
@@ -81,8 +81,8 @@ def test_scenes_of_a_size_that_training_has_not_are_not_measured(train: Scene) -
 
 def test_what_is_not_scored_does_not_count(train: Scene) -> None:
     """A sample that repeats training where it was generated is that near, whatever was given beside it."""
-    known = train.pick([7])
-    truth = BODY.joints(aligned(known, CONTEXT - 1).cut(CONTEXT))
+    known = train.select([7])
+    truth = BODY.joints(aligned(known, CONTEXT - 1).slice(CONTEXT))
     made = truth[None].clone()
     made[:, :, 6:12] += 5.0
     scored = torch.ones(1, HORIZON, 3, dtype=torch.bool)

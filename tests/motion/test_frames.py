@@ -50,7 +50,7 @@ def test_an_unturned_pelvis_faces_z():
 
 @pytest.mark.parametrize("yaw", [0.4, 3.0, -2.2])
 def test_what_tokens_hold_does_not_change_when_the_world_turns_and_shifts(scene: Scene, yaw: float):
-    moved = scene.moved(world_move(yaw, 3.0, -7.0))
+    moved = scene.transformed(world_move(yaw, 3.0, -7.0))
     for before, after in zip(scene_transforms(scene), scene_transforms(moved), strict=True):
         assert torch.allclose(before, after, atol=1e-5)
     assert torch.allclose(pose_features(scene), pose_features(moved), atol=1e-5)
@@ -94,7 +94,7 @@ def test_pose_features_and_canonical_frames_give_the_scene_back(scene: Scene):
 def test_permuting_agents_permutes_everything(scene: Scene):
     order = torch.tensor([2, 0, 1])
     steps, relations = scene_transforms(scene)
-    steps_ordered, relations_ordered = scene_transforms(scene.order(order))
+    steps_ordered, relations_ordered = scene_transforms(scene.permute_agents(order))
     assert torch.equal(steps[:, :, order], steps_ordered)
     table = partners(3)
     for agent in range(3):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.motion.scene import Scene, concatenate, joined
+from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.testing import random_scene
 
 
@@ -43,8 +43,8 @@ def test_concatenated_scenes_come_back_by_picking(scene: Scene, generator):
     other = random_scene(1, 64, 4, generator)
     both = concatenate([scene, other])
     assert (both.scenes, both.agents) == (3, 4)
-    assert torch.equal(both.pick([2]).T_world_root, other.T_world_root)
-    assert torch.equal(both.pick(slice(0, 2)).pad_agents(4).betas[:, :3], scene.betas)
+    assert torch.equal(both.select([2]).T_world_root, other.T_world_root)
+    assert torch.equal(both.select(slice(0, 2)).pad_agents(4).betas[:, :3], scene.betas)
 
 
 def test_repeat_keeps_samples_of_a_scene_together(scene: Scene):
@@ -62,25 +62,25 @@ def told(scene: Scene, generator) -> Scene:
 
 def test_what_was_given_follows_its_frames_people_and_scenes(told: Scene):
     given = told.given
-    assert torch.equal(told.cut(3, 9).given, given[:, 3:9])
-    assert torch.equal(told.picked(torch.tensor([5, 5, 0])).given, given[:, [5, 5, 0]])
-    assert torch.equal(told.order(torch.tensor([2, 0])).given, given[:, :, [2, 0]])
-    assert torch.equal(told.pick([1]).given, given[1:]) and torch.equal(told.repeat(2).given[1], given[0])
-    assert torch.equal(told.held(2).given[:, :3], given[:, [0, 0, 0]])
+    assert torch.equal(told.slice(3, 9).given, given[:, 3:9])
+    assert torch.equal(told.frames_at(torch.tensor([5, 5, 0])).given, given[:, [5, 5, 0]])
+    assert torch.equal(told.permute_agents(torch.tensor([2, 0])).given, given[:, :, [2, 0]])
+    assert torch.equal(told.select([1]).given, given[1:]) and torch.equal(told.repeat(2).given[1], given[0])
+    assert torch.equal(told.pad_frames(2).given[:, :3], given[:, [0, 0, 0]])
     padded = told.pad_agents(4)
     assert torch.equal(padded.given[:, :, :3], given) and not padded.given[:, :, 3].any()
     assert torch.equal(told.people().given[0, :, 0], given[0, :, 0])
-    assert torch.equal(joined([told.cut(0, 20), told.cut(20)]).given, given)
+    assert torch.equal(cat_time([told.slice(0, 20), told.slice(20)]).given, given)
     assert torch.equal(concatenate([told, told]).given[2:], given)
 
 
 def test_what_is_said_of_only_a_part_is_not_said_of_the_whole(scene: Scene, told: Scene):
     assert concatenate([told, scene]).given is None
-    assert joined([told, scene]).given is None
+    assert cat_time([told, scene]).given is None
 
 
 def test_other_frames_forget_what_was_given_and_wrong_shapes_are_named(told: Scene):
-    longer = told.held(4)
+    longer = told.pad_frames(4)
     assert told.replace(body_rot=longer.body_rot, T_world_root=longer.T_world_root).given is None
     assert told.replace(T_world_root=told.T_world_root + 1).given is not None
     with pytest.raises(ValueError, match=r"given: got \(2, 64\), expected \(2, 64, 3\)"):
@@ -99,10 +99,10 @@ def test_arrays_that_a_later_version_adds_are_passed_over(scene: Scene, tmp_path
 
 
 def test_pieces_joined_are_the_whole(scene: Scene):
-    whole = joined([scene.cut(0, 10), scene.cut(10, 11), scene.cut(11)])
+    whole = cat_time([scene.slice(0, 10), scene.slice(10, 11), scene.slice(11)])
     assert torch.equal(whole.T_world_root, scene.T_world_root) and torch.equal(whole.body_rot, scene.body_rot)
-    half = scene.replace(valid=torch.rand(2, 64) > 0.5).cut(0, 10)
-    assert joined([half, scene.cut(10)]).valid[:, 10:].all()
+    half = scene.replace(valid=torch.rand(2, 64) > 0.5).slice(0, 10)
+    assert cat_time([half, scene.slice(10)]).valid[:, 10:].all()
 
 
 def test_absent_agents_are_not_moved(generator):
@@ -110,7 +110,7 @@ def test_absent_agents_are_not_moved(generator):
     scene = random_scene(1, 8, 3, generator, present=present)
     T = torch.eye(4)
     T[0, 3] = 5.0
-    assert torch.equal(scene.moved(T).T_world_root[:, :, 2], scene.T_world_root[:, :, 2])
+    assert torch.equal(scene.transformed(T).T_world_root[:, :, 2], scene.T_world_root[:, :, 2])
 
 
 def test_people_are_everybody_present_alone(generator):
@@ -146,7 +146,7 @@ def test_a_damaged_file_is_refused_by_name(scene, tmp_path):
 
 def test_no_scenes_can_be_picked(scene: Scene):
     for nothing in ([], torch.zeros(2, dtype=torch.bool), slice(0, 0)):
-        assert scene.pick(nothing).scenes == 0
+        assert scene.select(nothing).scenes == 0
 
 
 def test_tensors_of_other_types_are_named(scene: Scene):
@@ -159,6 +159,6 @@ def test_tensors_of_other_types_are_named(scene: Scene):
 
 
 def test_a_scene_in_single_precision_is_itself(scene: Scene):
-    assert scene.single() is scene
-    double = scene.replace(body_rot=scene.body_rot.double())
-    assert double.single().body_rot.dtype == torch.float32 and torch.equal(double.single().body_rot, scene.body_rot)
+    assert scene.to_float32() is scene
+    again = scene.replace(body_rot=scene.body_rot.double()).to_float32()
+    assert again.body_rot.dtype == torch.float32 and torch.equal(again.body_rot, scene.body_rot)

@@ -109,7 +109,7 @@ def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, option
     scene = random_scene(2, 48, people, generator)
     whole = model.generate(scene, task, 8, 40, 1, options, torch.Generator().manual_seed(0))
     known = task.schedule(Grid(12, 4, 2, 3, 8, 2)).known[:, :people].repeat_interleave(4, dim=0)
-    there = whole.order(torch.arange(people))
+    there = whole.permute_agents(torch.arange(people))
     assert torch.equal(there.T_world_root[known.expand(2, -1, -1)], scene.T_world_root[known.expand(2, -1, -1)])
     assert torch.equal(there.body_rot[known.expand(2, -1, -1)], scene.body_rot[known.expand(2, -1, -1)])
     assert there.T_world_root.isfinite().all()
@@ -122,11 +122,11 @@ def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, option
 def test_nothing_jumps_at_the_keyframes_of_the_model_that_ships(task):
     """As it samples by default, but for the number of steps, on a scene that it made and on people it never saw."""
     model, options = Denoiser.load("duet"), SamplerOptions(steps=6)
-    made = Scene.load(weights.FOLDER / "duet" / "scenes" / "duet.npz").cut(0, 64)
-    handshake = Synthetic(test_clips=1).scene("test", 2).scene.cut(0, 64)
+    made = Scene.load(weights.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 64)
+    handshake = Synthetic(test_clips=1).scene("test", 2).scene.slice(0, 64)
     for scene in (made, handshake):
         whole = model.generate(scene, task, 8, 56, 2, options, torch.Generator().manual_seed(0))
-        there = whole.order(torch.arange(scene.agents))
+        there = whole.permute_agents(torch.arange(scene.agents))
         seam, inside = changes(there, there.given[0])
         for what, most in seam.items():
             assert (most < 1.2 * inside[what]).all(), what
@@ -176,7 +176,7 @@ def test_keyframes_without_a_past_place_the_scene(model, options, generator):
     scene = random_scene(2, 48, 2, generator)
     task = Inbetweening(keys=(6,), agents=(0,))
     whole = model.generate(scene, task, 0, 48, 1, options, torch.Generator().manual_seed(0))
-    whole = whole.order(torch.arange(2))
+    whole = whole.permute_agents(torch.arange(2))
     assert torch.equal(whole.T_world_root[:, 24:28, 0], scene.T_world_root[:, 24:28, 0])
     step = (whole.T_world_root[:, 1:, :, :3, 3] - whole.T_world_root[:, :-1, :, :3, 3]).norm(dim=-1)
     assert step[:, 23].max() < 0.5 and step.isfinite().all()
@@ -186,15 +186,15 @@ def test_moving_the_world_moves_what_is_between(model, options, scene):
     T = from_planar(torch.tensor(0.9), torch.tensor([4.0, -2.0]))
     a, b = (
         model.generate(s, Inbetweening(every=5), 8, 40, 1, options, torch.Generator().manual_seed(0))
-        for s in (scene, scene.moved(T))
+        for s in (scene, scene.transformed(T))
     )
-    assert torch.allclose(a.moved(T).T_world_root[:, :, :3], b.T_world_root[:, :, :3], atol=2e-3)
+    assert torch.allclose(a.transformed(T).T_world_root[:, :, :3], b.T_world_root[:, :, :3], atol=2e-3)
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene, task):
     """Placement alone: what is left is the guess of the one step into each keyframe, spread over its gap."""
-    scene = scene.cut(0, 48).pad_agents(4)
+    scene = scene.slice(0, 48).pad_agents(4)
     schedule = task.schedule(Grid(12, 4, 2, 3, 8, 2))
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, options, 1)

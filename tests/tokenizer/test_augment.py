@@ -37,7 +37,7 @@ def test_absent_agents_and_the_pelvis_stay_as_they_are(people, generator):
 
 
 def test_nobody_to_exchange_with_leaves_a_person_alone(people, generator):
-    alone = people.pick([1])
+    alone = people.select([1])
     assert torch.equal(exchange_limbs(alone, 1.0, generator).body_rot, alone.body_rot)
 
 

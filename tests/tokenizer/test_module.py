@@ -72,7 +72,7 @@ def test_encode_and_decode_keep_the_shapes(scene: Scene) -> None:
     pose = tokenizer.decode(latent, *conditions(scene))
     assert pose.shape == (2, 64, 3, 135)
     assert torch.equal(tokenizer.requantise(latent), latent)
-    assert tokenizer.reconstruct(scene.cut(0, 63)).frames == 60
+    assert tokenizer.reconstruct(scene.slice(0, 63)).frames == 60
 
 
 def test_every_latent_is_a_code(scene: Scene) -> None:
@@ -90,7 +90,7 @@ def test_agents_do_not_see_each_other(scene: Scene) -> None:
     tokenizer = tiny(scene).eval()
     order = torch.tensor([2, 0, 1])
     torch.testing.assert_close(
-        tokenizer.encode_scene(scene.order(order)), tokenizer.encode_scene(scene)[:, :, order], **CLOSE
+        tokenizer.encode_scene(scene.permute_agents(order)), tokenizer.encode_scene(scene)[:, :, order], **CLOSE
     )
 
 
@@ -99,7 +99,7 @@ def test_where_a_scene_lies_in_the_world_does_not_matter(scene: Scene) -> None:
     T_new_world = torch.eye(4)
     T_new_world[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.6, 0.8, -0.8, 0.6])
     T_new_world[:3, 3] = torch.tensor([2.0, 0.0, -1.0])
-    seen, moved = features(scene), features(scene.moved(T_new_world))
+    seen, moved = features(scene), features(scene.transformed(T_new_world))
     vectors = [tokenizer._embed(s.pose, s.betas, s.steps, None) for s in (seen, moved)]
     torch.testing.assert_close(vectors[0], vectors[1], rtol=0, atol=1e-3)
 
@@ -121,7 +121,7 @@ def test_causal_tokens_of_a_growing_clip_do_not_change(generator: torch.Generato
     frames = tokenizer.decode(whole, *conditions(scene))
     betas, steps = conditions(scene)
     for tokens in (1, 7, 16):
-        assert torch.equal(tokenizer.encode_scene(scene.cut(0, 4 * tokens)), whole[:, :tokens])
+        assert torch.equal(tokenizer.encode_scene(scene.slice(0, 4 * tokens)), whole[:, :tokens])
         prefix = tokenizer.decode(whole[:, :tokens], betas, steps[:, :tokens])
         torch.testing.assert_close(prefix, frames[:, : 4 * tokens], **CLOSE)
 
@@ -130,7 +130,7 @@ def test_symmetric_tokens_do_look_ahead(generator: torch.Generator) -> None:
     """Why a context must be cut out before it is encoded."""
     scene = random_scene(1, 64, 1, generator)
     tokenizer = tiny(scene).eval()
-    seen, cut = features(scene), features(scene.cut(0, 32))
+    seen, cut = features(scene), features(scene.slice(0, 32))
     whole = tokenizer._embed(seen.pose, seen.betas, seen.steps, None)[:, :8]
     assert (whole - tokenizer._embed(cut.pose, cut.betas, cut.steps, None)).abs().max() > 1e-3
 
@@ -167,7 +167,7 @@ def test_absent_agents_and_bad_frames_change_nothing(scene: Scene, generator: to
 
 def test_statistics_are_those_of_the_people_present(scene: Scene) -> None:
     tokenizer = tiny()
-    tokenizer.set_statistics([scene.pick([0]), scene.pick([1])])
+    tokenizer.set_statistics([scene.select([0]), scene.select([1])])
     pose = pose_features(scene).flatten(0, -2).double()
     torch.testing.assert_close(tokenizer.vqvae.pose.mean, pose.mean(0).float(), rtol=1e-4, atol=1e-5)
     std = pose.std(0, unbiased=False).clamp(min=1e-2).float()
@@ -375,10 +375,10 @@ def test_nothing_in_nothing_out():
     scene = random_scene(2, 16, 2, torch.Generator().manual_seed(0))
     nobody = torch.tensor([], dtype=torch.long)
     for empty, shape in [
-        (scene.pick([]), (0, 4, 2)),
-        (scene.order(nobody), (2, 4, 0)),
-        (scene.cut(0, 0), (2, 0, 2)),
-        (scene.cut(0, 3), (2, 0, 2)),
+        (scene.select([]), (0, 4, 2)),
+        (scene.permute_agents(nobody), (2, 4, 0)),
+        (scene.slice(0, 0), (2, 0, 2)),
+        (scene.slice(0, 3), (2, 0, 2)),
     ]:
         assert tokenizer.encode_scene(empty).shape == (*shape, tokenizer.latent)
         again = tokenizer.reconstruct(empty)

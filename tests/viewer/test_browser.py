@@ -27,7 +27,7 @@ def test_files_play_pause_step_and_scrub(page, panel, handshake, body) -> None:
     takes = [take("handshake", handshake, 32)]
     behind = torch.eye(4)
     behind[2, 3] = -0.9
-    truth = take("truth", handshake.moved(behind))
+    truth = take("truth", handshake.transformed(behind))
     with watched(page, takes, body, truth) as viewer:
         first = viewer.shown
         wait(lambda: viewer.shown != first)
@@ -82,7 +82,7 @@ def test_without_a_truth_there_are_no_ghosts_and_the_panel_says_so(page, panel, 
 
 
 def test_every_format_is_downloaded(page, panel, handshake, body, tmp_path) -> None:
-    takes = [take("dance", handshake.cut(40, 64), 8)]
+    takes = [take("dance", handshake.slice(40, 64), 8)]
     begins = {"npz": b"PK", "bvh": b"PK", "glb": b"glTF", "csv": b"scene,frame", "gif": b"GIF8", "png": b"\x89PNG"}
     begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00"}
     files = {}
@@ -106,7 +106,7 @@ def test_what_cannot_be_saved_is_said_and_nothing_is_downloaded(page, panel, han
     monkeypatch.setattr(stage, "saved", refuses)
     files = []
     page.on("download", lambda download: files.append(download))
-    with watched(page, [take("dance", handshake.cut(40, 64))], body, style="skeleton"):
+    with watched(page, [take("dance", handshake.slice(40, 64))], body, style="skeleton"):
         page.get_by_text("Save", exact=True).click()
         panel.press("Download")
         notice = page.get_by_role("alert").filter(has_text="magnet-motion[video]")

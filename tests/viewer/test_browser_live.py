@@ -53,7 +53,7 @@ def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, pa
         page.get_by_text("Save", exact=True).click()
         saved = Scene.load(panel.downloaded("npz", "scene.npz", tmp_path))
         assert saved.agents == 3 and saved.frames >= FIRST
-        assert torch.equal(saved.T_world_root, live.scene.cut(0, saved.frames).T_world_root)
+        assert torch.equal(saved.T_world_root, live.scene.slice(0, saved.frames).T_world_root)
 
 
 def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(page, panel, body) -> None:

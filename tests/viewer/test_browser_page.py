@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 def test_the_page_plays_scrubs_and_changes_its_look_without_any_network(page, handshake, body, tmp_path) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
-    path = save_html(handshake, tmp_path / "a.html", body, context=32, truth=handshake.cut(0, 60), title="Two people")
+    path = save_html(handshake, tmp_path / "a.html", body, context=32, truth=handshake.slice(0, 60), title="Two people")
     page.goto(path.as_uri())
     page.wait_for_function("window.player && player.drawn > 2")
     start = page.evaluate("player.time")

@@ -76,7 +76,7 @@ def test_the_page_asks_for_nothing_from_elsewhere(duet: Scene, body: Body) -> No
 
 
 def test_context_truth_and_title_are_there(duet: Scene, body: Body) -> None:
-    meta, arrays = contents(page(duet, body, context=8, truth=duet.cut(0, 12), title="</script><b>"))
+    meta, arrays = contents(page(duet, body, context=8, truth=duet.slice(0, 12), title="</script><b>"))
     assert [person["ghost"] for person in meta["people"]] == [False, False, True, True]
     known = arrays["known"].reshape(24, 4)
     assert known[:8, :2].all()
@@ -112,7 +112,7 @@ def test_several_scenes_stand_side_by_side_and_share_their_meshes(duet: Scene, b
     given = torch.zeros(1, 24, 2, dtype=torch.bool)
     given[:, :8, 1] = True
     samples = duet.replace(given=given).repeat(3)
-    meta, arrays = contents(page(samples, body, truth=duet.cut(0, 12), title="dance"))
+    meta, arrays = contents(page(samples, body, truth=duet.slice(0, 12), title="dance"))
     assert meta["takes"] == ["dance · 1", "dance · 2", "dance · 3"]
     assert [(person["take"], person["ghost"]) for person in meta["people"]] == [
         (take, ghost) for take in range(3) for ghost in (False, False, True, True)
@@ -129,7 +129,7 @@ def test_several_scenes_stand_side_by_side_and_share_their_meshes(duet: Scene, b
 
 
 def test_takes_of_several_lengths_and_people_share_a_page(duet: Scene, body: Body) -> None:
-    short = duet.cut(0, 10).order(torch.tensor([1])).replace(given=torch.ones(1, 10, 1, dtype=torch.bool))
+    short = duet.slice(0, 10).permute_agents(torch.tensor([1])).replace(given=torch.ones(1, 10, 1, dtype=torch.bool))
     meta, arrays = contents(page([take("long", duet), take("short", short)], body))
     assert (meta["frames"], [person["take"] for person in meta["people"]]) == (24, [0, 0, 1])
     turns = arrays["turns"].reshape(24, 3, 22, 4)

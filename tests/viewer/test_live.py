@@ -40,7 +40,7 @@ def test_pieces_go_on_from_what_was_there(live: Live) -> None:
     piece = live.advance()
     assert (piece.start, piece.frames) == (FIRST, live.settings.piece)
     assert live.scene.frames == FIRST + piece.frames
-    assert torch.equal(live.scene.cut(0, FIRST).T_world_root, before.T_world_root)
+    assert torch.equal(live.scene.slice(0, FIRST).T_world_root, before.T_world_root)
     step = live.scene.T_world_root[0, :, :, :3, 3].diff(dim=0).norm(dim=-1)
     assert step[FIRST - 1].max() <= 3 * step.median() + 0.2  # nobody jumps at the seam
 
@@ -71,7 +71,7 @@ def test_same_seed_same_motion(model) -> None:
 
 def test_restart_forgets_whole_tokens_after_a_frame(live: Live) -> None:
     live.advance()
-    kept = live.scene.cut(0, 48)
+    kept = live.scene.slice(0, 48)
     assert live.restart(50) == 48
     assert torch.equal(live.scene.T_world_root, kept.T_world_root)
     assert live.restart(3) == CONTEXT
@@ -118,7 +118,7 @@ def test_who_is_steered_comes_nearer_and_the_others_are_generated_from_that(live
 def test_a_partners_recording_is_given_as_it_is(model) -> None:
     generator = torch.Generator().manual_seed(2)
     recorded = random_scene(1, 80, 2, generator)
-    live = Live(model, start=recorded.cut(0, 40), partner=recorded, generator=generator)
+    live = Live(model, start=recorded.slice(0, 40), partner=recorded, generator=generator)
     live.settings.task, live.settings.steps = "motion_control", 2
     live.advance()
     torch.testing.assert_close(live.scene.T_world_root[:, 40:56, 1], recorded.T_world_root[:, 40:56, 1])
@@ -139,7 +139,7 @@ def test_a_live_scene_says_what_the_model_did_not_make(model, live: Live) -> Non
     live.advance()
     assert live.scene.given[0, FIRST:].nonzero().tolist() == [[REACH - 4 + t, 1] for t in range(4)]
     recorded = random_scene(1, 80, 2, torch.Generator().manual_seed(2))
-    led = Live(model, start=recorded.cut(0, 40), partner=recorded, generator=torch.Generator().manual_seed(2))
+    led = Live(model, start=recorded.slice(0, 40), partner=recorded, generator=torch.Generator().manual_seed(2))
     led.settings.task, led.settings.steps = "motion_control", 2
     led.advance()
     assert led.scene.given[0, :40].all() and led.scene.given[0, 40:].all(dim=0).tolist() == [False, True]
@@ -185,7 +185,7 @@ def test_in_betweening_goes_through_every_keyframe_and_keeps_what_comes_before(l
     assert (piece.between, piece.start, piece.frames) == (True, 72 - REACH, 124 - 72 + REACH)
     scene = live.scene
     assert scene.frames == 124 and not live.asked
-    assert torch.equal(scene.cut(0, 40).T_world_root, before.cut(0, 40).T_world_root)
+    assert torch.equal(scene.slice(0, 40).T_world_root, before.slice(0, 40).T_world_root)
     wanted = with_keyframes(scene, [first, last])
     torch.testing.assert_close(scene.T_world_root, wanted.T_world_root, atol=1e-4, rtol=0)
     torch.testing.assert_close(scene.body_rot, wanted.body_rot, atol=1e-4, rtol=0)

@@ -36,7 +36,7 @@ def test_recording_changes_nothing_of_the_sample(model, start, task, kind) -> No
     options = SamplerOptions(steps=3, guidance=Guidance(kind))
     recording = record(model, start, task, 16, 16, options, generator())
     plain = model.generate(start, task, 16, 16, options=options, generator=generator())
-    torch.testing.assert_close(recording.scene.T_world_root, plain.order(torch.arange(2)).T_world_root)
+    torch.testing.assert_close(recording.scene.T_world_root, plain.permute_agents(torch.arange(2)).T_world_root)
     assert bool(recording.estimates.T_world_root.isfinite().all())
 
 

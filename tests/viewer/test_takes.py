@@ -31,7 +31,7 @@ def test_smplx_files_are_shown_where_they_were_written_from(tmp_path: Path, duet
 
 def test_absent_people_are_not_shown_and_the_others_keep_their_slots(scene: Scene) -> None:
     present = torch.tensor([[True, False, True]])
-    shown = take("x", scene.pick([0]).replace(present=present))
+    shown = take("x", scene.select([0]).replace(present=present))
     assert shown.slots == (0, 2)
     assert shown.scene.agents == 2
 
@@ -48,7 +48,7 @@ def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scen
 
 
 def test_same_length_cuts_or_holds(duet: Scene) -> None:
-    short, long = take("a", duet.cut(0, 10)), take("b", duet)
+    short, long = take("a", duet.slice(0, 10)), take("b", duet)
     assert same_length(long, short).frames == 10
     held = same_length(short, long)
     assert held.frames == 24

@@ -37,8 +37,8 @@ def test_it_says_what_it_was_trained_on_and_names_no_machine():
 
 @pytest.mark.parametrize("people", [1, 2, 3, 4])
 def test_it_generates_groups_of_one_to_four(model, people):
-    scene = Synthetic(people=[max(people, 2)], test_clips=1).clips("test")[0].scene.cut(0, 32)
-    scene = scene.order(torch.arange(people))
+    scene = Synthetic(people=[max(people, 2)], test_clips=1).clips("test")[0].scene.slice(0, 32)
+    scene = scene.permute_agents(torch.arange(people))
     options = SamplerOptions(steps=4)
     whole = model.generate(scene, JointFuture(), 32, 32, 1, options, torch.Generator().manual_seed(0))
     assert whole.present.sum() == people
@@ -66,11 +66,11 @@ def test_it_has_learnt_the_coupling_of_a_circle_dance(model):
     errors = []
     for i in range(4):
         made = data.scene("test", i)
-        context = made.scene.cut(0, 32)
+        context = made.scene.slice(0, 32)
         options = SamplerOptions(steps=20)
         whole = model.generate(context, JointFuture(), 32, 90, 1, options, torch.Generator().manual_seed(i))
-        joints = data.body.joints(whole.cut(32))[0][:, :3]
-        still = data.body.joints(context.cut(31).cut(0, 1))[0].expand(90, -1, -1, -1)
+        joints = data.body.joints(whole.slice(32))[0][:, :3]
+        still = data.body.joints(context.slice(31).slice(0, 1))[0].expand(90, -1, -1, -1)
         mine, held = (coupling_error("circle", j, made.truth, start=32 / 30) for j in (joints, still))
         errors.append((abs(mine["omega"]), abs(held["omega"])))
     model_error, held_error = (sum(e) / len(errors) for e in zip(*errors, strict=True))

@@ -301,7 +301,7 @@ def check_cmu(data: CMU) -> Checked:
             flags = _flags(clip.scene, data.body)
             found.notes += [f"{clip.name}, {said}" for said in check_people.words(flags, (), 30.0, met=False)]
         seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
-        found.scenes += [(clip.name, clip.scene.cut(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
+        found.scenes += [(clip.name, clip.scene.slice(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
     found.scenes = found.scenes[:SHOWN]
     takes = data.takes()
     reports = [report for take in takes if "frames" in (report := data.report(take))]
@@ -337,7 +337,7 @@ def draw(found: Checked, path: Path, body: Body | None) -> Path | None:
     if not found.scenes:
         return None
     frames = min(scene.frames for _, scene in found.scenes)
-    scenes = [(name, scene.cut(0, frames)) for name, scene in found.scenes]
+    scenes = [(name, scene.slice(0, frames)) for name, scene in found.scenes]
     title = found.title
     if body is None or body.id != scenes[0][1].body:
         body = load_body()

@@ -37,7 +37,7 @@ class Track(Protocol):
     @property
     def frames(self) -> int: ...
 
-    def cut(self, start: int, stop: int) -> Self:
+    def slice(self, start: int, stop: int) -> Self:
         """Frames `start:stop`."""
         ...
 
@@ -220,7 +220,7 @@ class OwnReader(Reader, Generic[T]):
             lengths = ", ".join(f"{n or p} {t.frames}" for p, (n, t) in enumerate(zip(names, tracks, strict=True)))
             notes.append(f"unequal numbers of frames ({lengths}), cut to the shortest")
         start, stop = (0, frames) if part is None else span(part, frames, tracks[0].fps)
-        tracks = [track.cut(start, stop) for track in tracks]
+        tracks = [track.slice(start, stop) for track in tracks]
         return self.recording(group.scene, tracks, names, notes)
 
     def _meant(self, take: Take) -> tuple[Group, Split | None]:
@@ -271,7 +271,7 @@ def _from_latest(tracks: list[T], starts: list[float], group: Group) -> list[T]:
                 f"{group.seats[0].file}: people of {group.scene} never overlap: one begins at {latest:g} s, another "
                 f"ends at {ends:g} s; mend the starts in the table"
             )
-        cut.append(track.cut(skipped, track.frames))
+        cut.append(track.slice(skipped, track.frames))
     return cut
 
 

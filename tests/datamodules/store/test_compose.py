@@ -61,7 +61,7 @@ def test_a_group_moves_as_one_on_the_floor(groups: tuple[Scene, Tensor, Tensor])
 
 def test_absent_agents_neither_push_nor_move(groups: tuple[Scene, Tensor, Tensor]) -> None:
     scene, placing, second = groups
-    scene = scene.cut(0).replace(present=torch.tensor([True, True, False, False]).expand(200, 4))
+    scene = scene.slice(0).replace(present=torch.tensor([True, True, False, False]).expand(200, 4))
     placed = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
     elsewhere = scene.T_world_root.clone()
     elsewhere[:, :, 2:, :3, 3] += 5.0

@@ -59,9 +59,9 @@ def test_people_stand_in_the_order_of_roles(with_roles, resident):
     assert 0 < sum(leader) < len(leader)
     for b, slot in enumerate(leader):
         for found, first in ((leads, slot), (follows, 1 - slot)):
-            wanted = recorded.pick([b]).order(torch.tensor([first, 1 - first]))
-            assert torch.equal(found.pick([b]).T_world_root, wanted.T_world_root)
-            assert torch.equal(found.pick([b]).betas, wanted.betas)
+            wanted = recorded.select([b]).permute_agents(torch.tensor([first, 1 - first]))
+            assert torch.equal(found.select([b]).T_world_root, wanted.T_world_root)
+            assert torch.equal(found.select([b]).betas, wanted.betas)
 
 
 def test_mixed_reads_stores_by_memory_map_and_no_clip_whole(store, with_roles, monkeypatch):
