@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 
 FPS = 30.0
 
-BODY_LOSSES = ("pose", "motion", "partner")
+BODY_LOSSES = ("pose", "motion", "partner", "hands")
+
+WRISTS = [20, 21]
+
+WITHIN_REACH = 0.4
+"""Metres: only wrists that were recorded nearer to each other than this count in `hands`."""
 
 Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
 """latent (B, N, P, C), betas (B, P, 10), steps (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
@@ -99,7 +104,8 @@ def body_losses(
 
     Returns:
         pose: distance of joints in one's own canonical frame, metres. motion: error of the joints' velocities over
-        the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres.
+        the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres. hands: error
+        of the vectors from one's own wrists to a partner's that were recorded within reach, metres.
     """
     latent, steps, relations = layout.unpack(tokens)
     _, true_steps, true_relations = layout.unpack(truth)
@@ -120,7 +126,18 @@ def body_losses(
         seen_real = moved(relations_by_frame(true_relations), real[:, :, other])
         least = torch.minimum(weight[..., None], weight[:, :, other])
         losses["partner"] = masked_mean(least * _mean_length(seen - seen_real), counts[..., 1:])
+        reach, real_reach = _between_wrists(mine, seen), _between_wrists(real, seen_real)
+        near = counts[..., 1:, None, None] & (real_reach.norm(dim=-1) < WITHIN_REACH)
+        losses["hands"] = masked_mean(least[..., None, None] * length(reach - real_reach), near)
     return losses
+
+
+def _between_wrists(mine: Tensor, seen: Tensor) -> Tensor:
+    """Vectors from each of one's own wrists to each of a partner's, from joints in one's own frame.
+
+    mine (B, T, P, 22, 3), seen (B, T, P, P - 1, 22, 3) -> (B, T, P, P - 1, 2, 2, 3)
+    """
+    return seen[..., None, WRISTS, :] - mine[:, :, :, None, WRISTS, None, :]
 
 
 def _mean_length(away: Tensor) -> Tensor:

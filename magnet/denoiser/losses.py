@@ -81,6 +81,36 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     return masked_mean(rotation, both), masked_mean(translation, both)
 
 
+NEAR = 0.3
+"""Metres that are added to a distance before an error is divided by it: nearer people's errors count alike."""
+
+FINE_GROUND, FINE_YAW = 0.02, 0.05
+"""Metres and radians below which an error of a pairwise transform counts by its square."""
+
+
+def near_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, levels: Tensor) -> Tensor:
+    """Error of pairwise transforms where centimetres near a partner count (ours).
+
+    Metres over the ground, divided by `NEAR` + the recorded distance, and the same of radians; each weighted by the
+    share of signal that was shown, for what noise has drowned is a matter of chance.
+
+    clean, truth (B, N, P, D) in real units, there as in `token_losses`, levels (B, N, P, 1 + slots) of the groups -> ()
+    """
+    turn, shift = _planar(layout.unpack(clean)[2])  # (B, N, P, P - 1, 4, 2)
+    true_turn, true_shift = _planar(layout.unpack(truth)[2])
+    away = (shift - true_shift).square().sum(-1)
+    apart = _multiply(_conjugate(true_turn), turn)
+    angle = torch.atan2(apart[..., 1], apart[..., 0]).square()
+    error = _soft_length(away, FINE_GROUND) + _soft_length(angle, FINE_YAW)
+    signal = alpha_bar(levels[..., 1:])[..., None]
+    return masked_mean(signal * error / (NEAR + true_shift.norm(dim=-1)), there[..., 1:, None])
+
+
+def _soft_length(square: Tensor, fine: float) -> Tensor:
+    """Length less a little, about quadratic below `fine`, from its square. (...) -> (...)"""
+    return (square + fine**2).sqrt() - fine
+
+
 def _planar(nine: Tensor) -> tuple[Tensor, Tensor]:
     """Unit (cos, sin) of the yaw and ground shift (x, z) of nine numbers. (..., 9) -> (..., 2) x 2"""
     turn = torch.stack([nine[..., 0], -nine[..., 2]], dim=-1)

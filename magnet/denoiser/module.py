@@ -74,15 +74,20 @@ class Denoiser(L.LightningModule):
         latent_weight: lambda_0 of paper Eq. 10.
         step_weight: lambda_1 of paper Eq. 10.
         relation_weight: lambda_2 of paper Eq. 10.
+        near_weight: adds the error of pairwise transforms in which centimetres near a partner count (ours); see
+            `magnet.denoiser.losses.near_loss`.
         consistency_weight: lambda_3 of paper Eq. 10, for rotation and translation alike.
         consistency_warmup: steps over which lambda_3 grows from 0.
         pose_weight: adds the distance of decoded joints in metres to the loss (ours); see `body_losses`.
         motion_weight: adds the error of decoded joints' velocities in m/s (ours).
         partner_weight: adds the distance of the partners' decoded joints, as each sees them, in metres (ours).
-        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these three.
+        hands_weight: adds the error of vectors between people's wrists within reach, in metres (ours).
+        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these four.
         start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
             starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalised.
         std_floor: smallest standard deviation used for z-scores.
+        pairwise_metres: metres in a pairwise transform that count as one when tokens are normalised (ours): the
+            smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
         warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
@@ -118,14 +123,17 @@ class Denoiser(L.LightningModule):
         latent_weight: float = 1.0,
         step_weight: float = 1.0,
         relation_weight: float = 1.0,
+        near_weight: float = 0.0,
         consistency_weight: float = 0.1,
         consistency_warmup: int = 1000,
         pose_weight: float = 0.0,
         motion_weight: float = 0.0,
         partner_weight: float = 0.0,
+        hands_weight: float = 0.0,
         decoded_share: float = 0.25,
         start_from: str | None = None,
         std_floor: float = 1e-2,
+        pairwise_metres: float = 0.0,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
         warmup_steps: int = 1000,
@@ -156,7 +164,7 @@ class Denoiser(L.LightningModule):
         h: Any = self.hparams
         self.tokenizer = tokenizer.requires_grad_(False).eval()
         self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.relations, h.relation_noise)
-        self.statistics = Statistics(self.layout, h.std_floor)
+        self.statistics = Statistics(self.layout, h.std_floor, h.pairwise_metres)
         self.transformer = Transformer(
             self.layout,
             width=h.width,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.levels import draw_levels
-from magnet.denoiser.losses import consistency_losses, snr_weights, token_losses
+from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
 from magnet.denoiser.own_past import with_own_past
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import add_noise
@@ -38,10 +38,14 @@ def training_losses(model: Denoiser, scene: Scene, generator: torch.Generator) -
     losses = token_losses(clean, truth, layout, there, weights)
     total = h.latent_weight * losses["latent"] + h.step_weight * losses["step"]
     if layout.slots:
-        rotation, translation = consistency_losses(model.statistics.restore(clean), layout, there)
+        predicted = model.statistics.restore(clean)
+        rotation, translation = consistency_losses(predicted, layout, there)
         losses["consistency"] = rotation + translation
         ramp = min(1.0, (model.global_step + 1) / max(h.consistency_warmup, 1)) if model.training else 1.0
         total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
+        if h.near_weight:
+            losses["near"] = near_loss(predicted, tokens, layout, there, group_levels)
+            total = total + h.near_weight * losses["near"]
     if any(h[f"{name}_weight"] for name in BODY_LOSSES):
         bodies = decoded_losses(model, clean, tokens, levels, scene.pad_agents(P), there, model.require_body())
         total = total + sum(h[f"{name}_weight"] * value for name, value in bodies.items())

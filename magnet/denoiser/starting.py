@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from magnet import weights
 from magnet.tokenizer.module import RawPose, Tokenizer
@@ -65,6 +65,18 @@ def start_from(model: Denoiser, path: str | Path) -> None:
     same = theirs.keys() == mine.keys() and all(torch.equal(value, mine[name].cpu()) for name, value in theirs.items())
     if same:
         model.statistics.load_state_dict(_part(state, "statistics."))
+        _rescale(model)
+
+
+@torch.no_grad()
+def _rescale(model: Denoiser) -> None:
+    """Another scale of pairwise transforms, with weights that make the same of it."""
+    grown = model.statistics.set_pairwise_metres()
+    first, last = model.transformer.enter[0], model.transformer.leave
+    assert isinstance(first, nn.Linear)
+    first.weight[:, : len(grown)].mul_(grown)
+    last.weight.div_(grown[:, None])
+    last.bias.div_(grown)
 
 
 def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -19,16 +19,18 @@ class Statistics(Float32):
     Args:
         layout: what a token holds.
         floor: smallest standard deviation; six of the nine numbers are nearly constant.
+        pairwise_metres: metres that count as one over the ground in pairwise transforms; 0: their standard deviation.
     """
 
     mean: Tensor
     std: Tensor
     count: Tensor
 
-    def __init__(self, layout: TokenLayout, floor: float = 1e-2) -> None:
+    def __init__(self, layout: TokenLayout, floor: float = 1e-2, pairwise_metres: float = 0.0) -> None:
         super().__init__()
         self.layout = layout
         self.floor = floor
+        self.pairwise_metres = pairwise_metres
         self.register_buffer("mean", torch.zeros(layout.width))
         self.register_buffer("std", torch.ones(layout.width))
         self.register_buffer("count", torch.zeros((), dtype=torch.long))
@@ -61,4 +63,18 @@ class Statistics(Float32):
             std.append(one_std.repeat(STRIDE * repeats))
         self.mean.copy_(torch.cat(mean))
         self.std.copy_(torch.cat(std))
+        self.set_pairwise_metres()
         self.count.fill_(int(own.sum()))
+
+    def set_pairwise_metres(self) -> Tensor:
+        """Put the wished scale in place of the measured one. -> how many times each number's deviation grew (D,)"""
+        before = self.std.clone()
+        if self.pairwise_metres:
+            self.std[self.pairwise_ground()] = self.pairwise_metres
+        return self.std / before
+
+    def pairwise_ground(self) -> Tensor:
+        """Which numbers of a token are ground positions of pairwise transforms. (D,) bool"""
+        pairs = self.layout.groups(self.std.device) > 0
+        place = torch.arange(self.layout.width, device=self.std.device) - self.layout.latent
+        return pairs & ((place % 9 == 6) | (place % 9 == 8))

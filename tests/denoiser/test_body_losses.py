@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.body import load_body
-from magnet.denoiser.body_losses import BODY_LOSSES, body_losses, surest
+from magnet.denoiser.body_losses import BODY_LOSSES, WITHIN_REACH, body_losses, surest
 from magnet.denoiser.starting import start_from
 from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
@@ -65,6 +65,38 @@ def test_the_terms_are_distances_and_speeds_of_joints(body, generator):
     pairs = [(of, by) for of in range(3) for by in range(3) if of != by]
     seen_away = torch.stack([(local(0, of, by) - local(1, of, by)).norm(dim=-1) for of, by in pairs])
     assert got["partner"] == pytest.approx(float(seen_away.mean()), rel=1e-4)
+    assert got["hands"] == 0, "nobody was recorded within reach"
+
+
+def test_hands_are_vectors_between_wrists_that_were_recorded_within_reach(body, generator):
+    real = random_scene(1, 16, 2, generator)
+    seen = random_scene(1, 16, 2, generator).replace(betas=real.betas)
+    seen, real = (scene.pad_agents(3) for scene in (seen, real))
+
+    def between(scene: Scene) -> torch.Tensor:
+        """World vectors from each wrist of 0 to each of 1. (T, 2, 2, 3)"""
+        joints = body.joints(scene)[0]
+        return joints[:, 1, None, 20:22] - joints[:, 0, 20:22, None]
+
+    def brought_near(scene: Scene) -> Scene:
+        """The second one's left wrist at the first one's right in the first frame."""
+        shift = torch.eye(4).repeat(3, 1, 1)
+        shift[1, :3, 3] = -between(scene)[0, 1, 0] * torch.tensor([1.0, 0.0, 1.0])
+        return scene.replace(T_world_root=shift @ scene.T_world_root)
+
+    real = brought_near(real)
+    near = between(real).norm(dim=-1) < WITHIN_REACH
+    assert near.any() and not near.all()
+    got = run(body, seen, real, there=LAYOUT.group_present(seen.present)[:, None].expand(1, 4, 3, 3))["hands"]
+    expected = []
+    for by, sign in ((0, 1.0), (1, -1.0)):
+        turned = [inverse(canonical_frame(s.T_world_root))[0, :, by, None, None, :3, :3] for s in (seen, real)]
+        away = sum(
+            k * (R @ (sign * between(s))[..., None])[..., 0]
+            for k, R, s in zip((1.0, -1.0), turned, (seen, real), strict=True)
+        )
+        expected.append(away.norm(dim=-1)[near])
+    assert got == pytest.approx(float(torch.cat(expected).mean()), rel=1e-3)
 
 
 def test_noisy_tokens_count_less_and_absent_agents_not_at_all(body, generator):
@@ -93,6 +125,31 @@ def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
     assert all(weight.grad is not None for weight in model.transformer.blocks.parameters())
     assert all(weight.grad is None for weight in model.tokenizer.parameters())
     assert not [name for name in model.state_dict() if name.startswith("body")], "a body is no part of a checkpoint"
+
+
+def test_another_scale_of_pairwise_transforms_starts_as_the_same_model(tmp_path):
+    """What it makes of clean tokens is the same in metres, and noise hides fewer of them."""
+    first, second = tiny_denoiser(seed=1), tiny_denoiser(seed=2, pairwise_metres=0.25)
+    first.statistics.std.copy_(torch.rand(first.layout.width) + 0.5)
+    first.statistics.count.fill_(1)
+    checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
+    first.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "first.ckpt")
+    second.tokenizer.load_state_dict(first.tokenizer.state_dict())
+    start_from(second, tmp_path / "first.ckpt")
+    ground = second.statistics.pairwise_ground()
+    assert int(ground.sum()) == 2 * 4 * second.layout.slots
+    assert torch.all(second.statistics.std[ground] == 0.25)
+    assert torch.equal(second.statistics.std[~ground], first.statistics.std[~ground])
+    scene = random_scene(2, 32, first.layout.agents, torch.Generator().manual_seed(0))
+    made = []
+    for model in (first.eval(), second.eval()):
+        tokens, _ = model.tokenize(scene)
+        levels = torch.zeros(tokens.shape[:3], dtype=torch.long)
+        with torch.no_grad():
+            clean = model.denoise(model.statistics.normalise(tokens), levels, scene.present)
+        made.append(model.statistics.restore(clean))
+    assert torch.allclose(made[0], made[1], atol=1e-4)
 
 
 def test_a_denoiser_starts_from_anothers_weights(tmp_path):

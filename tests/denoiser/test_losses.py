@@ -3,11 +3,12 @@ import math
 import pytest
 import torch
 
-from magnet.denoiser.losses import consistency_losses, snr_weights, token_losses
-from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, pairwise, propagated
+from magnet.denoiser.losses import FINE_GROUND, FINE_YAW, NEAR, consistency_losses, near_loss, snr_weights, token_losses
+from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, from_planar, pairwise, propagated, to_9d
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import TokenLayout, scene_transforms
+from magnet.motion.tokens import TokenLayout, relations_by_token, scene_transforms
+from magnet.sampling.noise import alpha_bar
 
 LAYOUT = TokenLayout(latent=8, agents=3)
 
@@ -101,3 +102,23 @@ def test_weights_count_each_group_of_a_token_by_its_own(scene: Scene):
     assert losses["relation"].item() == pytest.approx(1.5 * 0.5 / 6)
     ones = token_losses(truth + 2.0, truth, LAYOUT, there, torch.ones_like(weights))
     assert ones == token_losses(truth + 2.0, truth, LAYOUT, there)
+
+
+def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_shown(scene: Scene, generator):
+    truth = packed(scene)
+    pairs = canonical_frame(scene.T_world_root)
+    turned, moved = 0.3, torch.tensor([0.03, 0.04])
+    offset = from_planar(torch.tensor(turned), torch.zeros(2))
+    T_self_partner = pairwise(pairs) @ offset
+    T_self_partner[..., [0, 2], 3] += moved
+    latent, steps, _ = LAYOUT.unpack(truth)
+    clean = LAYOUT.pack(latent, steps, relations_by_token(to_9d(T_self_partner)))
+    distance = pairwise(pairs)[..., [0, 2], 3].norm(dim=-1)
+    off = math.hypot(0.05, FINE_GROUND) - FINE_GROUND + math.hypot(turned, FINE_YAW) - FINE_YAW
+    levels = torch.full((*truth.shape[:3], 3), 300)
+    expected = alpha_bar(torch.tensor(300)) * (off / (NEAR + distance)).mean()
+    got = near_loss(clean, truth, LAYOUT, everybody(scene), levels)
+    assert got == pytest.approx(float(expected), rel=1e-3)
+    assert near_loss(truth, truth, LAYOUT, everybody(scene), levels) < 1e-4
+    assert near_loss(clean, truth, LAYOUT, torch.zeros_like(everybody(scene)), levels) == 0
+    assert near_loss(clean, truth, LAYOUT, everybody(scene), torch.full_like(levels, 1000)) < 1e-6

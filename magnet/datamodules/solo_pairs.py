@@ -1,0 +1,172 @@
+"""Recorded single people put in pairs: real motion whose coupling is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from magnet.body.mirror import mirror_scene
+from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
+from magnet.motion.scene import Scene
+from magnet.seeding import derive
+
+SHORTEST = 48
+"""Frames that a pair has at least, after a follower's delay."""
+TRIES = 8
+"""How often another distance is tried where the two come too close, before a clip is left out."""
+
+Place = Callable[[Scene, Tensor, Tensor, Tensor], Scene]
+"""solo (1, T, 1), its T_world_mid (4, 4) in the middle frame, distance in metres, side -1 or 1 -> the partner"""
+
+
+def _ground(x: Tensor | float, z: Tensor | float, yaw: float = 0.0) -> Tensor:
+    return from_planar(torch.tensor(yaw), torch.stack([torch.as_tensor(x), torch.as_tensor(z)]))
+
+
+def _mirror(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
+    """The mirror image, seen in a wall half the distance ahead."""
+    # mirror_scene reflects x: the wall's frame has its x axis along the person's heading.
+    T_world_wall = T_world_mid @ _ground(0.0, distance / 2, torch.pi / 2)
+    return mirror_scene(solo.transformed(inverse(T_world_wall))).transformed(T_world_wall)
+
+
+def _opposite(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
+    """The same motion turned by half a turn about a point ahead: both circle it."""
+    return solo.transformed(T_world_mid @ _ground(0.0, distance, torch.pi) @ inverse(T_world_mid))
+
+
+def _pass(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
+    """The same motion the other way, passing at the distance."""
+    return solo.transformed(T_world_mid @ _ground(side * distance, 0.0, torch.pi) @ inverse(T_world_mid))
+
+
+def _beside(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
+    """The same motion side by side."""
+    return solo.transformed(T_world_mid @ _ground(side * distance, 0.0) @ inverse(T_world_mid))
+
+
+def _behind(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
+    """The same motion straight behind."""
+    return solo.transformed(T_world_mid @ _ground(0.0, -distance) @ inverse(T_world_mid))
+
+
+PAIRINGS: dict[str, tuple[Place, float, float]] = {
+    "mirror": (_mirror, 0.6, 2.0),
+    "opposite": (_opposite, 0.6, 2.0),
+    "pass": (_pass, 0.5, 1.2),
+    "beside": (_beside, 0.5, 1.2),
+    "behind": (_behind, 0.5, 1.5),
+}
+"""How a solo's copy is placed, and between which distances in metres."""
+
+
+class SoloPairs(MotionDataModule):
+    """Pairs made of the single people of other data sets: a copy mirrors, circles, passes, walks beside or follows.
+
+    The motion of each is real, and so is how it goes with the other: the copy's place follows from its own motion.
+    Recorded couples have no such variety of places. Only training clips are made; pairs whose pelvises come nearer
+    than `clearance` are placed anew, further apart, or left out. Sources of clips, for `weights`: "solo-mirror" and
+    so on.
+
+    Args:
+        data: the data sets; their scenes of one person are used.
+        pairings: which of `PAIRINGS`; None: all.
+        delay: most frames that the copy comes later, drawn at random from 0; a follower always has one of these.
+        clearance: metres between pelvises, at every frame.
+        pair_seed: of distances, sides and delays.
+        **kwargs: as for MotionDataModule.
+
+    Raises:
+        ValueError: no data sets, or no such pairing.
+    """
+
+    def __init__(
+        self,
+        data: list[MotionDataModule],
+        pairings: Sequence[str] | None = None,
+        delay: int = 30,
+        clearance: float = 0.35,
+        pair_seed: int = 0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        names = list(PAIRINGS) if pairings is None else list(pairings)
+        unknown = [name for name in names if name not in PAIRINGS]
+        if unknown or not names:
+            raise ValueError(f"pairings: got {unknown or names}, expected some of {', '.join(PAIRINGS)}")
+        if not data:
+            raise ValueError("data: got no data sets, expected at least one with recordings of single people")
+        if delay < 0:
+            raise ValueError(f"delay: got {delay} frames, expected 0 or more")
+        self.data = list(data)
+        self.pairings = names
+        self.delay = delay
+        self.clearance = clearance
+        self.pair_seed = pair_seed
+
+    def prepare_data(self) -> None:
+        """Let every data set prepare its files."""
+        for part in self.data:
+            part.prepare_data()
+
+    def setup(self, stage: str) -> None:
+        """Let every data set set itself up."""
+        for part in self.data:
+            part.setup(stage)
+
+    def clips(self, split: Split) -> list[Clip]:
+        """A pair of each kind for every training clip of one person; nothing to validate or test on."""
+        if split != "train":
+            return []
+        pairs = []
+        for clip in (clip for part in self.data for clip in part.clips("train") if clip.agents == 1):
+            for name in self.pairings:
+                seed = derive(self.pair_seed, f"{name} {clip.name}")
+                pair = paired(clip.scene, name, self.delay, self.clearance, torch.Generator().manual_seed(seed))
+                if pair is not None:
+                    pairs.append(Clip(scene=pair, name=f"{clip.name} {name}", source=f"solo-{name}", split="train"))
+        return pairs
+
+
+def paired(solo: Scene, name: str, delay: int, clearance: float, generator: torch.Generator) -> Scene | None:
+    """A person and a copy of him as one scene; None: too short, or they come too close wherever the copy is put.
+
+    solo (1, T, 1) -> (1, T - delay drawn, 2)
+    """
+    place, least, most = PAIRINGS[name]
+    first = 1 if name == "behind" else 0
+    later = int(torch.randint(first, max(delay, first) + 1, (), generator=generator))
+    frames = solo.frames - later
+    if frames < SHORTEST:
+        return None
+    leader, follower = solo.slice(later, solo.frames), solo.slice(0, frames)
+    yaw, ground = to_planar(canonical_frame(leader.T_world_root[0, frames // 2, 0]))
+    T_world_mid = from_planar(yaw, ground)
+    side = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
+    for attempt in range(TRIES):
+        distance = least + (most - least) * torch.rand((), generator=generator) + 0.25 * attempt
+        copy = place(follower, T_world_mid, distance, torch.tensor(side))
+        apart = (leader.T_world_root - copy.T_world_root)[..., [0, 2], 3].norm(dim=-1)
+        if float(apart.min()) >= clearance:
+            return _together(leader, copy)
+    return None
+
+
+def _together(one: Scene, other: Scene) -> Scene:
+    """Two people of equal length as one scene; a frame is valid where both are."""
+    valid = None
+    if one.valid is not None and other.valid is not None:
+        valid = one.valid & other.valid
+    return one.replace(
+        body_rot=torch.cat([one.body_rot, other.body_rot], dim=2),
+        T_world_root=torch.cat([one.T_world_root, other.T_world_root], dim=2),
+        betas=torch.cat([one.betas, other.betas], dim=1),
+        present=torch.cat([one.present, other.present], dim=1),
+        valid=valid,
+        given=None,
+        names=(),
+    )
