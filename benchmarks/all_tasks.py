@@ -19,15 +19,15 @@ from pathlib import Path
 import lightning as L
 import torch
 
-from magnet import cli_record
-from magnet.cli_run import quiet
+from magnet.cli import run_folder
+from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation import TRUTH, Evaluation, Predictor
+from magnet.evaluation.evaluator import TRUTH, Evaluation, Predictor
+from magnet.evaluation.results import Results, machine
+from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout
-from magnet.report import Results, machine
 from magnet.sampling.guidance import Guidance
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.base import Task
@@ -113,7 +113,7 @@ def measure(
     """One row, with the ground truth's beside it."""
     evaluation = (Replaced if replaced else Evaluation)(task, samples, options, baselines=False)
     model.configure_test(evaluation)
-    callbacks = [cli_record.progress_bar(sampling=True)]
+    callbacks = [run_folder.progress_bar(sampling=True)]
     silent = {"logger": False, "enable_checkpointing": False, "enable_model_summary": False}
     trainer = L.Trainer(accelerator="auto", precision=precision, callbacks=callbacks, **silent)  # type: ignore[arg-type]
     trainer.test(model, datamodule=data, verbose=False)
@@ -160,7 +160,7 @@ def main() -> None:
         truth = f"{PARTNER if PARTNER in name else ''}{TRUTH}"
         found.rows.setdefault(truth, results.rows[TRUTH])
         found.meta[name] = results.meta
-        found.meta.update(cli_record.provenance() | {"machine": machine()})
+        found.meta.update(run_folder.provenance() | {"machine": machine()})
         found.save_json(file)
     shown = [metric for metric in METRICS if metric in found.metrics]
     (given.out / "table.md").write_text(found.to_markdown(shown))

@@ -24,17 +24,17 @@ from torch import Tensor
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from magnet import cli_record
 from magnet.body import Body, load_body
+from magnet.cli import run_folder
 from magnet.datamodules.cmu import CMU
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation import aligned
+from magnet.evaluation.evaluator import aligned
+from magnet.evaluation.results import machine
 from magnet.export.picture import contact_sheet
+from magnet.generation.conditioning import SamplerOptions
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
 from magnet.metrics.frechet import moments
 from magnet.motion.scene import Scene, concatenate
-from magnet.report import machine
 from magnet.sampling.guidance import Guidance
 from magnet.tasks.joint import JointFuture
 
@@ -149,7 +149,7 @@ def main() -> None:
         "options": {key: str(value) for key, value in vars(given).items()},
     }
     given.out.mkdir(parents=True, exist_ok=True)
-    content = {"facts": facts, "curve": curve, "meta": cli_record.provenance() | {"machine": machine()}}
+    content = {"facts": facts, "curve": curve, "meta": run_folder.provenance() | {"machine": machine()}}
     (given.out / "results.json").write_text(json.dumps(content, indent=1, default=str))
     draw(curve, floor, given.out / "curve.png")
     for b in range(min(2, long.scenes)):

@@ -18,9 +18,9 @@ from torch import Tensor
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior, planar_of
+from magnet.evaluation.results import machine
 from magnet.motion.scene import concatenate
 from magnet.motion.tokens import STRIDE
-from magnet.report import machine
 from magnet.sampling.noise import LEVELS, add_noise
 
 SHOWN = (5, 20, 50, 100, 300, 500)

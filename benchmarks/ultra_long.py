@@ -19,10 +19,10 @@ from typing import Any
 import torch
 
 from magnet.datamodules.synthetic import Synthetic
-from magnet.denoiser.canvas import Health
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.seams import cat_time
+from magnet.generation.blending import cat_time
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.world import Health
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid

@@ -23,10 +23,10 @@ from typing import Any
 import torch
 
 from magnet.body import load_body
+from magnet.export.page.rig import VIEWS, Style
+from magnet.export.page.takes import take
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
-from magnet.viewer.rig import VIEWS, Style
-from magnet.viewer.takes import take
 from magnet.viewer.troupe import Look
 from magnet.viewer.watch import Viewer
 

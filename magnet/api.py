@@ -16,12 +16,12 @@ from torch import Tensor
 
 from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole, require_wholes
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.partner import Partner
 from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
 from magnet.motion.tokens import STRIDE
-from magnet.partner import Partner
 from magnet.tasks import registry
 
 if TYPE_CHECKING:
@@ -301,7 +301,7 @@ class Model:
             agents: slots of those who answer.
 
         Raises:
-            ValueError: as `magnet.partner.Partner`.
+            ValueError: as `magnet.generation.partner.Partner`.
         """
         plain = past.plain() if isinstance(past, Motion) else past
         return Partner(self.denoiser, plain, _slots("agents", agents), self.sampler, self._generator(seed))

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.denoiser.generation import SamplerOptions, task_sight
-from magnet.denoiser.stream import Stream
+from magnet.generation.conditioning import SamplerOptions, task_sight
+from magnet.generation.rollout import Stream
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream

@@ -14,8 +14,8 @@ import torch
 import magnet
 from magnet.api import Model, Motion
 from magnet.body import load_body
-from magnet.denoiser.generation import SamplerOptions
 from magnet.export import resampled, save_bvh
+from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from magnet import cli
-from magnet.cli_layers import read_layers
+from magnet.cli.config_files import read_layers
 from magnet.datamodules import catalogue
-from magnet.denoiser.presets import PRESETS
+from magnet.sampling.presets import PRESETS
 
 ROOT = Path(__file__).parents[1] / "configs"
 PAPER = ROOT / "paper"

@@ -80,7 +80,7 @@ def test_a_run_folder_tells_where_it_came_from(trained):
 
 def test_training_of_the_denoiser_goes_on_when_the_tokenizers_file_is_gone(trained, tmp_path):
     (trained / "tok/checkpoints/last.ckpt").rename(tmp_path / "moved.ckpt")
-    callbacks = ("--trainer.callbacks+=magnet.denoiser.averaging.WeightEMA",)
+    callbacks = ("--trainer.callbacks+=magnet.training.ema.WeightEMA",)
     try:
         checkpoint = str(trained / "den/checkpoints/last.ckpt")
         magnet("fit", "--ckpt_path", checkpoint, *callbacks, "--trainer.max_steps", "3", "--out", str(tmp_path / "on"))

@@ -110,7 +110,7 @@ def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path, monkeypatch, capsy
 
 
 def test_every_option_that_the_page_names_is_there() -> None:
-    from magnet.cli_data_options import reader_parser
+    from magnet.cli.data_options import reader_parser
     from magnet.datamodules import catalogue
 
     known = {flag for name in catalogue.OWN for action in reader_parser(catalogue.find(name).load_reader())._actions

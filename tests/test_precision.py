@@ -10,8 +10,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from magnet.body import load_body
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
 from magnet.precision import Float32
 from magnet.sampling.guidance import Guidance

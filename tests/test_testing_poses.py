@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from magnet.denoiser import showing
-from magnet.denoiser.generation import SamplerOptions
+from magnet.generation import showing
+from magnet.generation.conditioning import SamplerOptions
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule

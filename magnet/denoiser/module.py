@@ -15,20 +15,20 @@ from magnet import weights
 from magnet.body import Body, load_body
 from magnet.checks import require_number
 from magnet.denoiser import starting
-from magnet.denoiser import stream as streaming
 from magnet.denoiser.levels import NoiseLevels
 from magnet.denoiser.losses import Weighting
 from magnet.denoiser.objective import training_losses
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.statistics import Statistics
 from magnet.denoiser.transformer import Rope, Transformer
-from magnet.evaluation import Evaluation
+from magnet.evaluation.evaluator import Evaluation
+from magnet.generation import rollout
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
-from magnet.optim import adamw_cosine
 from magnet.precision import dtype_of, require_float32_scenes
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.module import RawPose, Tokenizer
+from magnet.training.optim import adamw_cosine
 
 Target = Literal["quantised", "continuous"]
 
@@ -287,8 +287,8 @@ class Denoiser(L.LightningModule):
             there = there & whole[:, :, None, None]
         return tokens, there
 
-    generate = streaming.generate
-    stream = streaming.stream
+    generate = rollout.generate
+    stream = rollout.stream
 
     # -- training ------------------------------------------------------------------------------
 

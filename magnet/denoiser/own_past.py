@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.denoiser.generation import SamplerOptions
+from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, place, project_se2
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, transforms

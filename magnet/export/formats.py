@@ -262,7 +262,7 @@ def _save_picture(
 def _save_page(
     scene: Scene, path: Path, context: int, body: Body, style: Style | Literal["light"], title: str | None
 ) -> Path:
-    from magnet.viewer.html import save_html  # late: the viewer stands on this room
+    from magnet.export.page.html import save_html  # late: the viewer stands on this room
 
     # A body's skin is only written where the page itself thinks it may be.
     styles: Any = None if style == "body" else (style,)

@@ -26,7 +26,8 @@ class NearestTraining(ClipMeans):
 
     A distance is the mean over scored frames, agents and 21 joints, with both futures in the same world: origin
     between the people and facing as the first of them at the last context frame. What is measured is expected there
-    (`magnet.evaluation.shared_world`); windows are put there once for each order of their people (`assignments`).
+    (`magnet.evaluation.evaluator.shared_world`); windows are put there once for each order of their people
+    (`assignments`).
     Only windows with as many people count; a scene that has none is not measured.
 
     Samples much nearer than recordings that training has not seen (the ground truth's row) repeat the training set.

@@ -16,7 +16,6 @@ from torchmetrics import MeanMetric
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
-from magnet.optim import adamw_cosine
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
 from magnet.tokenizer.augment import drift, exchange_limbs, turn_joints
@@ -27,6 +26,7 @@ from magnet.tokenizer.losses import masked_mean, matrices, proper, reconstructio
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_level
 from magnet.tokenizer.vqvae import VQVAE
+from magnet.training.optim import adamw_cosine
 
 if TYPE_CHECKING:
     from magnet.body import Body

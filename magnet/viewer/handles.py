@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from magnet.export.page.palette import agent_colours
+from magnet.export.page.rig import bone_poses
+from magnet.generation.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
 from magnet.motion.frames import canonical_frame
-from magnet.viewer.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
-from magnet.viewer.palette import agent_colours
 from magnet.viewer.people import People, add_people
-from magnet.viewer.rig import bone_poses
 
 if TYPE_CHECKING:
     from magnet.viewer.play import Playground

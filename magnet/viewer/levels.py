@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.export.page.palette import agent_colours
+from magnet.generation.recording import Recording
 from magnet.sampling.noise import LEVELS
-from magnet.viewer.palette import agent_colours
-from magnet.viewer.recording import Recording
 
 CELL = 14
 

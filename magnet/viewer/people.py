@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from magnet.body.base import Body
 from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs
+from magnet.export.page.palette import Colours, for_batches
+from magnet.export.page.rig import Array, Rig, Style, capsule, rigs, turn_to
 from magnet.motion.scene import BODY_JOINTS, Scene
-from magnet.viewer.palette import Colours, for_batches
-from magnet.viewer.rig import Array, Rig, Style, capsule, rigs, turn_to
 
 MANY = 8
 """People above whom a limb has a quarter of the triangles."""

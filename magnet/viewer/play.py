@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
+from magnet.export.page.takes import Take, take
+from magnet.generation.live import Live, Piece
 from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.clock import Clock
 from magnet.viewer.handles import Keys, Steering
-from magnet.viewer.live import Live, Piece
 from magnet.viewer.stage import Stage
-from magnet.viewer.takes import Take, take
 from magnet.viewer.troupe import Look, Troupe
 from magnet.viewer.worker import Worker
 

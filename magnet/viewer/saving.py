@@ -8,8 +8,8 @@ import zipfile
 from pathlib import Path
 
 from magnet.body.base import Body
+from magnet.export.page.takes import Take
 from magnet.motion.scene import Scene
-from magnet.viewer.takes import Take
 
 FORMATS = ("npz", "html", "glb", "bvh", "csv", "gif", "mp4", "png")
 """What a take can be saved as; see `magnet.export.formats.WRITTEN`."""
@@ -26,7 +26,7 @@ def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> tupl
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"
         if kind == "html":
-            from magnet.viewer.html import save_html
+            from magnet.export.page.html import save_html
 
             written = [save_html([take], path, body, truth=truth)]
         elif kind in ("gif", "mp4"):

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from magnet.export.page.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
+from magnet.export.page.rig import Array, Index, capsule
 from magnet.export.stage import SHADOW
 from magnet.viewer import marks
-from magnet.viewer.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
-from magnet.viewer.rig import Array, Index, capsule
 
 AWAY, NO_SIZE = -50.0, 1e-6
 """Height in metres and size of marks that are not needed: mostly out of sight, so not drawn, and nothing to see."""

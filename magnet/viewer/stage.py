@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
+from magnet.export.page.rig import VIEWS, Array
 from magnet.viewer.clock import SPEEDS, Clock
-from magnet.viewer.rig import VIEWS, Array
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from magnet.body.base import Body
+from magnet.export.page.palette import GHOST, agent_colours, pale
+from magnet.export.page.rig import Array, Style, bone_poses
+from magnet.export.page.takes import Take
 from magnet.motion.scene import Scene
-from magnet.viewer.palette import GHOST, agent_colours, pale
 from magnet.viewer.people import People, add_people
-from magnet.viewer.rig import Array, Style, bone_poses
 from magnet.viewer.scenery import Marks, Shades, Trails
-from magnet.viewer.takes import Take
 
 HEAD_HIGH = 2.1
 EVEN = 1.2

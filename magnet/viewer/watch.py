@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from magnet.body.base import Body
+from magnet.export.page.rig import CROWD, Style, first_style
+from magnet.export.page.takes import Take, in_a_row, numbered, same_length
 from magnet.viewer.clock import Clock
 from magnet.viewer.levels import level_image
-from magnet.viewer.rig import CROWD, Style, first_style
 from magnet.viewer.stage import Stage
-from magnet.viewer.takes import Take, in_a_row, numbered, same_length
 from magnet.viewer.troupe import Look, Troupe
 
 

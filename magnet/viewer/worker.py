@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from magnet.viewer.live import Live, Piece
+from magnet.generation.live import Live, Piece
 
 
 class Worker:

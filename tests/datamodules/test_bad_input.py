@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from magnet import cli
-from magnet.cli_data_shown import SKIPPED_SHOWN
+from magnet.cli.data_shown import SKIPPED_SHOWN
 from magnet.datamodules.catalogue import NAMES
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.reading.recording import Take

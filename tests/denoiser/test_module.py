@@ -155,7 +155,7 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
     ids=str,
 )
 def test_every_ablation_trains_and_samples(tmp_path, ablation):
-    from magnet.denoiser.generation import SamplerOptions
+    from magnet.generation.conditioning import SamplerOptions
     from magnet.tasks.joint import JointFuture
 
     model = build(tmp_path, **ablation)
@@ -166,7 +166,7 @@ def test_every_ablation_trains_and_samples(tmp_path, ablation):
 
 
 def test_without_a_vq_vae_the_poses_themselves_are_tokens(tmp_path):
-    from magnet.denoiser.generation import SamplerOptions
+    from magnet.generation.conditioning import SamplerOptions
     from magnet.tasks.joint import JointFuture
 
     torch.manual_seed(0)

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from magnet.denoiser.canvas import Health
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.own_past import with_own_past
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.world import Health
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture

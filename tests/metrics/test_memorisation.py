@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magnet.baselines import Windows
 from magnet.body import load_body
-from magnet.evaluation import aligned
+from magnet.evaluation.evaluator import aligned
 from magnet.metrics import memorisation
 from magnet.metrics.memorisation import NearestTraining
 from magnet.motion.scene import Scene, concatenate

@@ -4,10 +4,10 @@ from torch import Tensor
 
 from magnet import weights
 from magnet.datamodules.synthetic import Synthetic
-from magnet.denoiser.canvas import Canvas
-from magnet.denoiser.generation import SamplerOptions, known_tokens, scrub
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.seams import arrive, next_known, seam_weights
+from magnet.generation.blending import arrive, next_known, seam_weights
+from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub
+from magnet.generation.world import Canvas
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, inverse, pairwise, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, relations_by_frame

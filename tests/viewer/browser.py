@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from magnet.body import Body
+from magnet.export.page.takes import Take
+from magnet.generation.live import Live
 from magnet.testing import tiny_denoiser
-from magnet.viewer.live import Live
-from magnet.viewer.takes import Take
 
 SHOTS = Path(__file__).parents[2] / "runs" / "viewer"
 
@@ -110,7 +110,7 @@ def watched(page: Any, takes: list[Take], body: Body, truth: Take | None = None,
 def played(page: Any, live: Live, body: Body) -> Iterator[Any]:
     """A model that plays live and has gone on from its first frames, without true shadows, and its page loaded."""
     pytest.importorskip("viser")
-    from magnet.viewer.live import FIRST
+    from magnet.generation.live import FIRST
     from magnet.viewer.play import Playground
     from magnet.viewer.troupe import Look
 

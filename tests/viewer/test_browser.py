@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.denoiser.generation import SamplerOptions
+from magnet.export.page.takes import take
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.recording import record
 from magnet.motion.scene import Scene
 from magnet.tasks.joint import JointFuture
 from magnet.viewer import stage
-from magnet.viewer.recording import record
 from magnet.viewer.saving import FORMATS
-from magnet.viewer.takes import take
 from tests.viewer.browser import blue, grey, orange, pale_orange, seen, shipped, shot, upright, wait, watched
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

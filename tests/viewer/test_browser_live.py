@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from magnet.generation.live import FIRST, REACH, Live
 from magnet.motion.scene import Scene
-from magnet.viewer.live import FIRST, REACH, Live
 from tests.viewer.browser import blue, drag_handle, orange, played, seen, shipped, wait
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.viewer.html import save_html
+from magnet.export.page.html import save_html
 from tests.viewer.browser import blue, orange, pale_orange, shot, upright
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from magnet import cli_view
-from magnet.cli import main
+from magnet.cli import main, view
+from magnet.export.page.rig import VIEWS
 from magnet.motion.scene import Scene
 from magnet.viewer import server
-from magnet.viewer.rig import VIEWS
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -79,7 +78,7 @@ def test_rates_of_the_truth_are_compared_for_pages_too(tmp_path: Path, duet: Sce
 
 
 def test_after_a_run_what_cannot_be_shown_is_said_and_is_no_failure(tmp_path: Path, duet: Scene, capsys) -> None:
-    cli_view.show_at_the_end([str(tmp_path / "gone.npz"), "--port", "0", "--no-browser"])
+    view.show_at_the_end([str(tmp_path / "gone.npz"), "--port", "0", "--no-browser"])
     err = capsys.readouterr().err
     assert "not shown: " in err and "later: magnet view " in err
     assert len(err.strip().splitlines()) == 2
@@ -92,7 +91,7 @@ def test_an_unknown_host_is_named() -> None:
 
 def test_without_a_screen_it_says_how_to_get_there_by_ssh(monkeypatch, capsys) -> None:
     monkeypatch.setattr(server, "open_browser", lambda url: False)
-    cli_view.announce(8099, "127.0.0.1", quiet=False)
+    view.announce(8099, "127.0.0.1", quiet=False)
     out = capsys.readouterr().out
     assert "http://localhost:8099" in out
     assert "ssh -L 8099:localhost:8099" in out

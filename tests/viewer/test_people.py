@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from magnet.body import Body
+from magnet.export.page.palette import agent_colours
+from magnet.export.page.rig import bone_poses
 from magnet.motion.scene import Scene
-from magnet.viewer.palette import agent_colours
 from magnet.viewer.people import Skinned, add_people, poser, quick_poser
-from magnet.viewer.rig import bone_poses
 
 
 def told(mesh: Any, pose: Any, turns: Any, places: Any, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:

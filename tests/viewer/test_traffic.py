@@ -11,10 +11,10 @@ import torch
 
 from magnet.body import Body
 from magnet.export.limbs import CAPSULES, STICKS
+from magnet.export.page.rig import VIEWS, Style
+from magnet.export.page.takes import take
 from magnet.motion.scene import BODY_JOINTS
 from magnet.testing import random_scene
-from magnet.viewer.rig import VIEWS, Style
-from magnet.viewer.takes import take
 from magnet.viewer.troupe import Look
 
 MOST_BESIDES = 10

@@ -16,8 +16,9 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from magnet import cli_stored, files, weights
-from magnet.cli import CommandError
+from magnet import files, weights
+from magnet.cli import checkpoint_config
+from magnet.cli.errors import CommandError
 from magnet.tokenizer.checkpoint import read_checkpoint
 from tests.toys import ToyData, ToyModel
 
@@ -61,7 +62,7 @@ def test_a_flipped_byte_anywhere_is_refused_by_every_reader(saved: Path) -> None
         saved.write_bytes(whole)
     flipped(saved, 100)
     with pytest.raises(CommandError, match=r"damaged.*take another checkpoint; if you changed it yourself, delete"):
-        cli_stored.Stored.read(saved)
+        checkpoint_config.Stored.read(saved)
 
 
 def test_a_checkpoint_without_a_checksum_loads_unless_its_weights_are_flipped(saved: Path) -> None:

@@ -8,8 +8,8 @@ import torch
 
 from magnet import weights
 from magnet.datamodules.synthetic import Synthetic
-from magnet.denoiser.generation import SamplerOptions
 from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
 from magnet.synthesis import coupling_error
 from magnet.tasks.joint import Generation, JointFuture

@@ -1,0 +1,3 @@
+"""The command `magnet`: the roof over everything."""
+
+from magnet.cli.main import main as main

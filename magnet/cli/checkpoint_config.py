@@ -1,0 +1,357 @@
+"""What a checkpoint remembers of its making, as defaults below everything that the user says.
+
+Two traps of LightningCLI are met here: it lets a checkpoint's options beat explicit ones, and it does not
+restore linked options. So its own reading of checkpoints is switched off, and the options that a checkpoint
+keeps go in front of the user's arguments, where whatever comes later wins.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pickle
+import sys
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from magnet import weights
+from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
+from magnet.cli.config_files import Layer, read_layers
+from magnet.cli.errors import CommandError
+from magnet.motion.tokens import STRIDE
+
+Spec = dict[str, Any]
+"""A class and its options: {"class_path": ..., "init_args": {...}}."""
+
+CONFIG_FLAGS = ("--config", "-c")
+SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
+CONFIG_KEY = "magnet_config"
+
+
+@dataclass
+class Arguments:
+    """A command line after the command, with what its configuration files say."""
+
+    flags: list[str]
+    files: list[str] = field(default_factory=list)
+    layers: list[Layer] = field(default_factory=list)
+
+    @classmethod
+    def split(cls, arguments: Iterable[str]) -> Arguments:
+        """Take the configuration files out, so that they can go first and any flag beats any file.
+
+        Raises:
+            CommandError: as `read_layers`.
+        """
+        found = cls([])
+        rest = iter(arguments)
+        for argument in rest:
+            name, equals, value = argument.partition("=")
+            if name in CONFIG_FLAGS:
+                found.files.append(value if equals else next(rest, ""))
+            else:
+                found.flags.append(argument)
+        found.flags = one_class(found.flags)
+        found.layers = [layer for file in found.files for layer in read_layers(file)]
+        return found
+
+    @property
+    def configs(self) -> list[dict[str, Any]]:
+        """What the files say, and those that they extend; later ones win."""
+        return [layer.options for layer in self.layers]
+
+    def flag(self, key: str) -> str | None:
+        """The last value that a flag gives.
+
+        Raises:
+            CommandError: the flag stands at the end, without one.
+        """
+        value = None
+        for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):
+            name, equals, text = argument.partition("=")
+            if name == f"--{key}":
+                value = text if equals else after
+                if value is None:
+                    raise CommandError(f"--{key}: got nothing, expected a value behind it")
+        return value
+
+    def value(self, key: str) -> Any:
+        """What a flag says, else the last configuration file that says something; None where nobody does."""
+        flag = self.flag(key)
+        if flag is not None:
+            return None if flag == "null" else flag
+        return next((config[key] for config in reversed(self.configs) if config.get(key) is not None), None)
+
+    @property
+    def only_shown(self) -> bool:
+        """Whether the configuration or help is asked for, and nothing is run."""
+        return any(flag.startswith(SHOWN) for flag in self.flags)
+
+    def class_of(self, key: str) -> str | None:
+        """The class that the user asks for under `model`, `data` or `task`."""
+        named = (spec_of(config.get(key)).get("class_path") for config in reversed(self.configs))
+        return class_in_flags(self.flags, key) or next((name for name in named if name), None)
+
+    def option(self, key: str, name: str) -> Any:
+        """An option of the class under `model` or `data`: by a flag, else by the last file that says something."""
+        flag = self.flag(f"{key}.{name}") or self.flag(f"{key}.init_args.{name}")
+        if flag is not None:
+            return None if flag == "null" else flag
+        parts = [config[key] for config in reversed(self.configs) if isinstance(config.get(key), dict)]
+        return next((value for part in parts if (value := (part.get("init_args") or {}).get(name)) is not None), None)
+
+    def without(self, key: str) -> list[str]:
+        """The flags, less one and its value."""
+        kept: list[str] = []
+        rest = iter(self.flags)
+        for argument in rest:
+            if argument == f"--{key}":
+                next(rest, None)
+            elif not argument.startswith(f"--{key}="):
+                kept.append(argument)
+        return kept
+
+
+def import_named(given: Arguments) -> None:
+    """Import the classes that a user names by a dotted path, also out of the working directory.
+
+    Raises:
+        CommandError: such a module is there and cannot be imported.
+    """
+    from magnet.datamodules.plugins import import_local
+
+    named = [(f"--{key}", given.class_of(key)) for key in ("model", "data")]
+    named += [(layer.path or "a file", path) for layer in given.layers for path in class_paths(layer.options)]
+    for where, path in named:
+        if path and "." in path:
+            try:
+                import_local(path)
+            except ValueError as error:
+                raise CommandError(f"{where} {error}") from error
+
+
+def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:
+    """What `--ckpt_path` means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
+
+    Raises:
+        CommandError: there is none.
+    """
+    if name in ("last", "best"):
+        folders = list(folders)
+        found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]
+        if not found:
+            looked = " or ".join(map(str, folders))
+            raise CommandError(f"--ckpt_path {name}: no run with a checkpoints/{name}.ckpt in {looked}; name a file")
+        return max(found, key=lambda file: file.stat().st_mtime)
+    try:
+        return weights.resolve(name)
+    except ValueError as error:
+        if name is None:
+            raise CommandError("no weights come with this version: train a model, then give --ckpt_path") from error
+        raise CommandError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The options that a checkpoint was made with."""
+
+    path: Path
+    model: Spec | None
+    data: Spec | None
+
+    @classmethod
+    def read(cls, path: Path) -> Stored:
+        """Read them.
+
+        Raises:
+            CommandError: no checkpoint, a damaged one, or one of a class that nobody here has named.
+        """
+        try:
+            checkpoint = weights.read(path)
+        except (OSError, ValueError) as error:
+            if isinstance(error.__cause__, pickle.UnpicklingError):
+                reason = "not a checkpoint, or one that holds more than weights and plain values, which could run code"
+                raise CommandError(f"{path}: {reason}; it is not loaded") from error
+            raise CommandError(textwrap.shorten(str(error).partition("\n")[0], 400)) from error
+        if not isinstance(checkpoint, dict) or "state_dict" not in checkpoint:
+            raise CommandError(f"{path}: not a checkpoint of a model, it has no state_dict")
+        config = checkpoint.get(CONFIG_KEY) or {}
+        model = config.get("model") or _from_hyper_parameters(checkpoint)
+        return cls(path, model, config.get("data"))
+
+
+def _from_hyper_parameters(checkpoint: dict[str, Any]) -> Spec | None:
+    """What `save_hyperparameters` kept, for checkpoints that a Trainer wrote outside this command."""
+    values = checkpoint.get("hyper_parameters") or {}
+    denoiser = "magnet.denoiser.module.Denoiser" if "tokenizer_hyper_parameters" in checkpoint else None
+    path = values.get("_class_path", denoiser)
+    options = {key: value for key, value in values.items() if not key.startswith("_")}
+    return {"class_path": path, "init_args": options} if path else None
+
+
+def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, keep_data: bool) -> dict[str, Any]:
+    """Stored options as the lowest layer of configuration.
+
+    Args:
+        stored: what the checkpoint kept.
+        given: what the user says.
+        fit: training goes on; linked options then follow from the data's by themselves.
+        data_default: class of the data where nobody names one.
+        keep_data: use the checkpoint's data where the user names none.
+    """
+    layer: dict[str, Any] = {}
+    model_args: dict[str, Any] = {}
+    if stored.model is not None:
+        wanted = given.class_of("model")
+        if wanted is None or same_class(wanted, stored.model["class_path"]):
+            layer["model"] = known_options(trusted(stored.model, stored.path), "model")
+            model_args = layer["model"]["init_args"]
+    wanted = given.class_of("data") or (None if keep_data else data_default)
+    if stored.data is not None and (wanted is None or same_class(wanted, stored.data["class_path"])):
+        layer["data"] = known_options(trusted(stored.data, stored.path), "data")
+    elif not fit:
+        layer["data"] = {"class_path": wanted or data_default, "init_args": {}}
+    if fit:
+        for linked in LINKS.values():
+            model_args.pop(linked, None)
+    elif model_args:
+        linked_values = {"max_agents": model_args.get("max_agents")}
+        if model_args.get("window") is not None:
+            linked_values["window_frames"] = STRIDE * model_args["window"]
+        accepted = options_of(class_named(layer["data"]["class_path"]))
+        layer["data"]["init_args"] |= {k: v for k, v in linked_values.items() if v is not None and k in accepted}
+    return layer
+
+
+OWN_WAY = {
+    "tokenizer", "start_from", "decoder_only", "learning_rate", "weight_decay", "warmup_steps", "compile", "seed"
+}  # fmt: skip
+"""Options of a model that one which starts from it does not take over."""
+
+
+def started(name: str, given: Arguments, models: dict[str, str], data_default: str) -> dict[str, Any]:
+    """Options of the checkpoint that training starts from (`--model.start_from`), as the lowest layer.
+
+    Sizes have to be the same, and losses and noise had better be; the data are told how many people and frames.
+
+    Args:
+        name: a shipped model's, or a path.
+        given: what the user says.
+        models: modules of our models, by the class's short name.
+        data_default: class of the data where nobody names one.
+
+    Raises:
+        CommandError: there is no such checkpoint.
+    """
+    try:
+        checkpoint = weights.read(weights.resolve(name))
+    except (OSError, ValueError) as error:
+        if given.only_shown:
+            return {}
+        said = textwrap.shorten(str(error).partition("\n")[0], 200)
+        raise CommandError(f"--model.start_from {name}: {said}") from error
+    denoiser = "tokenizer_hyper_parameters" in checkpoint
+    short = (given.class_of("model") or ("Denoiser" if denoiser else "Tokenizer")).rpartition(".")[2]
+    if short not in models:  # somebody's own model knows what it starts from
+        return {}
+    fields = "tokenizer_hyper_parameters" if denoiser and short == "Tokenizer" else "hyper_parameters"
+    stored = checkpoint.get(fields) or {}
+    path = f"{models[short]}.{short}"
+    known = options_of(class_named(path))
+    kept = {key: value for key, value in stored.items() if key in known - OWN_WAY}
+    layer = {"model": {"class_path": path, "init_args": {k: v for k, v in kept.items() if k not in LINKS.values()}}}
+    if short == "Denoiser":
+        data = given.class_of("data") or data_default
+        linked = {"max_agents": kept.get("max_agents"), "window_frames": STRIDE * kept.get("window", 0) or None}
+        accepted = options_of(class_named(data))
+        wanted = {key: value for key, value in linked.items() if value is not None and key in accepted}
+        layer["data"] = {"class_path": data, "init_args": wanted}
+    return layer
+
+
+LINKS = {"max_agents": "max_agents", "window_frames": "window"}
+"""Options of the data that the model must agree with, and what they are called there."""
+
+
+def tokens(window_frames: int) -> int:
+    """Frames of a window as token steps."""
+    if window_frames % STRIDE:
+        raise ValueError(f"data.window_frames is {window_frames}, which is not a multiple of {STRIDE}")
+    return window_frames // STRIDE
+
+
+def refuse_linked(given: Arguments) -> None:
+    """A linked option can only be set where it comes from.
+
+    Raises:
+        CommandError: it is set at the model.
+    """
+    for source, target in LINKS.items():
+        said = [given.flag(f"model.{target}"), given.flag(f"model.init_args.{target}")]
+        for config in given.configs:
+            model = config.get("model")
+            said.append((model.get("init_args") or {}).get(target) if isinstance(model, dict) else None)
+        if any(value is not None for value in said):
+            raise CommandError(f"model.{target} follows from the data when a model is trained: set --data.{source}")
+
+
+def class_named(path: str) -> type | None:
+    """The class of a dotted path, or of the short name of one that is imported."""
+    module, _, name = path.rpartition(".")
+    if module:
+        return getattr(importlib.import_module(module), name, None)
+    from lightning.pytorch import LightningDataModule
+
+    found: list[type] = [LightningDataModule]
+    for kind in found:
+        found.extend(kind.__subclasses__())
+    return next((kind for kind in found if kind.__name__ == path), None)
+
+
+def options_of(kind: type | None) -> set[str]:
+    """Names of all options of a class, inherited ones included."""
+    if kind is None:
+        return set()
+    from lightning.pytorch.cli import LightningArgumentParser
+
+    parser = LightningArgumentParser()
+    return {name.split(".")[1] for name in parser.add_class_arguments(kind, "it", fail_untyped=False)}
+
+
+def trusted(spec: Spec, path: Path) -> Spec:
+    """Refuse classes whose import could run code that nobody here has chosen.
+
+    Raises:
+        CommandError: the checkpoint names a class outside magnet that is not imported yet.
+    """
+    for name in class_paths(spec):
+        module = name.rpartition(".")[0]
+        if not (module == "magnet" or module.startswith("magnet.") or module in sys.modules):
+            raise CommandError(
+                f"{path} was made with {name}, which is not part of magnet; if you trust that, name the class yourself "
+                "with --model or --data"
+            )
+    return spec
+
+
+def class_paths(value: Any) -> Iterable[str]:
+    if isinstance(value, dict):
+        if isinstance(value.get("class_path"), str):
+            yield value["class_path"]
+        for part in value.values():
+            yield from class_paths(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from class_paths(part)
+
+
+def known_options(spec: Spec, key: str) -> Spec:
+    """The options that the class still has; names the others on standard error."""
+    known = options_of(class_named(spec["class_path"]))
+    options = spec.get("init_args") or {}
+    gone = sorted(set(options) - known)
+    if gone:
+        print(f"magnet: the checkpoint's {key} options {', '.join(gone)} no longer exist", file=sys.stderr)
+    return {"class_path": spec["class_path"], "init_args": {k: v for k, v in options.items() if k in known}}

@@ -1,0 +1,161 @@
+"""Options belong to the class that they were given to: what layers say of a class that was replaced is left out.
+
+jsonargparse, by intent (its issue 460), keeps equally named values when another layer names another class: a file's
+values, but just as much the first class's own defaults, and those of list elements at the same place. So Synthetic's
+defaults became every data set's. Here the class that wins is found first; it is the parser's default, and layers reach
+the parser without what they say of others.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from magnet.cli.config_files import Layer
+
+Options = dict[str, Any]
+KEYS = ("model", "data", "task")
+"""Options under which one of several classes stands."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Layers of which none contradicts a later one in what stands where."""
+
+    layers: tuple[Layer, ...]  # lowest first
+    classes: dict[str, str]  # the class that wins under each of KEYS, as it was named; those that somebody names
+    notes: tuple[str, ...]  # options of files that are left out, a line each class
+
+
+def settle(layers: Sequence[Layer], flags: Sequence[str]) -> Settled:
+    """Find the classes that win, and leave out of each layer what it says of others.
+
+    Args:
+        layers: lowest first; those without a path are not the user's own.
+        flags: the command line after the command, which beats all layers.
+    """
+    layers = [replace(layer, options=copy.deepcopy(layer.options)) for layer in layers]
+    classes, notes = {}, []
+    for key in KEYS:
+        specs = [spec_of(layer.options.get(key)) for layer in layers]
+        named = [class_in_flags(flags, key), *(spec.get("class_path") for spec in reversed(specs) if spec)]
+        winner = next((name for name in named if name), None)
+        if winner is not None:
+            classes[key] = winner
+            notes += _only(layers, specs, key, winner)
+    for number, layer in enumerate(layers):
+        for later in layers[number + 1 :]:
+            _replace(layer.options, later.options)
+        for name, value in valued(flags):
+            if name.removeprefix("--") not in KEYS:
+                _replace_at(layer.options, name.removeprefix("--").split("."), value)
+    return Settled(tuple(layers), classes, tuple(notes))
+
+
+def spec_of(value: Any) -> Options:
+    """A class and its options from what stands under a key: a mapping, or the class's name alone."""
+    if isinstance(value, str):
+        return {"class_path": value}
+    return value if isinstance(value, dict) else {}
+
+
+def class_in_flags(flags: Sequence[str], key: str) -> str | None:
+    """The class that the last flag to name one names under a key; by a mapping or in a file, too."""
+    named = [value for name, value in valued(flags) if name in (f"--{key}", f"--{key}.class_path")]
+    value: Any = named[-1] if named else None
+    if value and (value.startswith("{") or value.endswith((".yaml", ".yml"))):
+        try:
+            text = value if value.startswith("{") else Path(value).read_text(encoding="utf-8")
+            return spec_of(yaml.safe_load(text)).get("class_path")
+        except (OSError, yaml.YAMLError):
+            return None  # the parser says what is wrong with it
+    return None if value in ("", "null") else value
+
+
+def one_class(flags: Sequence[str]) -> list[str]:
+    """The flags with the last of several that name a class under one key, and no other."""
+    kept = list(flags)
+    for key in KEYS:
+        names = (f"--{key}", f"--{key}.class_path")
+        places = [i for i, flag in enumerate(kept) if flag.partition("=")[0] in names]
+        for i in reversed(places[:-1]):
+            del kept[i : i + (1 if "=" in kept[i] else 2)]
+    return kept
+
+
+def valued(flags: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Each flag's name and value."""
+    for argument, after in pairwise([*flags, ""]):
+        name, equals, value = argument.partition("=")
+        if name.startswith("--"):
+            yield name, value if equals else after
+
+
+def same_class(one: str, other: str) -> bool:
+    """Whether two names, short or dotted, mean one class; nothing is imported to find out."""
+    if one == other:
+        return True
+    if "." in one and "." in other:
+        parts = [path.rpartition(".") for path in (one, other)]
+        here, there = (getattr(sys.modules.get(module), name, None) for module, _, name in parts)
+        return here is not None and here is there
+    return one.rpartition(".")[2] == other.rpartition(".")[2]
+
+
+def _only(layers: list[Layer], specs: list[Options], key: str, winner: str) -> list[str]:
+    """Leave what is said of other classes out of all layers; a note for each file.
+
+    Options without a class belong to the class that lower layers name, or else to any.
+    """
+    notes, owner = [], None
+    for layer, spec in zip(layers, specs, strict=True):
+        owner = spec.get("class_path") or owner
+        if not spec or owner is None or same_class(owner, winner):
+            continue
+        del layer.options[key]
+        lost = sorted(spec.get("init_args") or {})
+        if lost and layer.path:
+            to, now = owner.rpartition(".")[2], winner.rpartition(".")[2]
+            notes.append(f"{key} is {now}: what {layer.path} gives to {to} is left out ({', '.join(lost)})")
+    return notes
+
+
+def _replace(lower: Options, later: Options) -> None:
+    """Take lists, and options of classes, out of a layer where a later one has something else in their place."""
+    for key in [key for key in lower if key in later]:
+        old, new = lower[key], later[key]
+        if isinstance(old, dict) and isinstance(new, dict):
+            if "class_path" in old and "class_path" in new and not same_class(old["class_path"], new["class_path"]):
+                del lower[key]
+            else:
+                _replace(old, new)
+        elif isinstance(old, list) or (isinstance(old, dict) and "class_path" in old):
+            del lower[key]
+
+
+def _replace_at(options: Options, path: list[str], value: str) -> None:
+    """The same where a flag puts a whole value: `--trainer.callbacks`, `--data.data`."""
+    old: Any = options
+    for name in path:
+        within = old if name in old else old.get("init_args")
+        if not isinstance(within, dict) or name not in within:
+            return
+        old = within[name]
+        if name != path[-1] and not isinstance(old, dict):
+            return
+    named = old.get("class_path") if isinstance(old, dict) else None
+    if isinstance(old, list) or (isinstance(named, str) and not value.startswith("{") and not same_class(named, value)):
+        del within[path[-1]]
+
+
+def known_path(classes: Mapping[str, type], name: str) -> str:
+    """The dotted path of a class by its short name; a dotted path is itself."""
+    kind = classes.get(name)
+    return name if kind is None else f"{kind.__module__}.{kind.__qualname__}"

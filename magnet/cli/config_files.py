@@ -1,0 +1,113 @@
+"""Configuration files as layers of options: what a file extends, and presets that stand for a sampler's options."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from magnet.cli.errors import CommandError
+
+EXTENDS = "extends"
+"""Key under which a file names the files that it changes, relative to itself."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Options from one file."""
+
+    path: str
+    options: dict[str, Any]
+
+    def word(self) -> str:
+        """What stands behind `--config` for it: the file, or its options where they are not the file's text."""
+        expanded = with_presets(self.options)
+        if Path(self.path).is_file() and read_yaml(self.path) == expanded:
+            return self.path
+        return json.dumps(expanded)
+
+
+def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
+    """A configuration file behind those that it extends, in the order in which later ones win.
+
+    Raises:
+        CommandError: a file that is not there, is no YAML, holds no mapping, or extends itself.
+    """
+    options = dict(read_yaml(file))
+    here = Path(file).resolve()
+    if here in within:
+        raise CommandError(f"{file} extends itself, by way of {' and '.join(path.name for path in within)}")
+    named = options.pop(EXTENDS, [])
+    named = [named] if isinstance(named, str) else named
+    if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
+        raise CommandError(f"{file}: {EXTENDS} is {named!r}, expected a file or a list of files")
+    before = [layer for name in named for layer in read_layers(str(Path(file).parent / name), (*within, here))]
+    return [*before, Layer(file, options)]
+
+
+def read_yaml(file: str) -> dict[str, Any]:
+    """The options in a file.
+
+    Raises:
+        CommandError: it is not there, is no YAML, or holds no mapping.
+    """
+    path = Path(file)
+    if not path.is_file():
+        near = sorted(str(p) for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        hint = f"; there are {', '.join(near)}" if near else ""
+        raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CommandError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise CommandError(f"{file} holds {type(content).__name__}, expected options such as `model:` and `data:`")
+    return content
+
+
+def with_presets(options: dict[str, Any]) -> dict[str, Any]:
+    """Options in which `sampler: NAME`, or `preset: NAME` among the sampler's, is what the preset stands for.
+
+    Raises:
+        CommandError: no such preset.
+    """
+    sampler = options.get("sampler")
+    if isinstance(sampler, str) and is_preset(sampler):
+        return {**options, "sampler": sampler_preset(sampler)}
+    if isinstance(sampler, dict) and "preset" in sampler:
+        fields = {key: value for key, value in sampler.items() if key != "preset"}
+        return {**options, "sampler": merged(sampler_preset(str(sampler["preset"])), fields)}
+    return options
+
+
+def is_preset(word: str) -> bool:
+    """Whether a value of `--sampler` is meant as a preset's name, and not as a file or as options."""
+    return re.fullmatch(r"[\w-]+", word) is not None
+
+
+def sampler_preset(name: str) -> dict[str, Any]:
+    """Every sampler option as a preset has it.
+
+    Raises:
+        CommandError: no such preset; names the closest.
+    """
+    from magnet.generation.conditioning import SamplerOptions
+
+    try:
+        return dataclasses.asdict(SamplerOptions.preset(name))
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+
+
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """One set of options over another, group by group."""
+    both = {**below, **above}
+    for key in below.keys() & above.keys():
+        if isinstance(below[key], dict) and isinstance(above[key], dict):
+            both[key] = merged(below[key], above[key])
+    return both

@@ -1,0 +1,383 @@
+"""`magnet data list|info|check|fake|prepare|download`: from a download to a store that trains."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magnet.cli.data_list import add_list, run_list
+from magnet.cli.data_options import all_reader_options, order_of, reader_parser
+from magnet.cli.data_shown import (
+    bar,
+    clips_by_people,
+    file_bars,
+    show_gaps,
+    show_notes,
+    show_persons,
+    show_problems,
+    show_skipped,
+    show_splits,
+)
+from magnet.cli.errors import CommandError, no_such
+
+if TYPE_CHECKING:
+    from magnet.body import Body
+    from magnet.datamodules.preparing.check import Checked
+
+DESCRIPTION = """\
+Prepare, check, describe, fake and download data sets.
+
+  magnet data list                                   who may use each, where to ask, what must lie where
+  magnet data list dd100                             the same of one
+  magnet data fake interx OUT                        a tiny made-up download, to try everything out
+  magnet data check DOWNLOAD_OR_STORE                all assertions, a summary, a picture
+  magnet data prepare interx --root DOWNLOAD --out STORE --body SMPLX_NEUTRAL.npz
+  magnet data prepare bvh --root FOLDER STORE        recordings of your own: docs/own.md
+  magnet data info STORE                             what a store holds
+  magnet data download cmu --subjects 60,61 OUT      CMU's free recordings
+"""
+FAILED = 1
+"""Exit code of a check that found a problem."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """`magnet data ...`. Returns the exit code.
+
+    Raises:
+        CommandError: no such command.
+        ValueError: a data set, option or folder that does not fit; says what does.
+        OSError: a folder or disk that cannot be used.
+    """
+    command, *words = arguments or ["--help"]
+    if command in ("-h", "--help"):
+        parser().print_help()
+        return 0
+    if command not in COMMANDS:
+        raise CommandError(
+            no_such("command", f"data {command}", [f"data {name}" for name in COMMANDS], "magnet data --help")
+        )
+    # Intermixed, so that OUT may come after options: argparse would take it as left out once another came before them.
+    known, rest = command_parser(command).parse_known_intermixed_args(words)
+    if rest and not (command in ("prepare", "check") and all_reader_options(rest)):
+        raise ValueError(f"magnet data {command}: no option {rest[0]}; see magnet data {command} --help")
+    known.reader_options = rest
+    return show_help(known) if known.help else int(known.run(known))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The commands."""
+    whole = argparse.ArgumentParser(
+        prog="magnet data", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = whole.add_subparsers(metavar="COMMAND")
+    for name, (_, _, what) in COMMANDS.items():
+        commands.add_parser(name, help=what)
+    return whole
+
+
+def command_parser(command: str) -> argparse.ArgumentParser:
+    """A command's options."""
+    add, run, what = COMMANDS[command]
+    one = argparse.ArgumentParser(f"magnet data {command}", description=what, add_help=False, allow_abbrev=False)
+    one.add_argument("-h", "--help", action="store_true", help="show this")
+    add(one)
+    one.set_defaults(run=run, parser=one)
+    return one
+
+
+def show_help(given: argparse.Namespace) -> int:
+    """Help of a command, with a data set's own options where one is named."""
+    from magnet.datamodules import catalogue
+
+    given.parser.print_help()
+    if given.run in (run_prepare, run_check) and given.name in catalogue.NAMES:
+        kind = catalogue.find(given.name).load_reader()
+        print(f"\noptions of {kind.title}:\n")
+        reader_parser(kind).print_help()
+    return 0
+
+
+# -- options -----------------------------------------------------------------------------------
+
+
+def add_info(one: argparse.ArgumentParser) -> None:
+    one.add_argument("path", nargs="?", help="a prepared store")
+
+
+def add_work(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--body", default="open", help="SMPL-X's or SMPL's file, npz or pkl (register at https://smpl-x.is.tue.mpg.de)"
+    )
+    one.add_argument(
+        "--bodies",
+        nargs="+",
+        default=(),
+        help="folder or files of gendered bodies (SMPLX_FEMALE.npz ...) that the shape numbers belong to; people are "
+        "expressed in the one --body",
+    )
+    one.add_argument(
+        "--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)"
+    )
+    one.add_argument("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
+    one.add_argument("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
+    one.add_argument("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
+    one.add_argument("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
+    one.add_argument("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
+
+
+def add_check(one: argparse.ArgumentParser) -> None:
+    one.add_argument("path", nargs="?", help="a prepared store, or the folder of a download")
+    one.add_argument("--name", default=None, help="which data set a download is; default: found by its layout")
+    one.add_argument("--picture", default=None, help="PNG to write (default: NAME_check.png here); none: no picture")
+    add_work(one)
+
+
+def add_prepare(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="of the data set, see magnet data list")
+    one.add_argument("place", nargs="?", metavar="OUT", help="the same as --out")
+    one.add_argument("--root", help="folder of the download, or of your own recordings")
+    one.add_argument("--out", help="folder of the store; run again to go on or to bring it up to date")
+    add_work(one)
+    one.add_argument("--reader.OPTION", metavar="VALUE", help="an option of the data set: prepare NAME --help")
+
+
+def add_fake(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="of the data set, see magnet data list; cmu as well")
+    one.add_argument("out", nargs="?", help="folder to write to; new or empty")
+    one.add_argument("--takes", type=int, default=4, help="(default: %(default)s)")
+    one.add_argument("--frames", type=int, default=300, help="of a take at 30 fps, DuoBox: its test part (%(default)s)")
+    one.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
+
+
+def add_download(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="cmu; the others are given out by their authors alone")
+    one.add_argument("out", nargs="?", help="folder to write to; run again to go on")
+    one.add_argument("--subjects", default="60,61", help="numbers with commas (default: %(default)s, salsa couples)")
+    one.add_argument("--base_url", default=None, help="another copy of the site")
+    one.add_argument(
+        "--any_version", action="store_true", help="take files, too, whose SHA-256 is known to be another: issued anew"
+    )
+
+
+def needed(given: argparse.Namespace, *names: str) -> list[str]:
+    """Values that must be there.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for action in given.parser._actions:
+        if action.dest in names and getattr(given, action.dest) is None:
+            name, prog = "".join(action.option_strings[:1]) or action.dest, given.parser.prog
+            raise ValueError(f"{prog}: {name} is missing ({action.help}); see {prog} --help")
+    return [getattr(given, name) for name in names]
+
+
+# -- commands ----------------------------------------------------------------------------------
+
+
+def run_info(given: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from magnet.datamodules.preparing.check import noted
+    from magnet.datamodules.preparing.prepare import absent_note
+    from magnet.datamodules.store.reader import Folder
+
+    (path,) = needed(given, "path")
+    folder = Folder(path)
+    m = folder.manifest
+    out = Console(highlight=False)
+    out.print(f"[bold]{m['title']}[/bold]  {m['licence']}\n{m['source']}", soft_wrap=True)
+    genders = "".join(f", from {gender} ones ({digest[:8]})" for gender, digest in m["body"].get("genders", {}).items())
+    body = f"body {m['body']['id']} ({m['body']['sha256'][:8]}){genders}"
+    out.print(f"{body}, {m['fps']:g} fps, store format {m['format']}", soft_wrap=True)
+    rows = sum(split["person frames"] for split in m["splits"].values())
+    files = [folder.path / name for name in folder.files()]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    out.print(f"{rows:,} frames of one person, {size / 2**20:.1f} MiB; splits by {m['splits by']}")
+    if m.get("limit"):
+        out.print(f"a try-out: at most {m['limit']} takes of each split")
+    show_splits(
+        [
+            (
+                name,
+                str(split["takes"]),
+                f"{split['clips']} ({', '.join(f'{k} of {n}' for n, k in split['clips by people'].items())})",
+                f"{split['frames']:,}",
+                f"{split['frames'] / 30 / 60:.1f}",
+                str(len(split["shards"])),
+            )
+            for name, split in sorted(m["splits"].items(), key=lambda item: ("train", "val", "test").index(item[0]))
+        ]
+    )
+    show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
+    show_notes([noted(entry["note"], entry["takes"]) for entry in m["notes"]])
+    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    if m.get("listed but not there"):
+        out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
+    if m["left out"]:
+        out.print(f"{len(m['left out'])} takes are in no split")
+    show_gaps(clips_by_people(m))
+    return 0
+
+
+def run_check(given: argparse.Namespace) -> int:
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.store.reader import MANIFEST, STATE
+
+    path = Path(needed(given, "path")[0]).expanduser()
+    if (path / MANIFEST).exists() or (path / STATE).is_dir():
+        found, body = checked_store(given, path)
+    elif not path.is_dir():
+        raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
+    elif (name := given.name or check.recognise(path)) == "cmu":
+        found, body = checked_cmu(given, path)
+    else:
+        found, body = checked_download(given, name, path)
+    show_splits(list(check.lines(found)), title=found.title)
+    show_notes(found.notes)
+    show_skipped(found.skipped)
+    show_gaps(found.clips_by_people())
+    picture = Path(given.picture or f"{found.name}_check.png")
+    if given.picture != "none" and check.draw(found, picture, body):
+        print(f"picture: {picture}")
+    show_problems(found.problems)
+    print(f"{len(found.problems)} problems" if found.problems else "all assertions hold")
+    return FAILED if found.problems else 0
+
+
+def checked_store(given: argparse.Namespace, path: Path) -> tuple[Checked, Body | None]:
+    """What was found, and the body to draw."""
+    from magnet.body import load_body
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.store.reader import Folder
+
+    refuse_unused(given, "a store, which is checked whole, as it was prepared,")
+    body = load_body(given.body) if given.body != "open" else None
+    with bar() as tell:
+        return check.check_store(Folder(path), body, tell), body
+
+
+def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
+    """What was found, and the body to draw."""
+    from magnet.datamodules.cmu import CMU
+    from magnet.datamodules.preparing import check
+
+    refuse_unused(given, "CMU's recordings, all of which are fitted once and kept,", "name")
+    data = CMU(str(path), body_model=given.body)
+    return check.check_cmu(data), data.body
+
+
+def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[Checked, Body]:
+    """What was found, and the body to draw."""
+    from magnet.datamodules.preparing import check
+    from magnet.datamodules.preparing.prepare import read_splits
+
+    order = order_of(given, name, str(path))
+    body, splits = order.body(), read_splits(given.splits) if given.splits else None
+    with bar() as tell:
+        return check.check_download(order, given.workers, splits, given.limit, tell), body
+
+
+def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
+    """Options that would change nothing.
+
+    Raises:
+        ValueError: one was given.
+    """
+    used = ("path", "picture", "body", "workers", "reader_options", *used)
+    set_ones = {name for name, value in vars(given).items() if value != given.parser.get_default(name)}
+    if words := [*(f"--{name}" for name in sorted(set_ones.difference(used))), *given.reader_options]:
+        raise ValueError(f"{given.parser.prog}: {what} has no use for {words[0]}; leave it out")
+
+
+def run_prepare(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+    from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
+
+    if given.place and given.out and given.place != given.out:
+        raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
+    given.out = given.out or given.place
+    name, root, out = needed(given, "name", "root", "out")
+    order = order_of(given, name, root)
+    splits = read_splits(given.splits) if given.splits else None
+    with bar() as tell:
+        report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
+    m = report.folder.manifest
+    for line in order.reader().summary():
+        print(f"note: {line}")
+    if m["listed but not there"]:
+        print(absent_note(m["listed but not there"]))
+    print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
+    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    show_gaps(clips_by_people(m))
+    takes = sum(split["takes"] for split in m["splits"].values())
+    data = catalogue.find(name).data.partition(":")[2]
+    body = "" if given.body == "open" else f" --data.body_model {given.body}"
+    print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
+    if name in catalogue.OWN:
+        print(
+            f"  magnet fit --config configs/finetune.yaml --data.path {out}{body}   # the shipped model goes on with it"
+        )
+    print(f"  magnet fit --model Tokenizer --data {data} --data.path {out}{body}")
+    return 0
+
+
+def run_fake(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+    from magnet.datamodules.clip import at_least
+    from magnet.files import writing
+
+    name, out = needed(given, "name", "out")
+    folder = Path(out).expanduser()
+    if name == "cmu":
+        from magnet.datamodules.fakes.cmu import write
+
+        then = f"train on it:\n  magnet fit --model Tokenizer --data CMU --data.root {folder}"
+    else:
+        write = catalogue.find(name).load_fake()
+        body = "" if name == "bvh" else f" --body {folder / 'body.npz'}"
+        then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE{body}"
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} is not empty; give a new folder")
+    at_least(1, takes=given.takes, frames=given.frames)
+    with writing(folder, "choose another --out"):
+        write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    print(f"{len(files)} files of a made-up {name} are in {folder}. To {then}")
+    return 0
+
+
+def run_download(given: argparse.Namespace) -> int:
+    from magnet.datamodules import catalogue
+
+    (name,) = needed(given, "name")
+    if name != "cmu":
+        kind = catalogue.find(name).load_reader()
+        raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
+    (out,) = needed(given, "out")
+    from magnet.datamodules.reading.download import download_cmu
+    from magnet.files import writing
+
+    subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]
+    options: dict[str, Any] = {"any_version": True} if given.any_version else {}
+    options |= {} if given.base_url is None else {"base_url": given.base_url}
+    with file_bars() as tell, writing(out, "choose another --out; then run the same command again, which goes on"):
+        got = download_cmu(subjects, out, progress=tell, **options)
+    print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
+    if got.unlike:
+        print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")
+    print(f"to train on them: magnet fit --model Tokenizer --data CMU --data.root {out}")
+    return 0
+
+
+COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int], str]] = {
+    "list": (add_list, run_list, "data sets: who may use them, where to ask, what must lie where"),
+    "info": (add_info, run_info, "what a prepared store holds"),
+    "check": (add_check, run_check, "run all assertions on a store or a download; a summary and a picture"),
+    "fake": (add_fake, run_fake, "write a tiny made-up download in a data set's layout"),
+    "prepare": (add_prepare, run_prepare, "turn a download into a store, once"),
+    "download": (add_download, run_download, "fetch CMU's free recordings"),
+}

@@ -1,0 +1,67 @@
+"""Options of `magnet data prepare` and `check`: a reader's own, and what together they ask for."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magnet.datamodules.preparing.convert import Order
+    from magnet.datamodules.reading.recording import Reader
+
+
+def all_reader_options(words: Sequence[str]) -> bool:
+    """Whether words are `--reader.OPTION VALUE` or `--reader.OPTION=VALUE` alone."""
+    expected = "flag"
+    for word in words:
+        if word.startswith("--reader."):
+            expected = "value or flag" if "=" not in word else "flag"
+        elif expected == "flag":
+            return False
+    return True
+
+
+def reader_parser(kind: type[Reader]) -> Any:
+    """Options of a data set's reader, from its constructor."""
+    from jsonargparse import ArgumentParser
+
+    options = ArgumentParser(prog="magnet data prepare", exit_on_error=False, add_help=False)
+    options.add_class_arguments(kind, "reader", skip={"root"})
+    return options
+
+
+def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
+    """What was given of them.
+
+    Raises:
+        ValueError: an option that the reader has not, or a value that does not fit.
+    """
+    from jsonargparse import ArgumentError
+
+    from magnet.cli.errors import wrong_value
+
+    options = reader_parser(kind)
+    try:
+        config = options.parse_args(list(words)).as_dict().get("reader", {})
+    except ArgumentError as error:
+        known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
+        said = wrong_value(str(error)) or str(error)
+        raise ValueError(f"{kind.title}: {said}; its options are {', '.join(known) or 'none'}") from error
+    flags = {word.split("=")[0].removeprefix("--reader.") for word in words if word.startswith("--reader.")}
+    return {name: value for name, value in config.items() if name in flags}
+
+
+def order_of(given: argparse.Namespace, name: str, root: str) -> Order:
+    """What is to be prepared or checked, and how. Without --body, the body is the neutral one of --bodies."""
+    from magnet.datamodules import catalogue
+    from magnet.datamodules.preparing.canonicalize import Steps
+    from magnet.datamodules.preparing.convert import Order, families_of
+    from magnet.datamodules.preparing.genders import find_bodies
+
+    options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
+    if given.body == "open" and given.bodies:
+        families = families_of(catalogue.find(name).load_reader())
+        given.body = str(find_bodies(given.bodies, families).get("neutral", "open"))
+    steps = Steps(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)
+    return Order(name, root, options, given.body, steps, tuple(given.bodies))

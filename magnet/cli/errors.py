@@ -1,0 +1,86 @@
+"""Errors of the command, in one line that says what to do."""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import re
+from collections.abc import Sequence
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+UNION = "Does not validate against any of the Union subtypes"
+"""How jsonargparse begins to tell that a class refused its options."""
+
+
+class CommandError(Exception):
+    """Something the user can put right; shown as one line."""
+
+
+def no_such(what: str, name: str, known: Sequence[str] | dict[str, str], more: str) -> str:
+    """The message for a name that nothing has."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}."
+    return f"no {what} {name}; {hint} See {more}"
+
+
+def explain(error: Exception) -> str | None:
+    """An error in one line where the user can do something about it; None where the fault is ours."""
+    text = str(error).strip()
+    if isinstance(error, CommandError):
+        return text
+    if isinstance(error, RuntimeError) and "loading state_dict" in text:
+        return misfit(text)
+    if isinstance(error, ImportError) and "pip install" in text:
+        return text
+    if isinstance(error, OSError) and error.errno in FULL and error.args[:1] == (error.errno,):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}the disk is full: free some space, then run the same command again (--debug shows where)"
+    if isinstance(error, (ValueError, OSError)) or type(error).__name__ == "MisconfigurationException":
+        said = re.findall(r"^ *- (?!Expected )(.+)", text, re.MULTILINE) if text.startswith(UNION) else []
+        return f"{said[0] if said else text or type(error).__name__} (--debug shows where)"
+    return None
+
+
+def misfit(text: str) -> str:
+    """Torch's list of all parameters that do not fit, as one line about the first."""
+    size = re.search(
+        r"size mismatch for (\S+): copying a param with shape torch\.Size\((\[.*?\])\) from checkpoint, "
+        r"the shape in current model is torch\.Size\((\[.*?\])\)",
+        text,
+    )
+    advice = "leave out --model options to build the model that the checkpoint was made from"
+    if size:
+        name, stored, built = size.groups()
+        return f"the checkpoint is of another shape: {name} is {stored} there and {built} in this model; {advice}"
+    keys = re.search(r"(Missing|Unexpected) key\(s\) in state_dict: \"([^\"]+)\"", text)
+    what = f"{keys[1].lower()} {keys[2]}" if keys else text.splitlines()[0]
+    return f"the checkpoint is of another model: {what}; {advice}"
+
+
+KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "tuple": "a list such as [0,1]",
+    "list": "a list such as [0,1]",
+    "dict": "options",
+    "NoneType": "null",
+}
+
+
+def wrong_value(message: str, flag: str | None = None) -> str | None:
+    """The parser's lines about a value that does not fit its field, as one; None where it says something else.
+
+    Args:
+        message: jsonargparse's.
+        flag: the field as the user wrote it; by default its key.
+    """
+    key = re.search(r'Parser key "([\w.]+)"', message)
+    got = re.search(r"(?:Got|Given) value: (.*)", message)
+    kinds = re.findall(r"Expected an? (?:<class '(?:\w+\.)*(\w+)'>|\S*Literal\[(.*?)\])", message)
+    told = re.search(r"^ *- (?!Expected )", message, re.MULTILINE)  # a class that has said itself what it wants
+    if told or not (key and got and kinds):
+        return None
+    wanted = dict.fromkeys(KINDS.get(kind, kind) if kind else choices.replace("'", "") for kind, choices in kinds)
+    return f"{flag or '--' + key[1]}: got {got[1]}, expected {' or '.join(wanted)}"

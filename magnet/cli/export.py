@@ -1,0 +1,173 @@
+"""`magnet export IN... OUT`: scenes and skeletons from one format to another; OUT's suffix says which."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from magnet.motion.scene import Scene
+
+EPILOG = """\
+OUT's suffix:
+  .npz    the scene itself; with --smplx, SMPL-X's conventional keys
+  .bvh    a skeleton a person: out_0.bvh, out_1.bvh ..., all in one world
+  .glb    everybody skinned, coloured and animated in one world
+  .csv    joint positions, a row a frame and person, in metres
+  .html   a page that plays the scene, by itself
+  .mp4 .gif .webp   a film;   .png   a strip of moments
+
+for example:
+  magnet export demo/quartet.npz duet.glb --scene 0
+  magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
+  magnet export duet.npz duet.bvh --unit cm
+  magnet export duet.npz leader.glb --person 0
+  magnet export upstairs.npz duet.npz --on-floor
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    options = argparse.ArgumentParser(
+        "magnet export",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
+    options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
+    options.add_argument("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
+    options.add_argument(
+        "--person", type=int, action="append", default=[], metavar="N", help="only this person, from 0; may be repeated"
+    )
+    options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
+    options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
+    options.add_argument(
+        "--on-floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
+    )
+    options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
+    options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
+    pictures = options.add_argument_group("pictures, films and pages")
+    pictures.add_argument(
+        "--context",
+        type=int,
+        default=0,
+        metavar="FRAMES",
+        help="first frames that a model was given, in files that do not say",
+    )
+    pictures.add_argument(
+        "--style",
+        choices=("body", "light", "capsules", "skeleton"),
+        default="body",
+        help="how people look; light, a body of few vertices, is for .html",
+    )
+    pictures.add_argument("--title", help="written above")
+    bvh = options.add_argument_group("reading .bvh of other programs")
+    bvh.add_argument("--in-unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
+    bvh.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
+    bvh.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
+    bvh.add_argument(
+        "--keep-floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
+    )
+    bvh.add_argument(
+        "--joint", action="append", default=[], metavar="OURS=THEIRS", help="left_hip=Thigh_L, where names say nothing"
+    )
+    return options
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: files that cannot be read or written; says what to do.
+    """
+    options = parser().parse_args(list(arguments))
+    from magnet.body import on_floor
+    from magnet.cli.errors import CommandError
+    from magnet.export import formats
+
+    out = Path(options.out)
+    if out.suffix.lower() not in formats.WRITTEN:
+        raise CommandError(f"{out.name}: nothing writes {out.suffix or 'files without a suffix'}; use "
+                           f"{', '.join(formats.WRITTEN)}{FBX if out.suffix.lower() == '.fbx' else ''}")  # fmt: skip
+    given = dict(pair.partition("=")[::2] for pair in options.joint)
+    film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
+    reading = formats.Reading(
+        fps=None if film and len(options.inputs) == 1 else options.fps,
+        trim=options.trim,
+        unit=options.in_unit,
+        up=options.up,
+        joints=given,
+        keep_floor=options.keep_floor,
+    )
+    got = formats.read(options.inputs, options.body, reading)
+    for note in got.notes:
+        print(note)
+    scene = got.scene
+    if not scene.scenes:
+        raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
+    if options.on_floor:
+        if options.keep_floor:
+            raise CommandError("--on-floor moves people, --keep-floor leaves them: choose one")
+        scene = on_floor(scene, got.body)
+    if options.scene is not None:
+        if not 0 <= options.scene < scene.scenes:
+            raise CommandError(f"--scene {options.scene}: the file has scenes 0 to {scene.scenes - 1}")
+        scene = scene.select([options.scene])
+    if options.person:
+        scene = only(scene, options.person)
+    print(described(scene))
+    written = formats.write(
+        scene,
+        out,
+        got.body,
+        fps=options.fps,
+        unit=options.unit,
+        smplx=options.smplx,
+        context_frames=options.context,
+        style=options.style,
+        title=options.title,
+        progress=True,
+    )
+    for path in written:
+        print(f"written: {path} ({size(path)})")
+    return 0
+
+
+FBX = "; for .fbx write .glb and let Blender convert it (docs/export.md)"
+
+
+def only(scene: Scene, people: Sequence[int]) -> Scene:
+    """The scene with these people alone, who keep their slots and so their colours.
+
+    Raises:
+        CommandError: nobody of that number is there.
+    """
+    import torch
+
+    from magnet.cli.errors import CommandError
+
+    there = scene.present.any(dim=0).nonzero()[:, 0].tolist()
+    if missing := [p for p in people if p not in there]:
+        raise CommandError(f"--person {missing[0]}: the scene has {', '.join(map(str, there))}")
+    chosen = torch.zeros_like(scene.present)
+    chosen[:, list(people)] = True
+    return scene.replace(present=scene.present & chosen)
+
+
+def described(scene: Scene) -> str:
+    """What a scene holds, in a line."""
+    people = sorted(set(scene.present.sum(dim=1).tolist()))
+    count = f"{people[0]}" if len(people) == 1 else f"{people[0]} to {people[-1]}"
+    what = f"{scene.scenes} scenes of {count}" if scene.scenes > 1 else count
+    who = "person" if people == [1] else "people"
+    return f"{what} {who}, {scene.frames} frames at {scene.fps:g} fps, {scene.frames / scene.fps:.1f} s"
+
+
+def size(path: Path) -> str:
+    """A file's size for people."""
+    count = path.stat().st_size
+    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

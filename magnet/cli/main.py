@@ -1,0 +1,100 @@
+"""The command `magnet`. What needs no model is answered here without importing torch."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from magnet import __version__
+from magnet.cli.errors import CommandError, explain, no_such
+
+TRAINER_COMMANDS = {
+    "fit": "train a tokenizer or a denoiser",
+    "validate": "measure a checkpoint on validation windows",
+    "test": "sample a task on test scenes, measure it beside baselines",
+    "predict": "sample a task, write the scenes and a moving picture of them",
+}
+LIGHT_COMMANDS = {
+    "tasks": "list the tasks that are installed, with their options; `tasks show NAME` draws one",
+    "demo": "the main job on the embedded default, from nothing to a table and pictures",
+    "data": "prepare, check, describe, fake and download data sets",
+    "view": "watch scenes in the browser, or let a model play live",
+    "export": "write scenes as bvh, glb, csv, npz, html or a picture",
+}
+COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS
+
+USAGE = f"""\
+magnet {__version__}: several people move together, by diffusion forcing
+
+usage: magnet COMMAND [--option VALUE ...]
+
+{{commands}}
+
+  magnet COMMAND --help            every option of a command, and what it does
+  magnet COMMAND --print_config    the configuration that would run, as YAML
+  magnet --version
+
+options of every command:
+  --debug                          show the traceback of an error
+
+for example:
+  magnet demo
+  magnet test --task joint_future
+  magnet fit --config configs/synthetic_tokenizer.yaml
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line; `sys.argv` by default. Returns the exit code: 0, or 2 where the user can put it right."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(usage(), end="")
+        return 0
+    if arguments[0] in ("-V", "--version", "version"):
+        print(f"magnet {__version__}")
+        return 0
+    try:
+        return run(arguments[0], arguments[1:])
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
+    except KeyboardInterrupt:
+        return complain("interrupted", 130)
+    except Exception as error:
+        message = explain(error)
+        if debug or message is None:
+            raise
+        return complain(message)
+
+
+def run(command: str, arguments: list[str]) -> int:
+    """Run one command.
+
+    Raises:
+        CommandError: no such command.
+    """
+    if command in TRAINER_COMMANDS:
+        from magnet.cli.train import run_trainer
+
+        return run_trainer(command, arguments)
+    if command == "tasks":
+        from magnet.cli.tasks import list_tasks
+
+        return list_tasks(arguments)
+    if command in LIGHT_COMMANDS:
+        return int(importlib.import_module(f"magnet.cli.{command}").main(arguments) or 0)
+    raise CommandError(no_such("command", command, COMMANDS, "magnet --help"))
+
+
+def usage() -> str:
+    """What `magnet --help` says."""
+    width = max(map(len, COMMANDS))
+    return USAGE.format(commands="\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()))
+
+
+def complain(message: str, code: int = 2) -> int:
+    print(f"magnet: error: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,114 @@
+"""What `magnet test` and `magnet predict` show and write down."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+from rich.console import Console
+from rich.table import Table
+
+from magnet.cli import run_folder
+from magnet.evaluation.evaluator import UNALIGNED, Evaluation
+from magnet.evaluation.results import machine, print_table
+from magnet.motion.scene import Scene
+
+PANELS = 4
+"""Samples that a moving picture shows side by side."""
+
+
+WIDE = 100
+"""Columns that a table may have where it is written to no screen."""
+
+
+def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
+    """Print the table; write all of it as JSON and CSV, with how it came about.
+
+    Args:
+        evaluation: a run that is finished.
+        folder: to write to.
+        facts: more of how it came about.
+        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
+    """
+    results = evaluation.results
+    if results is None:
+        return
+    results.meta.update(run_folder.provenance() | {"machine": machine()} | facts)
+    title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
+    console = Console() if sys.stdout.isatty() else Console(width=WIDE)
+    shown = (
+        results if full else replace(results, rows={m: row for m, row in results.rows.items() if m not in UNALIGNED})
+    )
+    print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
+    print(cost(results.meta["health"]))
+    results.save_json(folder / "results.json")
+    results.save_csv(folder / "results.csv")
+    more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"
+    print(f"written: {folder / 'results.json'} and .csv{more}")
+
+
+def cost(health: dict[str, float]) -> str:
+    """What sampling cost, in a line."""
+    calls, evaluations = health["calls"], health["evaluations"]
+    return f"sampling: {calls:.0f} network calls a batch, {evaluations:.0f} denoiser evaluations a scene"
+
+
+def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
+    """Print and write what a module without an evaluation of its own has logged."""
+    values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
+    table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
+    for name, value in values.items():
+        table.add_row(name, f"{value:.6g}")
+    Console().print(table)
+    folder.mkdir(parents=True, exist_ok=True)
+    plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n")
+    lines = ["metric,value", *(f"{name},{value!r}" for name, value in values.items())]
+    (folder / "results.csv").write_text("\n".join(lines) + "\n")
+    print(f"written: {folder / 'results.json'} and .csv")
+
+
+def write_scenes(
+    predicted: list[Scene],
+    evaluation: Evaluation,
+    model: Any,
+    data: Any,
+    folder: Path,
+    picture: str,
+    pictures: int,
+) -> None:
+    """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames.
+
+    What was sampled and what it cost is written beside them.
+    """
+    from magnet.export.picture import contact_sheet
+    from magnet.export.video import render_video
+
+    rank = f"{model.global_rank}-" if model.trainer.world_size > 1 else ""
+    number = 0
+    for batch in predicted:
+        for first in range(0, batch.scenes, evaluation.samples):
+            scene = batch.select(slice(first, first + evaluation.samples)).to("cpu")
+            name = f"{rank}{number:04d}{_safe(scene)}"
+            scene.save(folder / "scenes" / f"{name}.npz")
+            if picture != "none" and number < pictures and model.global_rank == 0:
+                shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
+                look = {"context_frames": data.context_frames, "body": data.body.to("cpu")}
+                print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
+                print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
+            number += 1
+    facts = evaluation.facts(model) | run_folder.provenance() | {"machine": machine()}
+    (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
+    print(cost(facts["health"]))
+    print(f"written: {number} scenes of {evaluation.samples} samples to {folder / 'scenes'}")
+
+
+def _safe(scene: Scene) -> str:
+    name = re.sub(r"[^A-Za-z0-9]+", "_", scene.names[0] if scene.names else "").strip("_")
+    return f"_{name}" if name else ""

@@ -1,0 +1,178 @@
+"""The parser behind the command: help that explains every field, and errors in a line."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import inspect
+import re
+import sys
+from collections.abc import Mapping
+from typing import Any, ClassVar, NoReturn
+
+from lightning.pytorch.cli import LightningArgumentParser
+
+from magnet.cli.errors import wrong_value
+
+USAGE = (
+    "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
+    "{more}[--ckpt_path FILE] [--trainer.FIELD VALUE]"
+)
+
+
+SHARING = ("model", "data")
+"""Their classes have many fields in common, which help tells once. Of a task all fields are told."""
+
+TRAINER = "Customize every aspect of training via flags"
+"""Lightning's title over the Trainer's options."""
+
+REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
+NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
+
+
+class Parser(LightningArgumentParser):
+    """Knows the classes that can be named under `model`, `data` and `task`, for help and for suggestions."""
+
+    root: ClassVar[Parser | None] = None
+    """The parser of the command; the parsers of classes inside it know only their own fields."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.command = ""
+        self.arguments: list[str] = []
+        self.classes: dict[str, dict[str, type]] = {}
+        self.chosen: Mapping[str, str] = {}
+
+    def format_help(self, *args: Any, **kwargs: Any) -> str:
+        """Every option: first what a run has in all cases, then the fields of each class."""
+        if not self.command:
+            return super().format_help(*args, **kwargs)
+        self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
+        for key in self.classes:
+            self._name_choices(key)
+        longest_last = sorted(self._action_groups, key=lambda group: (group.title or "").startswith(TRAINER))
+        self._action_groups = longest_last
+        parts = [super().format_help(*args, **kwargs)]
+        for key, classes in self.classes.items():
+            shared: set[str] = set()
+            for name, kind in classes.items():
+                parts.append(_fields_help(key, name, kind, shared if key in SHARING else set()))
+        return "\n".join(parts)
+
+    def _name_choices(self, key: str) -> None:
+        """Head a group by what can be chosen, in place of class paths and of what base classes say of themselves."""
+        names = ", ".join(self.classes[key])
+        for group in self._action_groups:
+            for action in group._group_actions:
+                if f"--{key}.help" in action.option_strings:
+                    action.help = argparse.SUPPRESS
+                if f"--{key}" in action.option_strings:
+                    action.help = argparse.SUPPRESS
+                    path = action.default["class_path"] if action.default else ""
+                    default = f"; default: {path.rpartition('.')[2]}" if path else ""
+                    group.title = f"--{key} NAME"
+                    group.description = f"One of {names}{default}. What each is and its --{key}.FIELD VALUE is below."
+
+    def explain(self, key: str, value: str, text: str) -> None:
+        """Say of an option that is a group of others what else may stand behind it."""
+        for action in self._actions:
+            if action.option_strings == [f"--{key}"]:
+                action.metavar, action.help = value, text
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Say what is wrong, and the closest thing that would be right."""
+        told = self if self.command or Parser.root is None else Parser.root
+        said = told.clearer(message)
+        stop = "" if said.endswith("?") else "."
+        print(f"magnet {told.command}: error: {said}{stop} See magnet {told.command} --help", file=sys.stderr)
+        sys.exit(2)
+
+    def clearer(self, message: str) -> str:
+        """The parser's message without its internals."""
+        unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
+        refused = re.search(REFUSED, message)
+        if unknown and not unknown[1].startswith("-"):
+            meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
+            hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
+            return f"{unknown[1]} is no option; {hint}"
+        if unknown or refused:
+            field = refused[1] if refused else ""
+            name = unknown[1].partition("=")[0] if unknown else self._written(field, field)
+            return f"no option {name}{_closest(name, self._flags())}"
+        required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
+        if required and required[1] in self.classes:
+            key = required[1]
+            return f"say which {key}: --{key} {' or '.join(self.classes[key])}, or a --config that does"
+        named = re.search(r'Parser key "(\w+)"', message)
+        path = re.search(r"Expected a dot import path string: (\S+)", message)
+        if named and path and named[1] in self.classes:
+            known = ", ".join(self.classes[named[1]])
+            return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
+        key = re.search(r'Parser key "([\w.]+)"', message)
+        if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
+            return told
+        message = re.sub(r"Call to compute_fn of link .* failed: ", "", message)
+        lines = [line.strip() for line in message.splitlines() if line.strip()]
+        return " ".join(line for line in lines if not line.startswith(NOISE)) or message
+
+    def _written(self, field: str, otherwise: str) -> str:
+        """A field as the user wrote it: `--model.foo` for `foo`."""
+        flags = [argument.partition("=")[0] for argument in self.arguments]
+        return next((flag for flag in flags if flag.startswith("--") and flag.endswith(f".{field}")), otherwise)
+
+    def _flags(self) -> list[str]:
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        for key, classes in self.classes.items():
+            chosen = self.chosen.get(key)
+            for name, kind in classes.items():
+                if chosen is None or chosen.rpartition(".")[2] == name:
+                    flags.extend(f"--{option}" for option in _options(key, kind))
+        return flags
+
+
+def _closest(name: str, known: list[str]) -> str:
+    """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
+    group, _, leaf = name.rpartition(".")
+    flags = [flag for flag in known if not flag.endswith((".help", "+"))]
+    fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
+    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
+    leaf = leaf.lstrip("-")
+    near = [by_leaf[leaf]] if leaf in by_leaf else []
+    near = near or [flag for each, flag in by_leaf.items() if leaf in _words(each)][:-5:-1]
+    near = near or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
+    near = near or difflib.get_close_matches(name, [] if fields else flags, n=1)
+    if near:
+        return f"; did you mean {' or '.join(near)}?"
+    return f"; there are {', '.join(dict.fromkeys(fields))}" if group and fields else ""
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """What a field may be called in short: each of its words, and their first letters, as `lr`."""
+    words = name.split("_")
+    return (*words, "".join(word[:1] for word in words))
+
+
+def _options(key: str, kind: type) -> list[str]:
+    return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
+
+
+def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:
+    """Fields of one class as `--key.field`, less those that a class before it has told the same of."""
+    parser = LightningArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+    parser.add_class_arguments(kind, key, fail_untyped=False)
+    told: set[str] = set()
+    for action in parser._actions:
+        flags = action.option_strings
+        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags):
+            action.help = argparse.SUPPRESS
+            continue
+        told.add(f"{flags} {action.default!r} {action.help}")
+        if f"{flags} {action.default!r} {action.help}" in shared:
+            action.help = argparse.SUPPRESS
+    more = " (more fields as above)" if told & shared else "" if told else " (no fields)"
+    shared |= told
+    first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
+    text = parser.format_help()
+    lines = text.splitlines()
+    start = next((i for i, line in enumerate(lines) if line.lstrip().startswith("--")), len(lines))
+    return f"--{key} {name}: {first}{more}\n" + "\n".join(lines[start:]) + "\n"

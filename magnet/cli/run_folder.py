@@ -1,0 +1,302 @@
+"""What a run leaves behind: its folder, configuration, provenance, logs and checkpoints."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+import magnet
+from magnet.cli.checkpoint_config import CONFIG_KEY
+from magnet.cli.errors import CommandError
+
+PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma")
+FOLDER_VARIABLE = "MAGNET_RUN_FOLDER"
+MONITOR = "val/loss"
+LATEST = "latest"
+
+
+def run_folder(root: Path, out: str | None) -> Path:
+    """Folder of this run: `out`, else a new one under `root` named by the time. Processes it starts share it.
+
+    Raises:
+        CommandError: `out` is a file.
+    """
+    child = "LOCAL_RANK" in os.environ and FOLDER_VARIABLE in os.environ
+    if child:
+        return Path(os.environ[FOLDER_VARIABLE])
+    folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    if folder.is_file():
+        raise CommandError(f"--out {out}: got a file, expected a folder for what the run leaves behind")
+    number = 1
+    while out is None and folder.exists():
+        number += 1
+        folder = folder.with_name(f"{folder.name.partition('-v')[0]}-v{number}")
+    os.environ[FOLDER_VARIABLE] = str(folder)
+    return folder
+
+
+def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
+    """CSV always, TensorBoard where it is installed, wandb on request; only training is logged by default.
+
+    Raises:
+        CommandError: wandb is asked for and not installed.
+    """
+    root, name = str(folder.parent), folder.name
+    chosen: list[Logger] = []
+    if fit:
+        if find_spec("tensorboard") or find_spec("tensorboardX"):
+            chosen.append(TensorBoardLogger(root, "", name, default_hp_metric=False))
+        chosen.append(CSVLogger(root, "", name))
+    if wandb is not None:
+        if find_spec("wandb") is None:
+            raise CommandError('--wandb needs the package wandb: pip install "magnet-motion[wandb]"')
+        from lightning.pytorch.loggers import WandbLogger
+
+        folder.mkdir(parents=True, exist_ok=True)
+        label = f"{folder.parent.name}/{folder.name}"
+        chosen.append(WandbLogger(project="magnet", name=label, save_dir=str(folder), offline=wandb == "offline"))
+    return chosen
+
+
+def checkpoints(folder: Path, model: LightningModule) -> list[Callback]:
+    """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt`."""
+    place = folder / "checkpoints"
+    monitor = getattr(model, "monitor", MONITOR)
+    mode = getattr(model, "monitor_mode", "min")
+    return [
+        LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False),
+        ModelCheckpoint(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False),
+    ]
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """Also saves when training ends between two validations, which Lightning's does not."""
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
+
+
+def progress_bar(sampling: bool = False) -> ProgressBar:
+    """A bar on a terminal, now and then a line elsewhere; for sampling it counts denoising steps."""
+    if sampling:
+        return SamplingProgress()
+    return RichProgressBar() if sys.stdout.isatty() else ProgressLines()
+
+
+def learning_rate() -> Callback:
+    return LearningRateMonitor(logging_interval="step")
+
+
+class ProgressLines(ProgressBar):
+    """Progress for logs: a line every `seconds`, with what is left.
+
+    Args:
+        seconds: at least so much time between two lines.
+    """
+
+    def __init__(self, seconds: float = 30.0) -> None:
+        super().__init__()
+        self.seconds = seconds
+        self.began = self.said = time.monotonic()
+
+    def disable(self) -> None:
+        self.seconds = float("inf")
+
+    def _start(self) -> None:
+        self.began = self.said = time.monotonic()
+
+    def _step(self, what: str, done: int, total: float, more: str = "") -> None:
+        now = time.monotonic()
+        if now - self.said < self.seconds or not done:
+            return
+        self.said = now
+        left = ""
+        if total != float("inf"):
+            left = f", {clock((now - self.began) * (total - done) / done)} left"
+        print(f"{what} {done}/{total:g}{left}{more}", flush=True)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._start()
+        self.first = trainer.global_step
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        total = float(trainer.estimated_stepping_batches) - self.first
+        numbers = {key: value for key, value in self.get_metrics(trainer, pl_module).items() if key != "v_num"}
+        more = "".join(f", {key} {value:.4g}" for key, value in numbers.items() if isinstance(value, float))
+        self._step("train: step", trainer.global_step - self.first, total, more)
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._start()
+
+    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
+        self._step("test: batch", args[2] + 1, float(sum(trainer.num_test_batches)))
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._start()
+
+    def on_predict_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
+        self._step("predict: batch", args[2] + 1, float(sum(trainer.num_predict_batches)))
+
+
+class SamplingProgress(ProgressBar):
+    """Progress of `test` and `predict` in denoising steps: one batch of scenes can take minutes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enabled = True
+        self.bar: Progress | None = None
+        self.lines = ProgressLines()
+
+    def disable(self) -> None:
+        self.enabled = False
+
+    def _begin(self, what: str, batches: float, trainer: Trainer, model: Any) -> None:
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        plan = model.evaluation.schedule(model, data.context_frames, data.horizon_frames)
+        self.what, self.done, self.total = what, 0, int(batches) * plan.evaluations
+        model.evaluation.progress = self._advance
+        self.lines._start()
+        if self.enabled and trainer.is_global_zero and sys.stdout.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self.bar = Progress(*columns)
+            self.bar.start()
+            self.task = self.bar.add_task(f"{what}: denoising steps", total=self.total)
+
+    def _advance(self, steps: int) -> None:
+        self.done += steps
+        if self.bar is not None:
+            self.bar.advance(self.task, steps)
+        elif self.enabled:
+            self.lines._step(f"{self.what}: denoising step", self.done, self.total)
+
+    def _end(self) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin("test", sum(trainer.num_test_batches), trainer, pl_module)
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin("predict", sum(trainer.num_predict_batches), trainer, pl_module)
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._end()
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._end()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._end()
+
+
+def clock(seconds: float) -> str:
+    """Seconds as h:mm:ss."""
+    minutes, second = divmod(round(seconds), 60)
+    hour, minute = divmod(minutes, 60)
+    return f"{hour}:{minute:02}:{second:02}"
+
+
+class Record(Callback):
+    """Writes the configuration and where the run came from, and puts the options into every checkpoint.
+
+    Args:
+        folder: of the run.
+        config: the whole configuration as YAML.
+        options: {"model": ..., "data": ...} in plain values, for checkpoints.
+        facts: what else run.json says.
+        latest: keep a link `latest` beside the folder that leads to it once there is a checkpoint.
+    """
+
+    def __init__(
+        self, folder: Path, config: str, options: dict[str, Any], facts: dict[str, Any], latest: bool = False
+    ) -> None:
+        self.folder, self.config, self.options, self.facts, self.latest = folder, config, options, facts, latest
+        self.begun = False
+
+    def _begin(self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any) -> None:
+        """Write, once data, model and task have turned out to fit: a run that never began leaves nothing behind."""
+        if self.begun or not trainer.is_global_zero or getattr(trainer, "fast_dev_run", False):
+            return
+        self.begun = True
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "config.yaml").write_text(self.config)
+        (self.folder / "run.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
+
+    on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Say how an interrupted training goes on."""
+        last = self.folder / "checkpoints" / "last.ckpt"
+        if isinstance(exception, KeyboardInterrupt) and trainer.is_global_zero and last.exists():
+            print(f"interrupted; the same command with --ckpt_path {last} goes on", file=sys.stderr)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        checkpoint[CONFIG_KEY] = self.options
+        checkpoint["magnet_version"] = magnet.__version__
+        if trainer.is_global_zero and self.latest:
+            point(self.folder.with_name(LATEST), self.folder)
+
+
+def point(link: Path, folder: Path) -> None:
+    """Make `link` lead to `folder` beside it, where links can be made at all."""
+    if link.exists() and not link.is_symlink():
+        return  # somebody's own folder
+    part = link.with_name(f".{link.name}.part")
+    try:
+        part.unlink(missing_ok=True)
+        part.symlink_to(folder.name, target_is_directory=True)
+        part.replace(link)
+    except OSError as error:
+        print(f"magnet: no link {link}: {error}", file=sys.stderr)
+
+
+def provenance() -> dict[str, Any]:
+    """When, by what command, from which commit and with which packages."""
+    return {
+        "command": shlex.join(["magnet", *sys.argv[1:]]),
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "magnet": magnet.__version__,
+        "python": sys.version.split()[0],
+        "packages": {name: _version(name) for name in PACKAGES},
+        "git": git_state(Path(magnet.__file__).parent),
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit of the source tree and whether it has changes; None where magnet is installed without one."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10)
+        if done.returncode:
+            raise OSError(done.stderr)
+        return done.stdout.strip()
+
+    try:
+        if not git("ls-files", "--", "__init__.py"):
+            return None  # a repository that merely lies around an installed package
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain"))}
+    except (OSError, subprocess.TimeoutExpired):
+        return None

@@ -1,0 +1,405 @@
+"""`magnet fit|validate|test|predict`: one LightningCLI."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import logging
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import Any, Literal
+
+os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's calls, not ours
+
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+from magnet import weights
+from magnet.cli import checkpoint_config, class_options, config_files, outputs, run_folder
+from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.config_files import Layer
+from magnet.cli.errors import CommandError
+from magnet.cli.parser import Parser
+from magnet.cli.tasks import NamedTask, alias_path, aliases, task_of
+from magnet.datamodules.plugins import discover
+from magnet.denoiser.module import Denoiser
+from magnet.evaluation.evaluator import Evaluation
+from magnet.files import writing
+from magnet.generation.conditioning import SamplerOptions
+from magnet.motion.scene import Scene
+from magnet.sampling.presets import PRESETS
+
+MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
+DATA = {
+    "Synthetic": "magnet.datamodules.synthetic",
+    "CMU": "magnet.datamodules.cmu",
+    "Mixed": "magnet.datamodules.mixed",
+    "Prepared": "magnet.datamodules.prepared",
+    "DuoBox": "magnet.datamodules.duobox",
+    "DD100": "magnet.datamodules.dd100",
+    "ReMoCap": "magnet.datamodules.remocap",
+    "InterX": "magnet.datamodules.interx",
+    "Embody3D": "magnet.datamodules.embody3d",
+    "InterHuman": "magnet.datamodules.interhuman",
+    "AIOZ": "magnet.datamodules.aioz",
+    "Hi4D": "magnet.datamodules.hi4d",
+    "CHI3D": "magnet.datamodules.chi3d",
+}
+"""Classes with short names, and where they are; the first ones are the default."""
+
+DEFAULT_TASK = "joint_future"
+SAMPLING = ("test", "predict")
+SEED = 1111
+SILENCED = (
+    ".*does not have many workers.*",
+    ".*LeafSpec.*",
+    ".*logging interval.*",
+    ".*is not empty.*",
+    ".*callbacks used to create the checkpoint need to be provided.*",
+    ".*The dirpath has changed.*",
+    ".*in eval mode at the start of training.*",
+)
+"""Lightning's hints that nobody here can follow."""
+RUNS = Path("runs")
+
+
+def run_trainer(command: str, arguments: list[str]) -> int:
+    """Parse and run one of the Trainer's commands.
+
+    Raises:
+        CommandError: something the user can put right.
+    """
+    quiet()
+    given = Arguments.split(arguments)
+    if any(flag in ("-h", "--help") for flag in given.flags):
+        MagnetCLI(command, ["--help"], None, Path(), {})
+        return 0
+    named_classes()
+    checkpoint_config.import_named(given)
+    words = task_words(command, given)
+    name, out = run_name(command, given.files), given.value("out")
+    checkpoint = which_checkpoint(command, given, name)
+    if command == "fit":
+        checkpoint_config.refuse_linked(given)
+    layer: dict[str, Any] = {}
+    if checkpoint is not None:
+        stored = checkpoint_config.Stored.read(checkpoint)
+        keep_data = given.value("ckpt_path") is not None
+        layer = checkpoint_config.defaults(stored, given, command == "fit", path_of(DATA), keep_data)
+    elif command == "fit" and (start := given.option("model", "start_from")):
+        layer = checkpoint_config.started(start, given, MODELS, path_of(DATA))
+    folder = run_folder.run_folder(RUNS / name, out)
+    preset, words = sampler_words(command, words)
+    settled = class_options.settle([Layer("", layer), *given.layers, Layer("", preset)], words)
+    for note in settled.notes:
+        print(f"magnet: {note}", file=sys.stderr)
+    layers = [word for each in settled.layers if each.options for word in ("--config", each.word())]
+    goes_on = "; then go on with --ckpt_path last, if there is one" if command == "fit" else ""
+    with writing(folder, f"choose another --out{goes_on}"):
+        MagnetCLI(command, [*layers, *words], checkpoint, folder, settled.classes)
+    return 0
+
+
+def named_classes() -> tuple[dict[str, type], dict[str, type]]:
+    """Models and data sets with short names; importing them is what makes the short names work."""
+
+    def load(classes: dict[str, str]) -> dict[str, type]:
+        return {name: getattr(importlib.import_module(module), name) for name, module in classes.items()}
+
+    return load(MODELS), load(DATA) | {one.name: one.data for one in discover().plugins}
+
+
+def path_of(classes: dict[str, str]) -> str:
+    """Dotted path of the default class."""
+    name, module = next(iter(classes.items()))
+    return f"{module}.{name}"
+
+
+def quiet() -> None:
+    """Silence what a user can do nothing about."""
+    for text in SILENCED:
+        warnings.filterwarnings("ignore", text)
+    log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    if not log.filters:
+        log.addFilter(lambda record: "Tip:" not in record.getMessage())
+
+
+def run_name(command: str, files: list[str]) -> str:
+    """Name of a run's folder: its configuration's, else the command's."""
+    if not files:
+        return command
+    file = Path(files[-1]).resolve()
+    return file.parent.parent.name if file.name == "config.yaml" and (file.parent / "run.json").exists() else file.stem
+
+
+def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
+    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
+
+    Raises:
+        CommandError: it is not there.
+    """
+    name, out = given.value("ckpt_path"), given.value("out")
+    if name is None and (command == "fit" or given.only_shown):
+        return None
+    folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
+    return checkpoint_config.find_checkpoint(name, folders)
+
+
+def task_words(command: str, given: Arguments) -> list[str]:
+    """The flags for the parser, with the task's name checked and made a path.
+
+    Raises:
+        CommandError: no such task.
+    """
+    flags = given.without("ckpt_path")
+    name = given.class_of("task")
+    if command not in SAMPLING or name is None:
+        return flags
+    try:
+        path = alias_path(name)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    rest = Arguments(flags).without("task")
+    return ["--task", path, *rest]
+
+
+def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
+
+    Raises:
+        CommandError: no such preset.
+    """
+    name = Arguments(flags).flag("sampler")
+    if command not in SAMPLING or name is None or not config_files.is_preset(name):
+        return {}, flags
+    return {"sampler": config_files.sampler_preset(name)}, Arguments(flags).without("sampler")
+
+
+class MagnetCLI(LightningCLI):
+    """LightningCLI for one command, with this project's order of precedence: flag, file, checkpoint, default.
+
+    Args:
+        command: fit, validate, test or predict.
+        arguments: what follows it; the checkpoint's own options are already in front.
+        checkpoint: to start from.
+        folder: of this run.
+        classes: those that the layers and flags name under `model`, `data` and `task`.
+    """
+
+    def __init__(
+        self, command: str, arguments: list[str], checkpoint: Path | None, folder: Path, classes: dict[str, str]
+    ) -> None:
+        self.command, self.arguments, self.checkpoint, self.folder = command, arguments, checkpoint, folder
+        self.classes = classes
+        self.evaluation: Evaluation | None = None
+        self.predicted: list[Any] = []
+        self.models, self.data = named_classes()
+        self.tasks = aliases() if command in SAMPLING else {}
+        super().__init__(
+            LightningModule,
+            LightningDataModule,
+            save_config_callback=None,
+            seed_everything_default=SEED,
+            parser_kwargs={"prog": "magnet", command: {"description": None}},
+            parser_class=Parser,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            args=[command, *arguments],
+            auto_configure_optimizers=False,
+        )
+
+    # -- parsing -------------------------------------------------------------------------------
+
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
+        """Only the one that runs: building the others' parsers takes most of a second."""
+        hidden = {"model", "dataloaders", "train_dataloaders", "val_dataloaders", "datamodule", "weights_only"}
+        return {self.command: hidden | {"return_predictions", "verbose"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """What this project adds to the Trainer's options."""
+        assert isinstance(parser, Parser)
+        Parser.root, parser.command, parser.arguments = parser, self.command, self.arguments
+        parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.classes
+        self._default_class(parser, "data", path_of(DATA))
+        parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
+        parser.add_argument(
+            "--wandb",
+            type=Literal["online", "offline"] | None,
+            default=None,
+            help='also log to Weights & Biases; needs pip install "magnet-motion[wandb]"',
+        )
+        if self.command == "fit":
+            parser.link_arguments("data.init_args.max_agents", "model.init_args.max_agents")
+            parser.link_arguments("data.init_args.window_frames", "model.init_args.window", checkpoint_config.tokens)
+        self._default_class(parser, "model", None if self.command == "fit" else path_of(MODELS))
+        if self.command in SAMPLING:
+            parser.classes["task"] = self.tasks
+            parser.add_subclass_arguments(NamedTask, "task", required=False, instantiate=False)
+            self._default_class(parser, "task", alias_path(DEFAULT_TASK))
+            parser.add_class_arguments(SamplerOptions, "sampler")
+            parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
+            parser.add_class_arguments(Evaluation, skip={"task", "options"}, instantiate=False)
+        if self.command == "test":
+            parser.add_argument(
+                "--full", action="store_true", help="print all that was measured, with intervals, not the main numbers"
+            )
+        if self.command == "predict":
+            parser.add_argument("--pictures", type=int, default=1, help="so many of the first scenes are drawn")
+            parser.add_argument(
+                "--picture",
+                type=Literal["mp4", "gif", "webp", "none"],
+                default="gif",
+                help='format of moving pictures; mp4 needs pip install "magnet-motion[video]"',
+            )
+            parser.add_argument(
+                "--view",
+                type=bool,
+                default=False,
+                help='open the first scenes in the browser; needs pip install "magnet-motion[view]"',
+            )
+
+    def _default_class(self, parser: Parser, key: str, otherwise: str | None) -> None:
+        """Make the class that wins the default, so that no other class's defaults come first."""
+        path = class_options.known_path(parser.classes[key], self.classes.get(key, otherwise or ""))
+        try:
+            there = checkpoint_config.class_named(path) is not None
+        except ImportError:
+            there = False
+        if there or otherwise:  # of a class that is not there the parser says so
+            parser.set_defaults({key: {"class_path": path if there else otherwise}})
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        self.config = parser.parse_args(args)
+
+    def _parse_ckpt_path(self) -> None:
+        """Off: it would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""
+
+    # -- building ------------------------------------------------------------------------------
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """A Trainer with this run's folder, logs, checkpoints and progress, unless options say otherwise."""
+        config = self.config_init[self.command]["trainer"]
+        callbacks = list(config.get("callbacks") or [])
+        fit = self.command == "fit"
+        if fit and config.get("enable_checkpointing") is not False and not config.get("fast_dev_run"):
+            self._refuse_overwriting()
+            if not any(isinstance(callback, ModelCheckpoint) for callback in callbacks):
+                callbacks += run_folder.checkpoints(self.folder, self.model)
+        if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
+            sampling = self.command in SAMPLING and hasattr(self.model, "configure_test")
+            callbacks.append(run_folder.progress_bar(sampling))
+        logger = config.get("logger")
+        if logger is None or logger is True:
+            logger = run_folder.loggers(self.folder, self._option("wandb"), fit)
+            if fit and logger:
+                callbacks.append(run_folder.learning_rate())
+        if not fit and config.get("enable_checkpointing") is None:
+            config["enable_checkpointing"] = False
+        callbacks.append(self._record())
+        plugins = config.get("plugins") or []
+        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), weights.CheckpointIO()]
+        changes = {
+            "callbacks": callbacks,
+            "logger": logger or False,
+            "plugins": plugins,
+            "default_root_dir": config.get("default_root_dir") or str(self.folder),
+        }
+        return self.trainer_class(**{**config, **changes, **kwargs})
+
+    def _refuse_overwriting(self) -> None:
+        own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents
+        if (self.folder / "checkpoints").exists() and not own and "LOCAL_RANK" not in os.environ:
+            raise CommandError(
+                f"{self.folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
+            )
+
+    def _record(self) -> run_folder.Record:
+        self._dump_config()
+        options = {key: self.config_dump.get(key) for key in ("model", "data")}
+        config = self._parser(self.command).dump(self.config[self.command], skip_none=False)
+        facts = {
+            "seed": self._option("seed_everything"),
+            "checkpoint": None if self.checkpoint is None else str(self.checkpoint),
+        }
+        latest = self.command == "fit" and self._option("out") is None
+        return run_folder.Record(self.folder, config, options, facts, latest)
+
+    def _option(self, name: str) -> Any:
+        return self.config[self.command].get(name)
+
+    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
+        checkpoint = None if self.checkpoint is None else str(self.checkpoint)
+        more = {"verbose": False} if subcommand in ("validate", "test") else {}
+        words = super()._prepare_subcommand_kwargs(subcommand)
+        return {**words, **more, "ckpt_path": checkpoint, "weights_only": True}
+
+    # -- running -------------------------------------------------------------------------------
+
+    def _evaluate(self) -> None:
+        if not hasattr(self.model, "configure_test"):
+            return
+        config = self.config_init[self.command]
+        names = {field.name for field in dataclasses.fields(Evaluation) if field.init} - {"task", "options"}
+        options = {name: config[name] for name in names}
+        if options["samples"] < 1:
+            raise CommandError(f"--samples is {options['samples']}, expected at least 1")
+        self.evaluation = Evaluation(task=task_of(config["task"]), options=config["sampler"], **options)
+        self.model.configure_test(self.evaluation)
+
+    def before_fit(self) -> None:
+        """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
+        if self.checkpoint is not None and not getattr(self.model, "built", True):
+            self.model.on_load_checkpoint(weights.read(self.checkpoint))
+        if isinstance(self.model, Denoiser):  # now, and not once data are made and files are written
+            self.model.require_tokenizer()
+
+    before_test = _evaluate
+    before_predict = _evaluate
+
+    def predict(self, **words: Any) -> None:
+        """The Trainer's, keeping what it returns."""
+        self.predicted = self.trainer.predict(**words) or []
+
+    def after_fit(self) -> None:
+        """Say where things are."""
+        if self.trainer.is_global_zero and not getattr(self.trainer, "fast_dev_run", False):
+            files = {name: self.folder / "checkpoints" / f"{name}.ckpt" for name in ("best", "last")}
+            kept = next((f"; its {name} checkpoint: {file}" for name, file in files.items() if file.exists()), "")
+            print(f"the run is in {self.folder}{kept}")
+
+    def after_validate(self) -> None:
+        """Show what was logged."""
+        if self.trainer.is_global_zero:
+            outputs.show_metrics(self.trainer, self.folder, self.command)
+
+    def after_test(self) -> None:
+        """Show the table of methods, or what was logged."""
+        if not self.trainer.is_global_zero:
+            return
+        if self.evaluation is None or self.evaluation.results is None:
+            return outputs.show_metrics(self.trainer, self.folder, self.command)
+        task = self._option("task").class_path.rsplit(".", 1)[-1]
+        facts = {"task": task, "checkpoint": str(self.checkpoint), "data": self.config_dump.get("data")}
+        outputs.show_results(self.evaluation, self.folder, facts, self._option("full"))
+
+    def after_predict(self) -> None:
+        """Write scenes and pictures."""
+        scenes = [batch for batch in self.predicted if isinstance(batch, Scene)]
+        if self.evaluation is not None and scenes:
+            picture, count = self._option("picture"), self._option("pictures")
+            outputs.write_scenes(scenes, self.evaluation, self.model, self.datamodule, self.folder, picture, count)
+            self._point_to_viewer()
+
+    def _point_to_viewer(self) -> None:
+        """Say how to watch what was written, or show it."""
+        first = sorted((self.folder / "scenes").glob("*.npz"))[:1]
+        if not first or not self.trainer.is_global_zero:
+            return
+        print(f"watch it: magnet view {first[0]}")
+        if self._option("view"):
+            from magnet.cli.view import show_at_the_end
+
+            show_at_the_end([str(first[0])])

@@ -1,0 +1,236 @@
+"""`magnet view`: scenes in the browser, or a model that plays live."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from magnet.sampling.presets import PRESETS, preset_name
+
+STEPS = 10
+"""Denoising steps where nothing is said: quick enough to watch."""
+
+EXAMPLES = """\
+examples:
+  magnet view recorded.npz --context 32             the first frames paler, as given
+  magnet view sampled.npz --truth recorded.npz      the ground truth as ghosts
+  magnet view a.npz b.npz --style capsules          side by side, light
+  magnet view dance.npz --html dance.html           one page that needs no server
+  magnet view --live                                the shipped model plays; choose, steer, save
+  magnet view --live start.npz --ckpt_path last     goes on from a scene
+  magnet view --live --sampler paper                samples as the paper does
+  magnet view start.npz --context 32 --record steps.npz --task joint_future
+
+over ssh: magnet view FILE --no-browser, and on your own machine ssh -L 8080:localhost:8080 HOST
+"""
+
+
+def arguments_of(words: Sequence[str]) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        prog="magnet view",
+        description="Watch scenes in the browser, or let a model play while you interfere.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
+    )
+    look = parser.add_argument_group("what is shown")
+    look.add_argument(
+        "--truth", metavar="FILE", help="a scene shown as ghosts in each of the others; without it there are none"
+    )
+    look.add_argument(
+        "--context",
+        type=int,
+        default=0,
+        metavar="N",
+        help="first frames that a model was given, in files that do not say",
+    )
+    look.add_argument("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
+    look.add_argument("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
+    look.add_argument(
+        "--style", choices=("body", "light", "capsules", "skeleton"), help="default: body, light for crowds"
+    )
+    look.add_argument(
+        "--no-shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
+    )
+    look.add_argument("--html", metavar="OUT.html", help="write a page of its own that plays all of it, and end")
+    live = parser.add_argument_group("generating")
+    live.add_argument("--live", action="store_true", help="a model generates while you watch")
+    live.add_argument(
+        "--record", metavar="OUT.npz", help="continue FILE once, keep the steps of its denoising, and watch these"
+    )
+    live.add_argument("--frames", type=int, default=64, metavar="N", help="frames that --record adds (default: 64)")
+    live.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
+    live.add_argument("--task", default="joint_future", help="task to begin with (default: %(default)s)")
+    live.add_argument("--people", type=int, default=2, metavar="N", help="people of a scene from nothing (default: 2)")
+    live.add_argument("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
+    live.add_argument(
+        "--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)"
+    )
+    live.add_argument("--seed", type=int, default=1, help="of the sampling (default: %(default)s)")
+    web = parser.add_argument_group("where")
+    web.add_argument("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
+    web.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
+    web.add_argument("--no-browser", action="store_true", help="only say where it is")
+    return parser.parse_args(words)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run `magnet view`. Returns the exit code.
+
+    Raises:
+        ValueError, OSError, ImportError: something the user can put right; the message says what.
+    """
+    options = arguments_of(arguments)
+    _check(options)
+    if options.html is not None:
+        return _write_page(options)
+    stage = _live(options) if options.live else _watch(options)
+    announce(stage.port, options.host, options.no_browser)
+    try:
+        stage.run()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        stage.stop()
+    return 0
+
+
+def show_at_the_end(words: Sequence[str]) -> None:
+    """`magnet view` after a run that has written its results: what keeps it from showing them is said, no failure."""
+    try:
+        main(words)
+    except (ImportError, OSError, ValueError) as error:
+        print(f"not shown: {error}", file=sys.stderr)
+        print(f"later: magnet view {shlex.join(words)}", file=sys.stderr)
+
+
+def announce(port: int, host: str, quiet: bool) -> None:
+    """Say where the viewer is, and open the browser if there is one."""
+    from magnet.viewer.server import open_browser
+
+    url = f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1', '::') else host}:{port}"
+    print(f"magnet view: {url}   (Ctrl+C ends it)", flush=True)
+    if not quiet and not open_browser(url):
+        tunnel = f"ssh -L {port}:localhost:{port}"
+        print(f"no browser here: open that address yourself; from another machine first run {tunnel}", flush=True)
+
+
+def _check(options: argparse.Namespace) -> None:
+    if not options.files and not options.live:
+        raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
+    if options.live and len(options.files) > 1:
+        raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
+    if options.record is not None and (options.live or len(options.files) != 1):
+        raise ValueError("--record continues one FILE, and is not --live")
+    if options.record is not None and options.html is not None:
+        raise ValueError("--html writes what FILE holds, --record continues it: record first, then --html its OUT.npz")
+    if options.context < 0 or options.samples < 1:
+        raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
+
+
+def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
+    from magnet.body.base import load_body
+    from magnet.export.page.takes import read_takes
+
+    body = load_body(options.body or "open")
+    return read_takes(options.files, body, options.context, options.samples)
+
+
+def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
+    """The first scene of --truth, or None."""
+    from magnet.export.page.takes import read_takes
+
+    if not options.truth:
+        return None
+    truth = read_takes([options.truth], body, samples=1)[0][0]
+    if abs(truth.scene.fps - fps) > 1e-3:
+        raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
+    return truth
+
+
+def _write_page(options: argparse.Namespace) -> int:
+    from magnet.export.page.html import save_html
+
+    takes, body = _read(options)
+    truth = _truth(options, body, takes[0].scene.fps)
+    styles = (options.style,) if options.style else None
+    path = save_html(takes, options.html, body, truth=None if truth is None else truth.scene, styles=styles)
+    print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _watch(options: argparse.Namespace) -> Any:
+    from magnet.export.page.takes import read_takes
+    from magnet.viewer.server import free_port, require_viser
+    from magnet.viewer.watch import Viewer, first_look
+
+    require_viser()
+    free_port(options.host, options.port)  # before reading, which may take long
+    takes, body = _read(options)
+    if options.record is not None:
+        _record(options, takes[0].scene)
+        takes, _ = read_takes([options.record], body, options.context)
+    truth = _truth(options, body, takes[0].scene.fps)
+    look = first_look(takes, options.style, not options.no_shadows)
+    return Viewer(takes, body, truth, options.host, options.port, look)
+
+
+def _record(options: argparse.Namespace, scene: Any) -> None:
+    import torch
+
+    from magnet.cli import checkpoint_config
+    from magnet.denoiser.module import Denoiser
+    from magnet.generation.recording import record
+    from magnet.tasks import registry
+
+    task = registry.get(options.task)()
+    model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    generator = torch.Generator().manual_seed(options.seed)
+    sampler = _sampler(options)
+    recording = record(model, scene, task, options.context, options.frames, sampler, generator)
+    print(f"written: {recording.save(options.record)}")
+
+
+def _sampler(options: argparse.Namespace) -> Any:
+    """How to sample, as --sampler and --steps say."""
+    from magnet.generation.conditioning import SamplerOptions
+
+    steps = STEPS if options.sampler is None and options.steps is None else options.steps
+    return SamplerOptions.preset(options.sampler or "default", **({} if steps is None else {"steps": steps}))
+
+
+def _live(options: argparse.Namespace) -> Any:
+    from magnet.viewer.server import free_port, require_viser
+
+    require_viser()
+    free_port(options.host, options.port)
+    import torch
+
+    from magnet.body.base import load_body
+    from magnet.cli import checkpoint_config
+    from magnet.denoiser.module import Denoiser
+    from magnet.generation.live import Live
+    from magnet.tasks import registry
+    from magnet.viewer.play import Playground
+    from magnet.viewer.troupe import Look
+
+    registry.get(options.task)
+    start = None
+    body = load_body(options.body or "open")
+    if options.files:
+        takes, body = _read(options)
+        start = takes[0].scene
+    model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
+    live.settings.task, live.settings.sampler = options.task, _sampler(options)
+    live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
+    look = Look(style=options.style or "body", shadows=not options.no_shadows)
+    return Playground(live, body, options.host, options.port, look)

@@ -1,0 +1,1 @@
+"""Scenes as one web page that plays by itself."""

@@ -1,0 +1,184 @@
+"""What is watched: scenes read from files, who is in them, and which frames a model was given."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magnet.body.base import Body, load_body
+from magnet.export.page.rig import Array
+from magnet.files import load_npz
+from magnet.generation.recording import Recording
+from magnet.motion.scene import Scene
+
+SAMPLES = 4
+"""Scenes of one file that are shown side by side."""
+APART = 0.5
+"""Metres between the takes of a row."""
+WIDEST = 8.0
+"""Metres of the row that one take takes up at most."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """One scene (B = 1, present people only) as it is shown.
+
+    Attributes:
+        slots: the people's slots, which say their colours.
+        known: (T, P) bool, frames that the model was given; the scene's own `given`, or False where that says nothing.
+        recording: its denoising steps, if they were recorded.
+    """
+
+    label: str
+    scene: Scene
+    slots: tuple[int, ...]
+    known: NDArray[np.bool_]
+    recording: Recording | None = None
+
+    @property
+    def frames(self) -> int:
+        return self.scene.frames
+
+    def said(self, frame: int) -> str:
+        """Whose motion a model was given in a frame, after the last one in that; empty where nobody's."""
+        known = self.known[min(frame, len(self.known) - 1)]
+        if known.all():
+            return "given"
+        those = ", ".join(f"person {slot + 1}" for slot, here in zip(self.slots, known, strict=True) if here)
+        return f"given: {those}" if those else ""
+
+
+def take(label: str, scene: Scene, context: int = 0, recording: Recording | None = None) -> Take:
+    """A scene (B = 1) made ready to be shown.
+
+    Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
+
+    Raises:
+        ValueError: nobody is there, no frames, or numbers that are not finite.
+    """
+    slots = scene.present[0].nonzero()[:, 0]
+    if not len(slots) or not scene.frames:
+        raise ValueError(f"{label}: {scene.frames} frames of {len(slots)} people, so there is nothing to see")
+    shown = (scene if len(slots) == scene.agents else scene.permute_agents(slots)).to("cpu")
+    for name in ("T_world_root", "body_rot"):
+        broken = ~getattr(shown, name)[0].flatten(1).isfinite().all(dim=1)
+        if bool(broken.any()):
+            first = int(broken.int().argmax())
+            raise ValueError(f"{label}: {name} is not finite in {int(broken.sum())} frames, the first is frame {first}")
+    if scene.given is None and context > 0:
+        past = torch.arange(scene.frames) < context
+        shown = shown.replace(given=past[None, :, None].expand(1, -1, len(slots)))
+    given = np.zeros((scene.frames, len(slots)), dtype=bool) if shown.given is None else shown.given[0].numpy()
+    return Take(label, shown, tuple(slots.tolist()), given, recording)
+
+
+def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[Take]:
+    """The first of a file's B scenes, each a take."""
+    names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
+    many = scene.scenes > 1
+    return [
+        take(f"{names[b]} · {b + 1}" if many else names[b], scene.select([b]), context)
+        for b in range(min(scene.scenes, samples))
+    ]
+
+
+def read_takes(
+    paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
+) -> tuple[list[Take], Body]:
+    """All that several files hold, and the body it is shown on.
+
+    body: the user's; by default the open one.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file that cannot be read, files of different frame rates or bodies; says which and what to do.
+    """
+    body = body or load_body("open")
+    found: list[tuple[Path, Take]] = []
+    for path in map(Path, paths):
+        scene, recording = read_scene(path, body)
+        here = takes(scene, path.stem, context, samples)
+        if recording is not None:
+            here = [take(path.stem, scene, context, recording)]
+        found += [(path, each) for each in here]
+    if not found:
+        raise ValueError("no file to show: magnet view FILE...")
+    rates = {each.scene.fps: path for path, each in found}
+    if len(rates) > 1:
+        listed = ", ".join(f"{path.name} has {fps:g}" for fps, path in rates.items())
+        raise ValueError(f"mixed frame rates (frames a second): {listed}; show files of one rate at a time")
+    return [each for _, each in found], body
+
+
+def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
+    """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not one of these, damaged, or of another body.
+    """
+    from magnet.export.formats import read  # late: it brings every format's code
+
+    if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_recording(path):
+        recording = Recording.load(path)
+        if recording.scene.body != body.id:
+            raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
+        return recording.scene, recording
+    try:
+        return read(path, body).scene, None
+    except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
+
+
+def is_recording(path: Path) -> bool:
+    """Whether an npz holds denoising steps.
+
+    Raises:
+        ValueError: the archive is damaged.
+    """
+    try:
+        with load_npz(path) as file:
+            return "meta" in file.files and "recording" in json.loads(str(file["meta"]))
+    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error
+
+
+def same_length(one: Take, other: Take) -> Scene:
+    """The scene of `one`, cut or held so that it has the frames of `other`."""
+    frame = torch.arange(other.frames).clamp(max=one.frames - 1)
+    scene = one.scene
+    return scene.frames_at(frame)
+
+
+def in_a_row(takes: Sequence[Take]) -> list[Array]:
+    """Offsets that put takes side by side along x around the origin, each (3,)."""
+    edges = []
+    for each in takes:
+        x = each.scene.T_world_root[0, :, :, 0, 3]
+        middle = float(x.median())
+        half = min(float((x - middle).abs().flatten()[:: max(x.numel() // 9999, 1)].quantile(0.8)) + 0.5, WIDEST / 2)
+        edges.append((middle, half))
+    width = sum(2 * half for _, half in edges) + APART * (len(takes) - 1)
+    offsets, left = [], -width / 2
+    for (middle, half), each in zip(edges, takes, strict=True):
+        z = float(each.scene.T_world_root[0, :, :, 2, 3].median())
+        offsets.append(np.array([left + half - middle, 0.0, -z]))
+        left += 2 * half + APART
+    return offsets
+
+
+def numbered(takes: list[Take]) -> list[Take]:
+    """The takes with labels that differ, for they name nodes of the scene."""
+    labels = [each.label for each in takes]
+    return [
+        replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
+        for i, each in enumerate(takes)
+    ]

@@ -1,0 +1,1 @@
+"""Scenes made with a trained denoiser: any task, any length, at once or as it happens."""

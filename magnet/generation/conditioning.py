@@ -1,0 +1,273 @@
+"""What a sample starts from: the options of the sampler, and the tokens of what is given."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from magnet.checks import require_choice, require_number, require_whole
+from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
+from magnet.motion.scene import Scene, empty_scene
+from magnet.motion.tokens import STRIDE, by_token, relations_by_token
+from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.presets import preset_fields
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.sampling.solvers import Solver
+from magnet.tokenizer.module import Tokenizer
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
+
+
+@dataclass(frozen=True)
+class SamplerOptions:
+    """How scenes are sampled.
+
+    `preset` gives sets of these options by name; `paper` is the paper's sampler.
+
+    Args:
+        steps: denoising steps S; the paper takes 30 (A.3). No more than pass levels that differ, which is a matter of
+            `spacing` and `shift`.
+        stride: token steps finished before the window moves on; the reference keeps 12 of 16.
+        rolling: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
+            8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
+            that can roll do, with half of the window half denoised; those whose agents take turns or that look
+            ahead to keyframes go in strides.
+        placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
+            reference), `anchor`, or `fuse` (ours).
+        trust: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
+            (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
+        requantise: snap generated latents to the nearest code before they are decoded and built on, as the reference
+            does. None: if codes are what the model was trained to generate (`target` of the denoiser).
+        paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
+        blend: frames over which a seam fades out behind given frames, and in before them.
+        eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
+            `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
+        shift: over 1, more of even denoising steps at high noise levels; 1 leaves them even, as in the paper.
+        any_floor: take people who all stand far from y = 0, where models have their floor, as they are.
+        guidance: motion history guidance (paper A.7), off by default.
+        noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
+            passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
+        solver: `ddim`, as in the paper, or `dpmpp_2m`, DPM-Solver++(2M), of second order: few steps keep the variance.
+        spacing: of the levels that are passed: `even`, as in the paper, which `shift` moves; or evenly in `log_snr`,
+            with a last level near 0.
+    """
+
+    steps: int = 16
+    stride: int = 4
+    rolling: int | None = None
+    placement: Placement = "fuse"
+    trust: float = 0.02
+    requantise: bool | None = None
+    paste: bool = True
+    blend: int = 10
+    eta: float = 1.0
+    shift: float = 1.0
+    any_floor: bool = False
+    guidance: Guidance = field(default_factory=Guidance)
+    noise_sampling: NoiseSampling = "joint"
+    solver: Solver = "dpmpp_2m"
+    spacing: Spacing = "log_snr"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.guidance, Guidance):
+            raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
+        require_choice("placement", self.placement, Placement)
+        require_choice("solver", self.solver, Solver)
+        require_whole("steps", self.steps, 1, LEVELS)
+        require_whole("stride", self.stride, 1)
+        if self.rolling is not None:
+            require_whole("rolling", self.rolling, 0)
+        require_number("trust", self.trust, least=0)
+        require_whole("blend", self.blend, 0)
+        require_number("eta", self.eta, 0, 1)
+        require_spacing(self.spacing, self.shift)
+
+    @classmethod
+    def preset(cls, name: str, **fields: Any) -> SamplerOptions:
+        """The options of a preset (`magnet.sampling.presets`), some fields replaced: `preset("paper", steps=50)`.
+
+        Raises:
+            ValueError: no such preset; suggests the closest.
+        """
+        said = preset_fields(name)
+        if "guidance" in said:
+            said = {**said, "guidance": Guidance(**said["guidance"])}
+        return cls(**{**said, **fields})
+
+
+def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
+    """The grid that a task plans on: sizes in token steps, and how these options sample."""
+    o = options
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift, o.noise_sampling, o.spacing)
+
+
+def occupied(scene: Scene) -> int:
+    """Slots up to the last that anybody is in, in any of the scenes: plans are made for people, not for free slots.
+
+    Raises:
+        ValueError: a scene has nobody in it.
+    """
+    empty = (~scene.present.any(dim=1)).nonzero()[:, 0].tolist()
+    if empty:
+        raise ValueError(f"{label(scene, empty[0])} has nobody in it: nothing can be sampled")
+    return int(scene.present.any(dim=0).nonzero()[-1]) + 1
+
+
+def require_people(schedule: MaskSchedule, scene: Scene) -> None:
+    """Raises ValueError where a scene has nobody to be generated, or nobody to be given if somebody is."""
+    generated = (schedule.finished & ~schedule.known).any(dim=0)
+    given = schedule.known.any(dim=0) & ~generated
+    for agents, what in ((generated, "generated"), (given, "given")):
+        lacking = (~(scene.present.cpu() & agents).any(dim=1)).nonzero()[:, 0].tolist()
+        if bool(agents.any()) and lacking:
+            slots = ", ".join(str(slot) for slot in agents.nonzero()[:, 0].tolist())
+            raise ValueError(
+                f"{label(scene, lacking[0])} has nobody in slot {slots}, of whom the task wants somebody to be {what}: "
+                "choose other slots for the task, or scenes with people in these"
+            )
+
+
+def label(scene: Scene, number: int) -> str:
+    """A scene of a batch as messages call it."""
+    return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
+
+
+def reach(model: Denoiser) -> tuple[int, int]:
+    """Tokens before and after that a code or a decoded frame can depend on: encoder and decoder look equally far."""
+    return model.tokenizer.vqvae.decoder.reach if isinstance(model.tokenizer, Tokenizer) else (0, 0)
+
+
+def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
+    """The scene as far as it is known: everything else is gone, so that nothing can leak. known (N, P) bool
+
+    Unknown frames hold a body at rest at the origin; missing frames are added, surplus ones cut.
+
+    Args:
+        scene: the recordings.
+        known: (N, P) bool, of the whole scene.
+        first: token step at which to begin.
+        stop: token step at which to end, which may lie beyond what `known` tells of; None: at the end of `known`.
+
+    Raises:
+        ValueError: something is known that was not recorded.
+    """
+    needed = int(known.any(dim=1).nonzero()[-1]) + 1 if bool(known.any()) else 0
+    if needed * STRIDE > scene.frames:
+        raise ValueError(f"the task needs {needed * STRIDE} frames, the scene has {scene.frames}")
+    stop = len(known) if stop is None else stop
+    part = scene.slice(first * STRIDE, min(stop, needed) * STRIDE)
+    blank = empty_scene(scene.scenes, (stop - first) * STRIDE, scene.agents, scene.T_world_root)
+    keep = known[first : min(stop, needed)].repeat_interleave(STRIDE, dim=0).to(scene.device)  # (T, P)
+    keep = keep[:, :, None, None] & scene.present[:, None, :, None, None]
+    body_rot, T_world_root = blank.body_rot.clone(), blank.T_world_root.clone()
+    recorded = part.frames
+    body_rot[:, :recorded] = torch.where(keep[..., None], part.body_rot, body_rot[:, :recorded])
+    T_world_root[:, :recorded] = torch.where(keep, part.T_world_root, T_world_root[:, :recorded])
+    return scene.replace(body_rot=body_rot, T_world_root=T_world_root, valid=None)
+
+
+def sight(schedule: MaskSchedule) -> Tensor:
+    """How far a known token's code may look ahead: up to which row, exclusive. -> (N, P) int
+
+    Without lookahead codes look to the end of the block that they are in, and those before the first block to where it
+    begins: so each is what it would be live, and is never encoded anew. In other plans the first stage that hides
+    what comes after a token settles it. N where no stage hides anything from everybody.
+    """
+    cuts = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
+    if not schedule.lookahead:
+        edges = sorted({edge for stage in schedule.stages for edge in stage.active})
+        for first, last in itertools.pairwise([0, *edges, schedule.tokens]):
+            cuts[first:last] = last
+        return cuts
+    done = [0] * schedule.agents
+    for stage in schedule.stages:
+        if stage.hidden is None:
+            continue
+        gone = stage.hidden.all(dim=0) & schedule.known[stage.start : stage.stop]  # (W, P)
+        for agent in gone.any(dim=0).nonzero()[:, 0].tolist():
+            cut = stage.start + int(gone[:, agent].int().argmax())
+            cuts[done[agent] : cut, agent] = cut
+            if not done[agent]:
+                begins = min(stage.active[0], cut)
+                cuts[:begins, agent] = begins
+            done[agent] = max(done[agent], cut)
+    return cuts
+
+
+def task_sight(task: Task, grid: Grid) -> Tensor:
+    """`sight` by what a task hides, whether or not a window on this grid would show it. -> (N, P) int
+
+    A window that ends where a block does has nothing to hide, so the task is asked where the window goes on.
+    """
+    roomy = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, rolling=0)
+    return torch.minimum(sight(task.schedule(grid)), sight(task.schedule(roomy)))
+
+
+def known_tokens(
+    model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, cuts: Tensor | None = None
+) -> Tensor:
+    """Normalised tokens of what is known; other tokens hold nothing of use. known (N, P) -> (B, N, P, D)
+
+    Each agent's unbroken stretches are encoded alone: an encoder that looks ahead must not see beyond
+    them, nor beyond `cuts` (N, P), see `sight`; where that is 0, the code is not wanted. Pairwise transforms are
+    those of `related`, by default the same scene. A step into a stretch from an unknown frame cannot be known
+    either; the stretch's own next step stands in for it, which leaves a smaller misfit at keyframes than standing
+    still does. At the very beginning nobody has come from anywhere.
+    """
+    N, P = known.shape
+    like = given.T_world_root
+    latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
+    steps = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
+    for start, stop, agents in stretches(known):
+        part = given.slice(start * STRIDE, stop * STRIDE).permute_agents(torch.tensor(agents, device=like.device))
+        for low, first, last, cut, those in encodings(start, stop, agents, cuts, reach(model)[0]):
+            seen = given.slice(low * STRIDE, cut * STRIDE).permute_agents(torch.tensor(those, device=like.device))
+            latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
+        own = by_token(to_9d(canonical_steps(canonical_frame(part.T_world_root))))
+        if start > 0:
+            own[:, 0, :, 0] = own[:, 0, :, 1]
+        steps[:, start:stop, agents] = own
+    relations = relations_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
+    return model.statistics.normalise(model.layout.pack(latent, steps, relations))
+
+
+def encodings(
+    start: int, stop: int, agents: list[int], cuts: Tensor | None, behind: int
+) -> list[tuple[int, int, int, int, list[int]]]:
+    """What to encode of a known stretch, as (low, first, last, cut, agents): rows [first, last) from rows [low, cut).
+
+    Rows that look up to the end are encoded with the whole stretch, others with all the `behind` rows that their
+    codes depend on, and one more, so that an artificial beginning is not seen.
+    """
+    if cuts is None:
+        return [(start, start, stop, stop, agents)]
+    found: dict[tuple[int, int, int, int], list[int]] = {}
+    for agent in agents:
+        ends = cuts[start:stop, agent].clamp(max=stop)
+        for cut in ends[ends > 0].unique().tolist():
+            rows = (ends == cut).nonzero()[:, 0] + start
+            first, last = int(rows[0]), int(rows[-1]) + 1
+            low = start if cut == stop else max(start, first - behind - 1)
+            found.setdefault((low, first, last, cut), []).append(agent)
+    return [(*rows, those) for rows, those in found.items()]
+
+
+def stretches(known: Tensor) -> list[tuple[int, int, list[int]]]:
+    """Unbroken known stretches as (start, stop, agents that share it). known (N, P) bool"""
+    found: dict[tuple[int, int], list[int]] = {}
+    edges = torch.nn.functional.pad(known.int(), (0, 0, 1, 1)).diff(dim=0)
+    for agent in range(known.shape[1]):
+        starts = (edges[:, agent] == 1).nonzero()[:, 0].tolist()
+        stops = (edges[:, agent] == -1).nonzero()[:, 0].tolist()
+        for span in zip(starts, stops, strict=True):
+            found.setdefault(span, []).append(agent)
+    return [(start, stop, agents) for (start, stop), agents in sorted(found.items())]

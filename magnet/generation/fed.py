@@ -1,0 +1,103 @@
+"""A scene without end of which some is given as it happens: what a partner in real time runs on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.generation.conditioning import SamplerOptions, reach, scrub
+from magnet.generation.inputs import check_given
+from magnet.generation.rollout import PIECE, Generators, Stream
+from magnet.motion.scene import Scene, cat_time
+from magnet.motion.tokens import STRIDE
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
+
+
+class FedStream(Stream):
+    """A sample that goes on as far as it has been fed, bit for bit as if all had been given at once.
+
+    Memory does not grow: what neither the model nor the decoder looks at any more is let go.
+
+    Args:
+        model: the trained denoiser.
+        past: B scenes of everybody, whole tokens.
+        task: is given some agents throughout, and reads nothing of them ahead.
+        options: how to sample.
+        generator: source of randomness, on the model's device.
+
+    Raises:
+        ValueError: the task reads ahead, or its plan does not repeat itself; the model was trained with relations that
+            tell of people who are not known; or a past that `magnet.generation.inputs` refuses.
+    """
+
+    fed = True
+
+    def __init__(
+        self,
+        model: Denoiser,
+        past: Scene,
+        task: Task,
+        options: SamplerOptions | None = None,
+        generator: Generators = None,
+    ) -> None:
+        model.require_tokenizer()
+        if model.layout.relation_noise == "token":
+            raise ValueError(
+                "relation_noise='token': tokens of those who are given tell where the others are, and nobody knows "
+                "that live; train with relation_noise='noisier_end'"
+            )
+        self.base = 0  # the row that the recording, as far as it is held, begins with
+        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, PIECE)
+        self.there = past.frames // STRIDE
+        self._advance()
+
+    @property
+    def made(self) -> int:
+        """Rows whose bodies are final."""
+        return self.first + self.canvas.shown
+
+    def feed(self, frames: Scene) -> Scene:
+        """The same frames with what the task generates in them, final.
+
+        Args:
+            frames: (B, 4 n), a whole number of the task's blocks; of whoever is generated nothing is read.
+
+        Raises:
+            ValueError: motion that is not finite, or no rotation.
+        """
+        begins, ends = self.made, self.made + frames.frames // STRIDE
+        fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
+        fed = fed.pad_agents(self.model.layout.agents)
+        # Where the floor is was seen in the past: an answer must not fail because somebody jumps or is carried.
+        check_given(fed, self._known(begins, ends), any_floor=True)
+        self.scene, self.there = cat_time([self.scene.replace(valid=None, names=()), fed]), ends
+        return self._advance(begins)
+
+    def _advance(self, begins: int = 0) -> Scene:
+        """Run the stages of what has been fed; the bodies of rows from `begins` on."""
+        while self.made < self.there:
+            stage, final, needed = next(self.plan)
+            if stage is not None:
+                self._run(stage)
+            for _ in self._ready(final):
+                pass
+        made = self._decoded(begins, self.made, None, needed)
+        old = max(self.stop - reach(self.model)[0] - 1, 0) - self.base
+        if old > 0:
+            kept = self.scene.slice(old * STRIDE)
+            self.scene = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
+            self.base += old
+        return made
+
+    def _given(self, low: int, high: int) -> Scene:
+        return scrub(self.scene, self._known(self.base, high), low - self.base, high - self.base)
+
+    def _known(self, first: int, stop: int) -> Tensor:
+        """What is given after the context is given throughout."""
+        rows = self.known[first:stop]
+        return torch.cat([rows, self.known[-1:].expand(stop - first - len(rows), -1)])

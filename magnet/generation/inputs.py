@@ -1,0 +1,114 @@
+"""What a model can go on from: refused here, with what to do, before anything is made of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.body.floor import MOMENTS, lowest, off_floor
+from magnet.checks import require_whole
+from magnet.generation.conditioning import label
+from magnet.motion.scene import Scene, require_rate
+from magnet.motion.tokens import STRIDE
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+ROUNDED = 0.05
+"""What a rotation's columns may be off: half precision and careless interpolation are not refused, scales are."""
+
+
+def check_request(model: Denoiser, scene: Scene, context: int, frames: int | None, samples: int) -> None:
+    """Refuse what cannot be sampled whatever the task.
+
+    Raises:
+        ValueError: a model that was not trained, no scenes, people or frames that fit the model, another frame rate,
+            or counts that are none.
+    """
+    model.require_tokenizer()
+    if not model.statistics.ready:
+        raise ValueError("the denoiser has never been trained: its statistics are not set; load a checkpoint")
+    require_whole("context", context, 0)
+    if context % STRIDE:
+        raise ValueError(f"context of {context} frames is not a multiple of {STRIDE}: cut the scene to whole tokens")
+    if frames is not None:
+        require_whole("frames", frames, 0)
+    require_whole("samples", samples, 1)
+    if not scene.scenes:
+        raise ValueError("got an empty batch of 0 scenes, expected at least one")
+    if scene.agents > model.layout.agents:
+        raise ValueError(f"the scene has {scene.agents} agents, the model was built for {model.layout.agents}")
+    require_rate(scene)
+
+
+def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
+    """Refuse motion that is given and means nothing; what is not given may hold anything. known (N, P) bool
+
+    Args:
+        scene: B recordings; of frames beyond them nothing is known.
+        known: token steps that are read.
+        any_floor: accept people who stand far from y = 0.
+
+    Raises:
+        ValueError: NaN, infinities or what is no rotation, or everybody stands far from the floor; names scene, agent
+            and frame, and what to do.
+    """
+    unshaped = ~scene.betas.isfinite().all(dim=-1) & scene.present
+    if bool(unshaped.any()):
+        b, agent = unshaped.nonzero()[0].tolist()
+        raise ValueError(f"{label(scene, b)}, agent {agent}: betas are not finite; zeros are an average body")
+    keep = known.repeat_interleave(STRIDE, dim=0)[: scene.frames].to(scene.device)
+    rows = keep.any(dim=1).nonzero()[:, 0]
+    if not len(rows):
+        return
+    part = scene.frames_at(rows)
+    counts = keep[rows] & scene.present[:, None]  # (B, F, P)
+    if not bool(counts.any()):
+        return
+    _refuse(~_finite(part) & counts, rows, scene, "is not finite: leave such frames out, or fill them in")
+    _refuse(
+        ~_rigid(part) & counts,
+        rows,
+        scene,
+        "is no rotation, or no rigid transform: expected body_rot of orthonormal columns, T_world_root with these and "
+        "0 0 0 1 below them",
+    )
+    if any_floor:
+        return
+    few = torch.linspace(0, len(rows) - 1, min(len(rows), MOMENTS), device=scene.device).long()
+    off = off_floor(lowest(part.frames_at(few)), counts[:, few], counts.sum(dim=1))
+    if bool((off != 0).any()):
+        b = int(off.abs().argmax())
+        metres = float(off[b])
+        raise ValueError(
+            f"{label(scene, b)}: everybody stands {abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where "
+            "the model has its floor: put them there with magnet.on_floor(scene) or magnet export --on-floor, or say "
+            "any_floor=True (--sampler.any_floor true) if they really are up there"
+        )
+
+
+def _finite(scene: Scene) -> Tensor:
+    """(B, T, P) bool"""
+    return scene.body_rot.flatten(3).isfinite().all(-1) & scene.T_world_root.flatten(3).isfinite().all(-1)
+
+
+def _rigid(scene: Scene) -> Tensor:
+    """Whether all rotations are rotations, and transforms have a fourth row of transforms. (B, T, P) bool"""
+    rotations = torch.cat([scene.body_rot, scene.T_world_root[..., None, :3, :3]], dim=3)
+    x, y, z = rotations.unbind(dim=-1)
+    mirrored = (torch.linalg.cross(x, y, dim=-1) - z).flatten(3)
+    lengths = torch.cat([x.square().sum(-1), y.square().sum(-1)], dim=-1) - 1
+    below = scene.T_world_root[..., 3, :] - torch.eye(4, device=scene.device)[3]
+    off = torch.cat([mirrored, lengths, (x * y).sum(-1), below], dim=-1)
+    return off.abs().amax(dim=-1) < ROUNDED
+
+
+def _refuse(bad: Tensor, rows: Tensor, scene: Scene, what: str) -> None:
+    """bad (B, F, P) bool of the frames `rows`"""
+    if bool(bad.any()):
+        b, frame, agent = bad.nonzero()[0].tolist()
+        count = int(bad[b].any(dim=-1).sum())
+        also = f" (and {count - 1} more frames of that scene)" if count > 1 else ""
+        raise ValueError(f"{label(scene, b)}, agent {agent}: frame {int(rows[frame])}{also} {what}")

@@ -1,0 +1,328 @@
+"""A model that plays on and on: motion generated piece by piece from the last second, while its settings change.
+
+Nothing here knows of a browser or of threads; see `Worker` for one that keeps it a little ahead of who watches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.inputs import check_given
+from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
+from magnet.motion.frames import canonical_frame
+from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+from magnet.tasks.base import Task
+from magnet.tasks.inbetweening import Inbetweening
+from magnet.tasks.joint import Generation, JointFuture
+
+CONTEXT = 32
+"""Frames that each piece goes on from."""
+FIRST = 64
+"""Frames of a scene from nothing."""
+REACH = 32
+"""Frames ahead at which who is steered is to be at the goal; so many before a first keyframe are made anew."""
+
+
+@dataclass
+class Settings:
+    """What the next piece is generated with.
+
+    Attributes:
+        task: a name in the registry.
+        fields: the task's own options, where they differ from its defaults.
+        piece: frames of a piece, whole tokens.
+        goals: where agents (slots) are steered to; see `Live`.
+        sampler: all other options of sampling.
+    """
+
+    task: str = "joint_future"
+    fields: dict[str, Any] = field(default_factory=lambda: {"block": 2})
+    steps: int = 10
+    guidance: Guidance = field(default_factory=Guidance)
+    piece: int = 16
+    goals: dict[int, Goal] = field(default_factory=dict)
+    sampler: SamplerOptions = field(default_factory=SamplerOptions)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What one call of `Live.advance` has made."""
+
+    start: int  # first new frame
+    frames: int
+    seconds: float  # that it took
+    between: bool = False  # keyframes
+
+
+class Live:
+    """A scene that grows; its `given` says what the model did not make itself.
+
+    Each piece is a sample of the chosen task that continues the last `CONTEXT` frames. Where a task is given
+    somebody's future (as `motion_control` is), that future comes first: from `partner`, if there is one; from
+    in-betweening towards that agent's goal, if it is steered; else from a joint prediction.
+
+    Args:
+        model: a trained denoiser.
+        people: how many there are when a scene begins from nothing.
+        start: a scene (B = 1) to go on from instead; whoever is present moves up to the first slots.
+        partner: recorded motion of whoever is given, in the same frames as the scene that grows.
+        generator: source of all randomness.
+
+    Attributes:
+        keys: keyframes that `between` goes through; those of people who are gone are dropped.
+        asked: whether the next piece is to be made `between` the keyframes.
+
+    Raises:
+        ValueError: more people than the model has slots, `start` is shorter than `CONTEXT`, or motion that the model
+            cannot go on from.
+    """
+
+    def __init__(
+        self,
+        model: Denoiser,
+        people: int = 2,
+        start: Scene | None = None,
+        partner: Scene | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.model = model
+        self.generator = generator or torch.Generator(device=model.device).manual_seed(1)
+        if partner is not None:
+            require_rate(partner, "partner")
+            check_given(partner, torch.ones(partner.frames // STRIDE, partner.agents, dtype=torch.bool))
+        self.partner = partner
+        self.settings = Settings()
+        self.keys: list[Keyframe] = []
+        self.asked = False
+        self.lock = threading.RLock()
+        self.version = 0  # grows when frames that were there have changed
+        self.made, self.spent = 0, 0.0
+        self.scene: Scene
+        self.begin(people, start)
+
+    # -- starting ------------------------------------------------------------------------------
+
+    def begin(self, people: int = 2, start: Scene | None = None) -> Piece:
+        """Start anew: from a scene, or from nothing with so many people."""
+        begun = time.perf_counter()
+        if start is None:
+            scene = self._from_nothing(people)
+        else:
+            self._check(start)
+            scene = start.permute_agents(start.present[0].nonzero()[:, 0])
+            scene = scene.slice(0, start.frames // STRIDE * STRIDE).replace(valid=None)
+            if scene.given is None:
+                scene = scene.replace(given=torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool))
+        with self.lock:
+            self.scene = scene
+            self.settings.goals = {a: goal for a, goal in self.settings.goals.items() if a < scene.agents}
+            self.keys, self.asked = [], False
+            self.version += 1
+        return Piece(0, scene.frames, time.perf_counter() - begun)
+
+    def _from_nothing(self, people: int) -> Scene:
+        slots = self.model.layout.agents
+        if not 1 <= people <= slots:
+            raise ValueError(f"people: got {people}, expected 1 to {slots}, the slots that the model has")
+        empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
+        made = self._sample(empty, Generation(), 0, FIRST)
+        return made.replace(given=torch.zeros(1, FIRST, people, dtype=torch.bool))
+
+    def _check(self, start: Scene) -> None:
+        slots = self.model.layout.agents
+        if start.scenes != 1 or start.frames < CONTEXT or start.agents > slots:
+            raise ValueError(
+                f"start: {start.scenes} scenes, {start.frames} frames, {start.agents} agents; expected 1, at least "
+                f"{CONTEXT}, at most {slots}"
+            )
+        if not bool(start.present.any()):
+            raise ValueError("start: nobody is there to go on")
+        require_rate(start, "start")
+        check_given(start, torch.ones(start.frames // STRIDE, start.agents, dtype=torch.bool))
+
+    def restart(self, frame: int) -> int:
+        """Forget what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
+        with self.lock:
+            keep = max(min(frame // STRIDE * STRIDE, self.scene.frames), CONTEXT)
+            self.scene = self.scene.slice(0, keep)
+            self.version += 1
+            return keep
+
+    @property
+    def fps(self) -> float:
+        """Frames made for each second of computing, so far."""
+        return self.made / self.spent if self.spent > 0 else 0.0
+
+    # -- going on ------------------------------------------------------------------------------
+
+    def task(self) -> Task:
+        """The task of the settings; fields that it does not have are left out.
+
+        A task that generates somebody from the others is for all but whoever is steered, by default the last one.
+
+        Raises:
+            ValueError: no such task, or it does not go on from a past and so cannot be played live.
+        """
+        kind = registry.get(self.settings.task)
+        if kind is Generation:  # after its first window it only goes on
+            return JointFuture()
+        own = {each.name for each in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
+        fields = {name: value for name, value in self.settings.fields.items() if name in own}
+        people = range(self.scene.agents)
+        if "pairs" in own and "pairs" not in fields:
+            last = (CONTEXT + self._length(kind)) // STRIDE - 1
+            fields["pairs"] = tuple((agent, last) for agent in self._steered() or people)
+        if "target" in own and "target" not in fields:
+            leads = self._steered() or people[-1:]
+            fields["target"] = tuple(agent for agent in people if agent not in leads) or (0,)
+        return kind(**fields)
+
+    def advance(self) -> Piece:
+        """Generate the next piece and append it; if it was `asked` for, the one between the keyframes instead.
+
+        Raises:
+            ValueError: the task cannot go on here; says why.
+        """
+        if self.asked:
+            self.asked = False
+            return self.between()
+        begun = time.perf_counter()
+        with self.lock:
+            scene, version = self.scene, self.version
+            task = self.task()
+            frames = self._length(type(task))
+        past = scene.slice(scene.frames - CONTEXT)
+        grid = Grid((CONTEXT + frames) // STRIDE, scene.agents, CONTEXT // STRIDE, self.settings.steps)
+        known = task.schedule(grid).known
+        if not bool(known[: grid.context].all()):
+            raise ValueError(
+                f"{self.settings.task} does not go on from everybody's past, so it cannot be played live; "
+                "try joint_future, motion_control or inbetweening"
+            )
+        given = self._future(past, scene.frames, known, frames)
+        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        return self._append(scene, piece, version, begun)
+
+    def between(self) -> Piece:
+        """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
+
+        Raises:
+            ValueError: there are no keyframes, or one lies where nothing comes before it.
+        """
+        begun = time.perf_counter()
+        with self.lock:
+            keys, version = sorted(self.keys, key=lambda key: key.frame), self.version
+            start = self.between_from()
+            scene = self.scene.slice(0, start)
+        frames = keys[-1].frame + STRIDE - start
+        shifted = [dataclasses.replace(key, frame=key.frame - start + CONTEXT) for key in keys]
+        given = with_keyframes(self._held(scene.slice(start - CONTEXT), frames), shifted)
+        task = Inbetweening(pairs=tuple((key.agent, key.frame // STRIDE) for key in shifted))
+        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        return dataclasses.replace(self._append(scene, piece, version, begun, anew=True), between=True)
+
+    def between_from(self) -> int:
+        """The first frame that `between` makes anew.
+
+        Raises:
+            ValueError: as `between`.
+        """
+        if not self.keys:
+            raise ValueError("no keyframes: add one first")
+        first = min(key.frame for key in self.keys)
+        if first < CONTEXT + STRIDE:
+            raise ValueError(
+                f"a keyframe at frame {first}: the model goes on from {CONTEXT} frames, so the first keyframe lies at "
+                f"{CONTEXT + STRIDE} or later"
+            )
+        return max(CONTEXT, min(self.scene.frames, first - REACH) // STRIDE * STRIDE)
+
+    def _append(self, scene: Scene, piece: Scene, version: int, begun: float, anew: bool = False) -> Piece:
+        """Put a piece behind the scene that it continues, unless that was restarted meanwhile."""
+        with self.lock:
+            took = time.perf_counter() - begun
+            if version != self.version:  # what this piece continues is no longer there
+                return Piece(self.scene.frames, 0, took)
+            self.scene = cat_time([scene, piece])
+            self.version += anew
+            self.made, self.spent = self.made + piece.frames, self.spent + took
+            return Piece(scene.frames, piece.frames, took)
+
+    def _sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
+        # A piece fits into the window, so denoising it all at once costs the fewest steps.
+        # What it has made itself is not asked where its floor is.
+        settings = self.settings
+        own: dict[str, Any] = {"steps": settings.steps, "guidance": settings.guidance, "rolling": 0, "any_floor": True}
+        options = dataclasses.replace(settings.sampler, **own)
+        longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
+        return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
+
+    def _length(self, kind: type) -> int:
+        return REACH if kind is Inbetweening else max(self.settings.piece // STRIDE, 1) * STRIDE
+
+    def _steered(self) -> list[int]:
+        return sorted(agent for agent in self.settings.goals if agent < self.scene.agents)
+
+    # -- the given future ----------------------------------------------------------------------
+
+    def _held(self, past: Scene, frames: int) -> Scene:
+        """The past, and its last frame for so many frames more, which nobody was given."""
+        scene = past.pad_frames(frames).slice(frames)
+        known = (torch.arange(scene.frames) < past.frames)[None, :, None]
+        return scene.replace(given=known.expand(scene.T_world_root.shape[:3]))
+
+    def _future(self, past: Scene, now: int, known: Tensor, frames: int) -> Scene:
+        """The past and what the task is given of what comes after. known (N, P)"""
+        coming = known[CONTEXT // STRIDE :]
+        scene = self._held(past, frames)
+        if not bool(coming.any()):
+            return scene
+        whole = coming.all(dim=0)
+        moments = (coming & ~whole).nonzero().tolist()
+        scene = with_keyframes(scene, [self._toward(past, p, CONTEXT + step * STRIDE) for step, p in moments])
+        return self._lead(scene, past, now, whole, frames) if bool(whole.any()) else scene
+
+    def _lead(self, scene: Scene, past: Scene, now: int, agents: Tensor, frames: int) -> Scene:
+        """Fill in the whole future of some agents before the task runs. agents (P,) bool"""
+        if self.partner is not None and self.partner.frames >= now + frames:
+            source = self.partner.slice(now - CONTEXT, now + frames)
+            source = source.replace(given=torch.ones(source.T_world_root.shape[:3], dtype=torch.bool))
+        else:
+            steered = [agent for agent in self._steered() if bool(agents[agent])]
+            task: Task = JointFuture()
+            length = REACH if steered else frames
+            goals = self._held(past, length)
+            if steered:
+                last = CONTEXT + REACH - STRIDE
+                task = Inbetweening(pairs=tuple((agent, last // STRIDE) for agent in steered))
+                goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
+            made = self._sample(goals, task, CONTEXT, length).replace(given=goals.given)
+            source = made.slice(0, CONTEXT + frames)
+        chosen = agents[None, None, :, None, None]
+        assert scene.given is not None and source.given is not None
+        return scene.replace(
+            body_rot=torch.where(chosen[..., None], source.body_rot, scene.body_rot),
+            T_world_root=torch.where(chosen, source.T_world_root, scene.T_world_root),
+            given=torch.where(agents, source.given, scene.given),
+        )
+
+    def _toward(self, past: Scene, agent: int, frame: int) -> Keyframe:
+        """A keyframe of one agent: the most upright of its last poses, moved towards its goal as far as it may get."""
+        pose = int(past.T_world_root[0, :, agent, 1, 3].argmax())
+        key = dataclasses.replace(keyframe(past, agent, past.frames - 1, pose, held=True), frame=frame)
+        T_world_can = canonical_frame(past.T_world_root)[0, -1, agent]
+        goal = self.settings.goals.get(agent, Goal.of(T_world_can))
+        return dataclasses.replace(key, goal=reached(T_world_can, goal, (frame - CONTEXT) / past.fps))

@@ -1,0 +1,86 @@
+"""A partner in real time: people's newest frames in, the answer to them out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.fed import FedStream
+from magnet.generation.inputs import check_request
+from magnet.motion.scene import Scene, cat_time, require_rate
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.schedule import Grid
+from magnet.tasks.partner import MotionControl, chosen
+
+
+class Partner:
+    """Some agents of a scene, who answer what the others do as it happens (the task `motion_control`, fed live).
+
+    Answers are those that `motion_control` gives with the same seed when all is known at once. Memory does not grow.
+
+    Args:
+        denoiser: a trained model.
+        past: how it began: B scenes of everybody, of which the last whole tokens are used; a second is enough.
+        agents: slots of those who answer.
+        options: how they are sampled; fewer steps answer sooner.
+        generator: source of randomness, on the model's device.
+        block: token steps that are answered at a time; the others are seen up to their end.
+
+    Raises:
+        ValueError: another frame rate or floor than the model's, motion that is not finite, less than a token of
+            past, no such agent, nobody left to be answered, or a block longer than the model's window.
+    """
+
+    def __init__(
+        self,
+        denoiser: Denoiser,
+        past: Scene,
+        agents: Sequence[int] = (0,),
+        options: SamplerOptions | None = None,
+        generator: torch.Generator | None = None,
+        block: int = 1,
+    ) -> None:
+        require_rate(past, "past")
+        check_request(denoiser, past, 0, 0, 1)
+        if past.frames < STRIDE:
+            raise ValueError(f"past: got {past.frames} frames, expected at least {STRIDE}, of everybody")
+        self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents), block=block)
+        self.options, self.generator = options or SamplerOptions(), generator
+        chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
+        self._present = past.present
+        whole = past.slice(past.frames % STRIDE).replace(valid=None, given=None)
+        self._stream = FedStream(denoiser, whole, self.task, self.options, generator)
+
+    @property
+    def past(self) -> Scene:
+        """The last frames of everybody, given and answered, as far back as the model or its decoder still looks."""
+        canvas = self._stream.canvas
+        held = canvas.given.slice(0, canvas.shown * STRIDE)
+        return held.permute_agents(torch.arange(self._present.shape[1]))
+
+    def answer(self, frames: Scene) -> Scene:
+        """The same frames with the answer in them, final; what is given in them comes back as it is.
+
+        Args:
+            frames: (B, 4 n) what follows the frames before, of the same people in the same slots and the same world;
+                of those who answer nothing is read. A whole number of blocks.
+
+        Raises:
+            ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people or frame rate.
+        """
+        require_rate(frames, "frames")
+        block = self.task.block * STRIDE
+        if not frames.frames or frames.frames % block:
+            raise ValueError(
+                f"frames: got {frames.frames}, expected a multiple of {block}: a token is {STRIDE} frames"
+                + (f", and {self.task.block} are answered at a time" if self.task.block > 1 else "")
+            )
+        if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):
+            raise ValueError("frames: expected the scenes and people of the past, in the same slots")
+        # Block by block: what has been fed beyond a block is not to be read in it.
+        answers = [self._stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        answer = cat_time(answers).replace(names=frames.names)
+        return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))

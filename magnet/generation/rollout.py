@@ -1,0 +1,321 @@
+"""Scenes of any length: sampled, decoded and handed out piece by piece, in memory that does not grow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.denoiser.transformer import without_dropout
+from magnet.generation.conditioning import (
+    SamplerOptions,
+    known_tokens,
+    occupied,
+    planning_grid,
+    reach,
+    require_people,
+    scrub,
+    task_sight,
+)
+from magnet.generation.inputs import check_given, check_request
+from magnet.generation.plan import endless, planned
+from magnet.generation.showing import Expected, own_view, show
+from magnet.generation.world import Canvas, Health
+from magnet.motion.scene import Scene, cat_time
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.noise import LEVELS, NoiseStream
+from magnet.sampling.sampler import begin, run_stages
+from magnet.sampling.schedule import Stage
+from magnet.sampling.solvers import History
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
+
+PIECE = 64
+"""Token steps that are decoded at a time: scenes of up to 8.5 seconds are one piece."""
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+
+
+def generate(
+    model: Denoiser,
+    scene: Scene,
+    task: Task,
+    context: int,
+    frames: int,
+    samples: int = 1,
+    options: SamplerOptions | None = None,
+    generator: Generators = None,
+    progress: Callable[[int], None] | None = None,
+    health: Health | None = None,
+) -> Scene:
+    """Sample a task.
+
+    Args:
+        model: the trained denoiser.
+        scene: B recordings; only what the task's schedule calls known is read.
+        task: plans what is known and what is generated.
+        context: frames recorded of everybody, a multiple of 4.
+        frames: frames after the context.
+        samples: scenes drawn for each recording; sample s of scene b is at b * samples + s.
+        options: how to sample.
+        generator: source of randomness, on the model's device; or one for each of the B * samples scenes, which
+            are then the same whatever else is in the batch.
+        progress: told 1 after each denoising step.
+        health: filled with how well the sampled tokens hang together, and how often the network ran.
+
+    Returns:
+        Scene of B * samples, context + frames frames, the given frames included.
+
+    Raises:
+        ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
+            scene nobody is there to be generated, or nobody to be given where the task gives somebody.
+    """
+    return cat_time(list(stream(model, scene, task, context, frames, samples, options, generator, progress, health)))
+
+
+def stream(
+    model: Denoiser,
+    scene: Scene,
+    task: Task,
+    context: int,
+    frames: int | None,
+    samples: int = 1,
+    options: SamplerOptions | None = None,
+    generator: Generators = None,
+    progress: Callable[[int], None] | None = None,
+    health: Health | None = None,
+    piece: int = PIECE,
+) -> Iterator[Scene]:
+    """Sample a task in consecutive pieces of frames, which make up what `generate` returns.
+
+    Memory holds a piece and its neighbourhood, however long the scene; it grows only where a keyframe far ahead
+    decides where everything before it stands. Arguments as for `generate`, and:
+
+    Args:
+        frames: None: without end, for tasks that then are given no more than the context.
+        piece: token steps decoded and handed out at a time. Smaller pieces come sooner and cost more; poses
+            differ by rounding.
+
+    Raises:
+        ValueError: as `generate`; or the task cannot go on without end, or a piece has no tokens.
+    """
+    if piece < 1:
+        raise ValueError(f"piece: got {piece}, expected at least 1 token step")
+    return Stream(model, scene, task, context, frames, samples, options, generator, progress, health, piece).pieces()
+
+
+class Stream:
+    """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
+
+    The rows held are [first, stop): `tokens` and `veil` (B, n, P, D), the `history` of a multistep solver, and the
+    world in `canvas`. `there` is how many rows there are so far of what is given.
+    """
+
+    fed = False
+
+    def __init__(
+        self,
+        model: Denoiser,
+        scene: Scene,
+        task: Task,
+        context: int,
+        frames: int | None,
+        samples: int,
+        options: SamplerOptions | None,
+        generator: Generators,
+        progress: Callable[[int], None] | None,
+        health: Health | None,
+        piece: int,
+    ) -> None:
+        check_request(model, scene, context, frames, samples)
+        layout = model.layout
+        self.model, self.options, self.piece = model, options or SamplerOptions(), piece
+        self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
+        self.samples, self.progress, self.health = samples, progress, health or Health()
+        self.frames = None if frames is None else context + frames
+        if self.frames is not None and scene.frames >= self.frames:
+            self.scene = whole_tokens(self.scene, self.frames)
+        o = self.options
+        tokens = model.window if self.frames is None else -(-self.frames // STRIDE)
+        past = context // STRIDE
+        grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
+        self.rows: float = grid.tokens
+        if frames is None:
+            schedule, self.plan = endless(task, grid, layout.agents, self.fed)
+            self.rows = torch.inf
+        else:
+            schedule = task.schedule(grid).padded(layout.agents)
+            self.plan = planned(schedule)
+        require_people(schedule, self.scene)
+        self.known = schedule.known
+        self.cuts: Tensor | None = None  # how far codes look ahead; matters only where something is given later
+        if frames is not None and bool(self.known[past:].any()):
+            free = layout.agents - grid.agents
+            self.cuts = torch.nn.functional.pad(task_sight(task, grid), (0, free), value=grid.tokens)
+        # The paper read literally: a known token holds its relations to everybody, also to those not known. It leaks.
+        self.related: Tensor | None = None
+        if layout.relation_noise == "token":
+            self.related = torch.zeros_like(self.known)
+            self.related[: scene.frames // STRIDE] = True
+        check_given(self.scene, self.known, o.any_floor)
+        B, P = scene.scenes * samples, layout.agents
+        self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
+        self.health.begin(B)
+        self.first = self.stop = 0
+        self.there: float = self.rows
+        self.reached = 0  # one past the last row that has been generated
+        self.expected = Expected(reach(model)[1])
+        self.canvas = Canvas(model, self._given(0, 0), schedule, o, samples, self.health)
+        self.tokens, self.veil = self.noise.rows(0)
+        self.history = None if o.solver == "ddim" else History.empty(self.tokens)
+        kind = model.device.type
+        self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
+
+    def pieces(self) -> Iterator[Scene]:
+        """Everything, piece by piece."""
+        start, before = 0, None
+        for stage, final, needed in self.plan:
+            if stage is not None:
+                self._run(stage)
+            for ready in self._ready(final):
+                while start < self.rows and ready >= min(start + self.piece, self.rows):
+                    stop = int(min(start + self.piece, self.rows))
+                    made = self._decoded(start, stop, before, needed)
+                    yield made if self.frames is None else made.slice(0, self.frames - start * STRIDE)
+                    start, before = stop, made.slice(made.frames - 1)
+
+    def _ready(self, final: int) -> Iterator[float]:
+        """Rows before which bodies can be handed out, given those before which nothing is generated or moved again.
+
+        Bodies of causal plans are made here, block by block, as they are live.
+        """
+        if not self.canvas.causal:
+            yield self.rows if final >= self.rows else final - self._margins[1]
+            return
+        for end in (min(self.reached, final), final):
+            while (shown := self.first + self.canvas.shown) < end:
+                yield self._show(min(shown + PIECE, end), end)
+
+    @torch.no_grad()
+    def _show(self, stop: int, end: int) -> int:
+        """Settle the bodies up to row `stop`, of which those before `end` are finished. Returns `stop`."""
+        near = min(stop + reach(self.model)[1], end)
+        with torch.autocast(self._autocast[0], enabled=False):
+            self._bring_in(near)
+            expected = self.expected.behind(end) if near == end else None
+            show(self.canvas, self.tokens, stop - self.first, near - self.first, expected)
+        return stop
+
+    @property
+    def _margins(self) -> tuple[int, int]:
+        """Rows before and after a piece that its poses depend on: by its seams, which depend on their neighbours."""
+        before, after = reach(self.model)
+        if self.canvas.causal:
+            return before + 2, 0
+        seam = -(-self.options.blend // STRIDE) if self.options.paste else 0
+        return before + seam + 1, after + seam
+
+    # Contexts are entered anew in each call: while a piece is being looked at they would hold outside too.
+
+    @torch.no_grad()
+    def _run(self, stage: Stage) -> None:
+        self._ahead = stage.ahead
+        with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
+            self._bring_in(stage.stop + 1)  # the step into the token behind the window is written too
+            self.tokens = run_stages(
+                self._denoise,
+                [dataclasses.replace(stage, start=stage.start - self.first)],
+                self.tokens,
+                self.veil,
+                self.canvas.given.present,
+                self.model.layout,
+                self.canvas.settle,
+                self.progress,
+                self.options.guidance,
+                self.noise,
+                self.first,
+                self.history,
+            )
+        self.reached = max(self.reached, stage.active[1])
+        if self.canvas.causal and self.expected.most:
+            self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
+
+    def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        self.health.add_call(len(noisy))
+        width = noisy.shape[1]
+        # What lies ahead is nobody's: it is shown as the mean of pure noise, which tells nothing of anybody.
+        noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
+        levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
+        with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
+            clean = self.model.denoise(noisy, levels, present).float()
+        self._clean = clean.detach()
+        return clean[:, :width]
+
+    @torch.no_grad()
+    def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
+        """Bodies of rows [start, stop), which are final; rows that no later piece or stage needs are let go."""
+        behind, ahead = self._margins
+        with torch.autocast(self._autocast[0], enabled=False):
+            self._bring_in(stop + ahead)
+            made = self.canvas.scene(self.tokens, start - self.first, stop - self.first, before)
+        surplus = min(stop - behind, needed - 1) - self.first
+        if surplus > 0:
+            self.canvas.release(surplus)
+            self.tokens, self.veil = self.tokens[:, surplus:].clone(), self.veil[:, surplus:].clone()
+            self.history = None if self.history is None else self.history.release(surplus)
+            self.first += surplus
+        given = self._known(start, stop).repeat_interleave(STRIDE, dim=0).to(made.device)
+        return made.replace(given=given[None] & made.present[:, None])
+
+    def _bring_in(self, stop: int) -> None:
+        """Bring in rows, whole pieces at a time, until those before `stop` are held."""
+        behind, ahead = reach(self.model)
+        while self.stop < min(stop, self.there):
+            last = int(min(self.stop + self.piece, self.there))
+            # What is known is encoded with all the neighbours that its codes can depend on.
+            low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
+            known = self._known(low, high)
+            given = self._given(low, high)
+            related = None if self.related is None else scrub(self.scene, self.related, low, high)
+            part = slice(self.stop - low, last - low)
+            tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
+            tokens = tokens.repeat_interleave(self.samples, dim=0)
+            fresh, veil = self.noise.rows(last - self.stop)
+            new = begin(tokens, fresh, known[part], self.model.layout)
+            self.tokens = torch.cat([self.tokens, new], dim=1)
+            self.history = None if self.history is None else self.history.extend(new)
+            self.veil = torch.cat([self.veil, veil], dim=1)
+            self.canvas.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
+            self.stop = last
+
+    def _given(self, low: int, high: int) -> Scene:
+        """Rows [low, high) of the recording, as far as they are known."""
+        return scrub(self.scene, self.known, low, high)
+
+    def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
+        """How far the codes of some of the rows [low, high) look ahead, counted from `low`; 0 for the others."""
+        if self.cuts is None:
+            return None
+        cuts = torch.zeros_like(self.cuts[low:high])
+        cuts[part] = (self.cuts[low:high][part] - low).clamp(max=high - low)
+        return cuts
+
+    def _known(self, first: int, stop: int) -> Tensor:
+        """Rows [first, stop) of what is known; nothing is, beyond the plan of a scene without end."""
+        rows = self.known[first:stop]
+        return torch.nn.functional.pad(rows, (0, 0, 0, stop - first - len(rows)))
+
+
+def whole_tokens(scene: Scene, frames: int) -> Scene:
+    """So many frames of a scene and, up to the end of their last token, its last pose held if there are no more."""
+    wanted = -(-frames // STRIDE) * STRIDE
+    if scene.frames >= wanted:
+        return scene
+    frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)
+    valid = None if scene.valid is None else scene.valid[:, frame]
+    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=valid)

@@ -1,0 +1,140 @@
+"""Bodies of causal plans: shown as soon as their tokens are finished, and never changed by what comes after."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.generation.blending import go_on, hold
+from magnet.generation.conditioning import reach
+from magnet.motion.frames import from_9d, posed, project_se2, to_9d
+from magnet.motion.scene import Scene, cat_time
+from magnet.motion.tokens import STRIDE
+from magnet.sampling.schedule import Stage
+
+if TYPE_CHECKING:
+    from magnet.generation.world import Canvas
+
+LEAD = 2
+"""Frames in front of a block by which its poses go on: where everybody is, and how fast."""
+
+
+class Expected:
+    """What the model expects to come after a block, in the place of what it will generate there.
+
+    A decoder that looks ahead makes poses that fit what follows; shown nothing behind the newest token, it makes some
+    that slide and jerk. What is expected is known in time: each agent's own view of the last denoising step tells it,
+    at no cost, of the token steps that lie `ahead` of the window.
+
+    Args:
+        most: tokens that the decoder looks ahead.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.row = -1
+        self._tokens: Tensor | None = None
+        self._told = torch.zeros(0, dtype=torch.bool)
+
+    def keep(self, stage: Stage, clean: Tensor) -> None:
+        """Take what a stage expected behind its block. clean (B, W + ahead, P, D)
+
+        Each agent's first word counts: stages that finish others of the same block know more than it may.
+        """
+        row = stage.active[1]
+        behind = clean[:, row - stage.start :][:, : self.most]
+        if row != self.row:
+            self.row, self._tokens = row, behind.clone()
+            self._told = torch.zeros(clean.shape[2], dtype=torch.bool)
+        new = (stage.levels[-1, row - 1 - stage.start] == 0) & ~self._told
+        if self._tokens is not None and self._tokens.shape == behind.shape:
+            self._tokens[:, :, new] = behind[:, :, new]
+            self._told |= new
+
+    def behind(self, row: int) -> tuple[Tensor, Tensor] | None:
+        """Tokens (B, n, P, D) expected from a row on, and of whom (P,) bool; None: nothing is known of that."""
+        if row != self.row or self._tokens is None or not self._tokens.shape[1] or not bool(self._told.any()):
+            return None
+        return self._tokens, self._told
+
+
+def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
+    """What each agent's own view expects of its tokens, guidance left out. (rows, W, P, D) -> (B, W, P, D)
+
+    A step's views and the branches of guidance run as one batch, scenes first, then views; the first branch is the
+    unguided one.
+    """
+    if stage.hidden is None:
+        return clean.unflatten(0, (scenes, -1))[:, 0]
+    views, view_of = stage.hidden.unique(dim=0, return_inverse=True)
+    each = clean.unflatten(0, (scenes, len(views), -1))[:, :, 0]  # (B, V, W, P, D)
+    agent = torch.arange(clean.shape[2])
+    return each[:, view_of, :, agent].permute(1, 2, 0, 3)
+
+
+def show(canvas: Canvas, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
+    """Settle the bodies of rows up to `stop` for good: they are given from then on.
+
+    Args:
+        canvas: where all rows before are shown.
+        tokens: (B, N, P, D), of which rows up to `near` are looked at.
+        stop: one past the last row to show.
+        near: one past the last finished row, at least `stop`.
+        expected: see `Expected.behind`, from row `near` on.
+    """
+    frames = slice(canvas.shown * STRIDE, stop * STRIDE)
+    made = bodies(canvas, tokens, canvas.shown, stop, near, expected)
+    canvas.given.body_rot[:, frames] = made.body_rot
+    canvas.given.T_world_root[:, frames] = made.T_world_root
+    canvas.shown = stop
+
+
+def seen(canvas: Canvas, tokens: Tensor, first: int, stop: int) -> Scene:
+    """Rows [first, stop) as they have been shown, and from there on as they would be."""
+    known = canvas.given.slice(first * STRIDE, max(min(canvas.shown, stop), first) * STRIDE)
+    if canvas.shown >= stop:
+        return known
+    rest = bodies(canvas, tokens, max(canvas.shown, first), stop, stop)
+    return cat_time([known, rest]) if known.frames else rest
+
+
+def bodies(
+    canvas: Canvas,
+    tokens: Tensor,
+    first: int,
+    stop: int,
+    near: int,
+    expected: tuple[Tensor, Tensor] | None = None,
+) -> Scene:
+    """Rows [first, stop) decoded from the tokens before `near` alone, as they go on from what was shown."""
+    model, options = canvas.model, canvas.options
+    lead = LEAD if first else 0
+    low = max(first - bool(first) - reach(model)[0], 0)
+    latent, steps, _ = model.layout.unpack(model.statistics.restore(tokens[:, low:near]))
+    if expected is not None:
+        later, ways = continuation(canvas, latent, steps, expected)
+        latent, steps = torch.cat([latent, later], dim=1), torch.cat([steps, ways], dim=1)
+    frames = slice(first * STRIDE - lead, stop * STRIDE)
+    features = model.tokenizer.decode(latent, canvas.given.betas, steps)
+    features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
+    given, T_world_can = canvas.given.slice(frames.start, frames.stop), canvas.T_world_can[:, frames]
+    keep = canvas.by_frame(canvas.known[first:stop] & options.paste)
+    if first:  # whoever was not there before does not go on from anywhere
+        keep = torch.cat([canvas.by_frame(canvas.placed[first - 1 : first])[:lead], keep])
+    made = go_on(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
+    before = canvas.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
+    return hold(made, canvas.by_frame(canvas.placed[first:stop]), before)
+
+
+def continuation(
+    canvas: Canvas, latent: Tensor, steps: Tensor, expected: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Latents and steps to decode behind the last ones; whoever nothing is expected of goes on as in the last token."""
+    tokens, told = expected
+    told = told.to(latent.device)
+    later, ways, _ = canvas.model.layout.unpack(canvas.model.statistics.restore(tokens))
+    ways = to_9d(project_se2(from_9d(ways)))
+    later = torch.where(told[:, None], later, latent[:, -1:])
+    return later, torch.where(told[:, None, None], ways, steps[:, -1:])

@@ -1,0 +1,390 @@
+"""World poses of a scene while it is being generated, and its bodies in the end."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.generation.blending import arrive, hold, paste, step_between
+from magnet.generation.conditioning import reach, sight
+from magnet.generation.showing import seen
+from magnet.motion.frames import (
+    Placement,
+    canonical_frame,
+    canonical_steps,
+    from_9d,
+    inverse,
+    pairwise,
+    partners,
+    place,
+    posed,
+    project_se2,
+    shift_onto,
+    to_9d,
+)
+from magnet.motion.scene import Scene, cat_time
+from magnet.motion.tokens import STRIDE, by_frame, by_token, relations_by_frame, relations_by_token
+from magnet.sampling.schedule import MaskSchedule
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+    from magnet.generation.conditioning import SamplerOptions
+
+
+@dataclass
+class Health:
+    """How well sampled tokens hang together and what they cost; filled while sampling, for whoever asks.
+
+    `snap`: distance of a sampled latent to its code, as a share of the code's length. `drift`: metres
+    between a sampled pairwise transform and what the placed agents imply. `calls`: how often the network ran, a
+    batch at a time. `evaluations`: how often it ran for each scene, views and guidance branches counted apart.
+    """
+
+    snap_sum: float = 0.0
+    snaps: int = 0
+    drift_sum: float = 0.0
+    drifts: int = 0
+    runs: int = 0
+    calls: int = 0
+    scenes: int = 0
+    rows: int = 0  # windows that went through the network
+
+    @property
+    def evaluations(self) -> float:
+        return self.rows / max(self.scenes, 1)
+
+    def means(self) -> dict[str, float]:
+        """Means of what was seen; `calls` is that of a run of the sampler."""
+        return {
+            "snap": self.snap_sum / max(self.snaps, 1),
+            "drift": self.drift_sum / max(self.drifts, 1),
+            "calls": self.calls / max(self.runs, 1),
+            "evaluations": self.evaluations,
+        }
+
+    def begin(self, scenes: int) -> None:
+        """A run of the sampler starts."""
+        self.runs += 1
+        self.scenes += scenes
+
+    def add_call(self, rows: int) -> None:
+        """The network runs on so many windows."""
+        self.calls += 1
+        self.rows += rows
+
+    def add_snap(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
+        """latent, code (B, n, P, C), counts (B, n, P) bool"""
+        away = ((latent - code).norm(dim=-1) / code.norm(dim=-1).clamp_min(1e-6))[counts]
+        self.snap_sum += float(away.sum())
+        self.snaps += len(away)
+
+    def add_drift(self, relations: Tensor, implied: Tensor, counts: Tensor) -> None:
+        """relations, implied (B, n, P, slots, 4, 9), counts (B, n, P, slots) bool"""
+        away = (relations - implied)[..., 6:].norm(dim=-1).mean(dim=-1)[counts]
+        self.drift_sum += float(away.sum())
+        self.drifts += len(away)
+
+
+class Canvas:
+    """World poses of the scene while it is being generated.
+
+    After each stage the new tokens are made self-consistent before the model sees them again: codes
+    snapped, transforms projected to turns about the vertical and ground shifts, agents placed in the
+    world, and both kinds of transforms recomputed from there.
+
+    Args:
+        model: whose tokens these are.
+        given: (B, T) what is known of the scene, the rest scrubbed; or of its first rows, see `extend`.
+        schedule: the plan of the whole scene; only what it knows is read.
+        options: how to sample.
+        samples: scenes drawn for each of B.
+        health: filled.
+    """
+
+    def __init__(
+        self,
+        model: Denoiser,
+        given: Scene,
+        schedule: MaskSchedule,
+        options: SamplerOptions,
+        samples: int,
+        health: Health | None = None,
+    ) -> None:
+        self.model = model
+        self.options = options
+        self.health = health or Health()
+        self.samples = samples
+        self.known = schedule.known[: given.frames // STRIDE]
+        self.given = given.repeat(samples)
+        self.placed = self.known.clone()
+        # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
+        self.T_world_can = canonical_frame(self.given.T_world_root).clone()
+        self.rooted = False  # whether something was known in rows that have been let go
+        self.causal, self._sight, self.released = schedule.causal, sight(schedule), 0
+        self.shown = 0  # rows of a causal plan whose bodies are final, and given from then on
+
+    def extend(self, given: Scene, known: Tensor) -> None:
+        """Take in more rows at the end. given (B, 4 n), known (n, P)"""
+        given = given.repeat(self.samples)
+        self.given = cat_time([self.given, given])
+        self.known, self.placed = torch.cat([self.known, known]), torch.cat([self.placed, known])
+        self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
+
+    def release(self, rows: int) -> None:
+        """Let the first rows go; nothing that follows may depend on them, so one row before what may still
+        change must stay."""
+        frames = rows * STRIDE
+        self.rooted |= bool(self.known[:rows].any())
+        self.shown, self.released = max(self.shown - rows, 0), self.released + rows
+        self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
+        self.T_world_can = self.T_world_can[:, frames:].clone()
+        kept = self.given.slice(frames)
+        self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
+
+    def settle(self, canvas: Tensor, finished: Tensor, apart: bool = False) -> Tensor:
+        """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
+
+        Of known tokens nothing changes but the step that leads into them, once it is known where from. `apart`:
+        some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
+        would tie together who decided alone, so everybody is placed by the own steps, whatever the options say.
+        """
+        rows = finished.any(dim=1).nonzero()[:, 0]
+        if not len(rows):
+            return canvas
+        layout, statistics = self.model.layout, self.model.statistics
+        first, stop = int(rows[0]), int(rows[-1]) + 1
+        latent, steps, relations = layout.unpack(statistics.restore(canvas[:, first:stop]))
+        if self.model.quantised if self.options.requantise is None else self.options.requantise:
+            new = finished[first:stop].to(canvas.device)
+            code = self.model.tokenizer.requantise(latent)
+            self.health.add_snap(latent, code, new & self.given.present[:, None])
+            latent = torch.where(new[..., None], code, latent)
+        placement = "integrate" if apart else self.options.placement
+        moved = self._place_all(steps, relations if layout.slots else None, finished, first, stop, placement)
+        begin = int(moved.any(dim=1).nonzero()[0, 0])
+        if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
+            earlier = layout.unpack(statistics.restore(canvas[:, begin:first]))[0]
+            latent = torch.cat([earlier, latent], dim=1)
+        true_steps = self._steps(begin, stop)
+        implied = relations_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
+        settled = layout.pack(latent, true_steps, implied)
+        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
+        if layout.slots:
+            together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
+            if apart:
+                new = finished[first:stop].to(canvas.device)
+                together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
+            self.health.add_drift(relations, implied[:, first - begin :], together)
+        changed = layout.spread(changed_groups)
+        canvas[:, begin:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, begin:stop])
+        return self._enter(canvas, begin, stop)
+
+    def _steps(self, first: int, stop: int) -> Tensor:
+        """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
+        # One frame more in front, so that the first step leads in from where each agent stood.
+        lead = min(1, first)
+        steps = canonical_steps(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
+        steps = by_token(to_9d(steps))
+        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(steps.device)
+        steps[:, :, :, 0] = torch.where(before[..., None], steps[:, :, :, 0], to_9d(torch.eye(4)).to(steps))
+        return steps
+
+    def _enter(self, canvas: Tensor, first: int, stop: int) -> Tensor:
+        """Write the true step into known tokens that a gap has just been closed in front of."""
+        until = min(stop + 1, len(self.known))
+        before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
+        entered = (self.known[first:until] & ~before).to(canvas.device)
+        entered[0] = False  # nothing in front of these rows has moved
+        if not bool(entered.any()):
+            return canvas
+        layout, statistics = self.model.layout, self.model.statistics
+        latent, _, relations = layout.unpack(canvas[:, first:until])
+        true = statistics.normalise(layout.pack(latent, self._steps(first, until), relations))
+        number = torch.arange(layout.width, device=canvas.device)
+        step = (number >= layout.latent) & (number < layout.latent + 9)
+        canvas[:, first:until] = torch.where(entered[..., None] & step, true, canvas[:, first:until])
+        return canvas
+
+    def _ready(self, first: int, stop: int) -> Tensor:
+        """Which groups of tokens speak only of agents that are placed. -> (n, P, 1 + slots) bool"""
+        own = self.placed[first:stop, :, None]
+        if not self.model.layout.slots:
+            return own.clone()
+        partner = partners(own.shape[1])
+        return torch.cat([own, own & self.placed[first:stop][:, partner]], dim=-1)
+
+    def _touched(self, moved: Tensor) -> Tensor:
+        """Which groups of tokens speak of somebody who moved. moved (n, P) -> (n, P, 1 + slots) bool"""
+        own = moved[..., None]
+        if not self.model.layout.slots:
+            return own
+        return torch.cat([own, own | moved[:, partners(moved.shape[1])]], dim=-1)
+
+    def _place_all(
+        self,
+        steps: Tensor,
+        relations: Tensor | None,
+        finished: Tensor,
+        first: int,
+        stop: int,
+        placement: Placement,
+    ) -> Tensor:
+        """Put the new tokens of a stage into the world, from known token to known token. -> (N, P) bool, who moved"""
+        moved = finished.clone()
+        for start, end in spans(finished, self.placed, first, stop):
+            part = slice(start - first, end - first)
+            new = finished[start]
+            pairs = None if relations is None else relations[:, part]
+            self._place(steps[:, part], pairs, start, end, new, placement)
+            self.placed[start:end] |= new
+            moved |= self._arrive(end, new)
+        return moved
+
+    def _place(
+        self, steps: Tensor, relations: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
+    ) -> None:
+        """Put newly generated agents into the world from their predicted steps and relations. new (P,) bool"""
+        new = new.to(steps.device)
+        known = self.placed[first].to(steps.device)
+        true_steps = from_9d(by_frame(self._steps(first, stop)))
+        T_prev_can = torch.where(known[:, None, None], true_steps, project_se2(from_9d(by_frame(steps))))
+        T_self_partner = None
+        if relations is not None:
+            T_self_partner = from_9d(relations_by_frame(relations))
+        there = self.given.present & (known | new)  # of others, nothing is known here
+        placed = place(
+            T_prev_can,
+            T_self_partner,
+            self._starts(T_prev_can, T_self_partner, first, new),
+            placement,
+            self.options.trust,
+            present=there,
+            fixed=known,
+            anchor=first_of(there),
+        )
+        frames = slice(first * STRIDE, stop * STRIDE)
+        self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
+
+    def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
+        """Canonical frames just before token `first`, such that the first step leads to the right place.
+
+        Whoever was there before goes on from there. A newcomer's whole way hangs by the pairwise transforms, as
+        nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
+        newcomer, who then starts at the origin; in each scene off somebody who is present.
+        """
+        starts = self.T_world_can[:, max(first * STRIDE - 1, 0)].clone()
+        there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
+        present = self.given.present
+        if bool((there | ~present).all()):
+            return starts
+        now = self.placed[first].to(new.device)
+        anchor = (present * (4 * now.int() + 2 * there.int() + new.int())).argmax(dim=1)
+        scene = torch.arange(len(starts), device=starts.device)
+        onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
+        onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
+        T_world_anchor = torch.where(now[anchor, None, None], self.T_world_can[scene, first * STRIDE, anchor], onward)
+        for agent in (~there).nonzero()[:, 0].tolist():
+            T_world_first = self.T_world_can[:, first * STRIDE, agent] if bool(now[agent]) else T_world_anchor
+            starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
+        if T_self_partner is None:
+            return starts
+        ways = place(T_prev_can, None, starts)
+        for agent in (~there & ~now).nonzero()[:, 0].tolist():
+            slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
+            hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
+            shift = shift_onto(ways[:, :, agent], hung)
+            starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
+        return starts
+
+    def _arrive(self, row: int, new: Tensor) -> Tensor:
+        """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
+
+        Each agent's misfit is spread over its whole gap, or as much of it as has not been shown. Where nothing was
+        known before, the world's origin was arbitrary, and all who are there move along with the first who arrives.
+        """
+        moved = torch.zeros_like(self.placed)
+        arriving = self.known[row] & new & ~self._late(row) if row < len(self.known) else torch.zeros_like(new)
+        if not bool(arriving.any()):
+            return moved
+        key = row * STRIDE
+        if not self.rooted and not self.shown and not bool(self.known[:row].any()):
+            self._root(key, arriving)
+            moved[:row] |= self.placed[:row]
+        for agent in arriving.nonzero()[:, 0].tolist():
+            T_world_key = self.T_world_can[:, key, agent]
+            key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
+            gap = (self.placed & ~self.known)[:row, agent]
+            gap[: self.shown] = False  # too late to move
+            outside = (~gap).nonzero()[:, 0]
+            start = int(outside[-1]) + 1 if len(outside) else 0
+            left = int(start > 0 and bool(self.placed[start - 1, agent]))
+            path = self.T_world_can[:, start * STRIDE - left : key, agent]
+            self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
+            moved[start:row, agent] = True
+        return moved
+
+    def _late(self, row: int) -> Tensor:
+        """Who is told of a known token only when the one before has been shown. -> (P,) bool"""
+        row += self.released
+        if not self.causal or not 0 < row < len(self._sight):
+            return torch.zeros_like(self.known[0])
+        return self._sight[row - 1] <= row
+
+    def _root(self, key: int, arriving: Tensor) -> None:
+        """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
+        there = self.given.present & arriving.to(self.given.device)
+        scene, lead = torch.arange(len(there), device=there.device), first_of(there)
+        T_world_key = self.T_world_can[scene, key, lead]
+        key_step = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
+        path = self.T_world_can[scene, :key, lead]
+        shift = T_world_key @ inverse(path[:, -1] @ step_between(path, key_step))
+        shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
+        placed = self.by_frame(self.placed[: key // STRIDE])[..., None, None]
+        now = self.T_world_can[:, :key]
+        self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
+
+    def scene(self, canvas: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
+        """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
+
+        `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
+        Poses depend on as many neighbouring rows as the decoder and the seams reach; those of causal plans on earlier
+        rows alone (`magnet.generation.showing`).
+        """
+        if self.causal:
+            return seen(self, canvas, first, len(self.known) if stop is None else stop)
+        layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.paste else 0
+        stop = len(self.known) if stop is None else stop
+        low, high = max(first - blend, 0), min(stop + blend, len(self.known))
+        behind, ahead = reach(self.model)
+        near = slice(max(low - behind, 0), high + ahead)
+        latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas[:, near]))
+        features = self.model.tokenizer.decode(latent, self.given.betas, steps)
+        frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
+        given = self.given.slice(low * STRIDE, high * STRIDE)
+        T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
+        decoded = posed(features[:, frames], T_world_can, given)
+        if self.options.paste:
+            decoded = paste(decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend)
+        decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
+        return hold(decoded, self.by_frame(self.placed[first:stop]), before)
+
+    def by_frame(self, rows: Tensor) -> Tensor:
+        """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""
+        return rows.repeat_interleave(STRIDE, dim=0).to(self.given.device)
+
+
+def first_of(mask: Tensor) -> Tensor:
+    """The first agent of each scene for whom a mask holds; 0 where there is none. (B, P) bool -> (B,) int"""
+    return mask.int().argmax(dim=1)
+
+
+def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:
+    """Runs of token steps in which the same agents are new and the same are placed. finished, placed (N, P) bool"""
+    pattern = torch.cat([finished, placed], dim=1)[first:stop]
+    change = (pattern[1:] != pattern[:-1]).any(dim=1).nonzero()[:, 0] + first + 1
+    edges = [first, *change.tolist(), stop]
+    return [(start, end) for start, end in itertools.pairwise(edges) if bool(finished[start].any())]

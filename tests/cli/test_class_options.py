@@ -1,0 +1,326 @@
+"""What a command resolves for a class is what the class says of itself, and what was given to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
+
+from magnet import cli, weights
+from magnet.cli import class_options, train
+from magnet.cli.checkpoint_config import LINKS, OWN_WAY
+from magnet.cli.config_files import Layer, merged, read_layers
+from magnet.cli.main import TRAINER_COMMANDS
+from magnet.tasks import registry
+from tests.toys import OtherData, ToyData, ToyModel
+
+CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+MODELS, DATA = train.named_classes()
+TASKS = {entry.name: entry.task for entry in registry.entries()}
+
+
+def told(config: Path) -> dict[str, Any]:
+    """What a configuration and those that it extends say together."""
+    options: dict[str, Any] = {}
+    for layer in read_layers(str(config)):
+        options = merged(options, layer.options)
+    return options
+
+
+RUNS = [
+    config
+    for config in sorted(Path(__file__).parents[2].joinpath("configs").rglob("*.yaml"))
+    if {"model", "data"} <= told(config).keys() and "sampler" not in told(config)
+]
+"""Trainings; parts of them and ways of sampling are held to what they say in test_configs.py."""
+
+
+def own(kind: type, package: str = "magnet") -> dict[str, Any]:
+    """A class's arguments and their defaults, from the signatures of itself and its bases, nearest first."""
+    found: dict[str, Any] = {}
+    for base in kind.__mro__:
+        if "__init__" in vars(base) and base.__module__.split(".")[0] in (package, "magnet"):
+            for name, parameter in list(inspect.signature(base.__init__).parameters.items())[1:]:
+                if parameter.kind is not parameter.VAR_KEYWORD:
+                    found.setdefault(name, parameter.default)
+    return plain({name: None if value is inspect.Parameter.empty else value for name, value in found.items()})
+
+
+def plain(value: Any) -> Any:
+    """As YAML has it: lists for tuples, mappings for dataclasses."""
+    return json.loads(json.dumps(value, default=dataclasses.asdict))
+
+
+def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    capsys.readouterr()
+    assert cli.main([*words, "--print_config"]) == 0
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+def written(path: Path, **options: Any) -> str:
+    path.write_text(yaml.safe_dump(options))
+    return str(path)
+
+
+def spelt(kind: type) -> dict[str, Any]:
+    """A class with every option, as `--print_config` writes it, each number otherwise than by default."""
+
+    def other(value: Any) -> Any:
+        return not value if isinstance(value, bool) else value + 1 if isinstance(value, int) else value
+
+    return {"class_path": kind.__name__, "init_args": {name: other(value) for name, value in own(kind).items()}}
+
+
+SPELT = spelt(DATA["Synthetic"])
+
+
+# -- each class ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", TRAINER_COMMANDS)
+@pytest.mark.parametrize("name", DATA)
+def test_data_named_by_a_flag_have_their_own_defaults(
+    name: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--model", "Tokenizer") if command == "fit" else ()
+    assert printed(capsys, command, *words, "--data", name)["data"]["init_args"] == own(DATA[name])
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_data_named_by_a_file_have_their_own_defaults_over_any_other_file(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    below = written(tmp_path / "below.yaml", model="Tokenizer", data=SPELT | {"class_path": "Synthetic"})
+    given = {"class_path": name, "init_args": {"batch_size": 5}}
+    above = written(tmp_path / "above.yaml", extends="below.yaml", data=given)
+    if name == "Synthetic":
+        assert printed(capsys, "fit", "--config", above)["data"]["init_args"] == SPELT["init_args"] | {"batch_size": 5}
+    else:
+        assert printed(capsys, "fit", "--config", above)["data"]["init_args"] == own(DATA[name]) | {"batch_size": 5}
+        words = ("--config", below, "--data.batch_size", "7", f"--data={name}")
+        assert printed(capsys, "fit", *words)["data"]["init_args"] == own(DATA[name]) | {"batch_size": 7}
+
+
+@pytest.mark.parametrize("command", TRAINER_COMMANDS)
+@pytest.mark.parametrize("name", MODELS)
+def test_models_have_their_own_defaults(name: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    linked = set(LINKS.values()) if command == "fit" else set()
+    expected = {key: value for key, value in own(MODELS[name]).items() if key not in linked}
+    assert printed(capsys, command, "--model", name)["model"]["init_args"] == expected
+
+
+def test_a_model_over_a_file_that_spells_the_other_out_has_its_own_defaults(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    below = written(tmp_path / "below.yaml", model=spelt(MODELS["Denoiser"]))
+    assert printed(capsys, "validate", "--config", below, "--model", "Tokenizer")["model"]["init_args"] == own(
+        MODELS["Tokenizer"]
+    )
+
+
+@pytest.mark.parametrize("command", ["test", "predict"])
+@pytest.mark.parametrize("name", TASKS)
+def test_tasks_have_their_own_defaults(name: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = printed(capsys, command, "--task", name)["task"]
+    fields = {field.name: field for field in dataclasses.fields(TASKS[name]) if field.init}
+    missing = dataclasses.MISSING
+    expected = {
+        key: field.default if field.default_factory is missing else field.default_factory()
+        for key, field in fields.items()
+    }
+    assert asked.get("init_args", {}) == plain(expected)
+
+
+def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inside = [name for name in DATA if name != "Mixed"]
+    parts = [{"class_path": name, "init_args": {"seed": 3}} for name in inside]
+    mixed = {"class_path": "Mixed", "init_args": {"data": parts, "max_agents": 3}}
+    below = SPELT | {"class_path": "Synthetic"}
+    lower = {"class_path": "Mixed", "init_args": {"data": [below] * len(inside), "compose": 0.5}}
+    words = ("--config", written(tmp_path / "lower.yaml", model="Tokenizer", data=lower))
+    more = ("--config", written(tmp_path / "mixed.yaml", data=mixed))
+    flag = ("--data.data", json.dumps(parts))
+    for given, agents in (((*words, *more), 3), ((*words, *flag), 2), ((*words, "--data.data=" + flag[1]), 2)):
+        got = printed(capsys, "fit", *given)["data"]["init_args"]
+        found = [part["init_args"] for part in got.pop("data")]
+        assert found == [own(DATA[name]) | {"seed": 3} for name in inside]
+        rest = own(DATA["Mixed"]) | {"max_agents": agents, "compose": 0.5}
+        assert got == {key: value for key, value in rest.items() if key != "data"}
+
+
+def test_callbacks_have_their_own_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = "lightning.pytorch.callbacks."
+    kept = {"class_path": f"{path}ModelCheckpoint", "init_args": {"filename": "abc", "dirpath": "there"}}
+    other = {"class_path": f"{path}OnExceptionCheckpoint", "init_args": {"dirpath": "here"}}
+    lower = written(tmp_path / "lower.yaml", model="Tokenizer", trainer={"callbacks": [kept]})
+    upper = written(tmp_path / "upper.yaml", trainer={"callbacks": [other]})
+    expected = own(OnExceptionCheckpoint, "lightning") | {"dirpath": "here"}
+    for more in (("--config", upper), ("--trainer.callbacks", json.dumps([other]))):
+        (callback,) = printed(capsys, "fit", "--config", lower, *more)["trainer"]["callbacks"]
+        assert callback["init_args"] == expected
+    (callback,) = printed(capsys, "fit", "--config", upper, "--config", lower)["trainer"]["callbacks"]
+    assert callback["init_args"] == own(ModelCheckpoint, "lightning") | kept["init_args"]
+
+
+def taken_over(name: str | None) -> dict[str, Any]:
+    """What a configuration that starts from a shipped model has from it."""
+    if name not in weights.names():
+        return {}
+    stored = weights.read(weights.resolve(name))["hyper_parameters"]
+    return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
+
+
+@pytest.mark.parametrize("config", RUNS, ids=lambda path: path.stem)
+def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = told(config)
+    got = printed(capsys, "fit", "--config", str(config))
+    fields = said["model"].get("init_args", {})
+    model = own(MODELS[said["model"]["class_path"]]) | taken_over(fields.get("start_from")) | fields
+    assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
+
+    def resolved(spec: dict[str, Any]) -> dict[str, Any]:
+        options = own(DATA[spec["class_path"]]) | spec.get("init_args", {})
+        return options | ({"data": [resolved(part) for part in options["data"]]} if "data" in options else {})
+
+    found = got["data"]["init_args"]
+    found |= {"data": [part["init_args"] for part in found["data"]]} if "data" in found else {}
+    assert found == resolved(said["data"])
+
+
+PAGES = [Path(__file__).parents[2] / "README.md", *sorted(Path(__file__).parents[2].glob("docs/*.md"))]
+COMMANDS = sorted(
+    {
+        line.partition("   #")[0].removesuffix("...").strip()
+        for page in PAGES
+        for line in re.findall(
+            r"^ {4}magnet ((?:fit|validate|test|predict) .*--data .*)",
+            page.read_text().replace("\\\n", " "),  # lines that a backslash continues
+            re.MULTILINE,
+        )
+    }
+)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_a_command_that_a_page_shows_for_a_data_set_runs_what_it_says(
+    line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [word for word in shlex.split(line) if word != "--full"]  # the one flag without a value
+    given = dict(zip(words[1::2], words[2::2], strict=True))
+    given.pop("--ckpt_path", None)  # of somebody's own run
+    said = {name.removeprefix("--data."): value for name, value in given.items() if name.startswith("--data.")}
+    got = printed(capsys, words[0], *(word for pair in given.items() for word in pair))["data"]
+    expected = own(DATA[given["--data"]]) | {name: yaml.safe_load(value) for name, value in said.items()}
+    assert got["init_args"] == expected
+
+
+# -- what is given ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty working folder, and toys in place of the real models and data."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
+    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    return tmp_path
+
+
+def data_of(*words: str) -> Any:
+    assert cli.main([*words, *CPU]) == 0
+    return ToyModel.seen["data"]
+
+
+def test_what_a_file_gives_to_another_class_is_left_out_and_told(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = {"class_path": "OtherData", "init_args": {"root": "there", "takes": 9, "max_agents": 3}}
+    file = written(toy / "other.yaml", model="ToyModel", data=other, trainer={"max_epochs": 1})
+    data = data_of("fit", "--config", file, "--data", "ToyData", "--out", "one")
+    assert (type(data), data.root, data.max_agents) == (ToyData, "nowhere", 2)
+    assert f"data is ToyData: what {file} gives to OtherData is left out (max_agents, root, takes)" in (
+        capsys.readouterr().err
+    )
+    data = data_of("fit", "--config", file, "--out", "two")
+    assert (type(data), data.root, data.max_agents, data.takes) == (OtherData, "there", 3, 9)
+    assert "left out" not in capsys.readouterr().err
+
+
+def test_options_of_no_class_are_given_to_whichever_wins(toy: Path) -> None:
+    base = written(
+        toy / "base.yaml", model="ToyModel", data={"init_args": {"max_agents": 5}}, trainer={"max_epochs": 1}
+    )
+    for name, root in (("ToyData", "nowhere"), ("OtherData", "elsewhere")):
+        named = written(toy / "named.yaml", extends="base.yaml", data=name)
+        for number, words in enumerate((("--config", named), ("--config", base, "--data", name))):
+            data = data_of("fit", *words, "--out", f"{name}{number}")
+            assert (type(data).__name__, data.max_agents, data.root) == (name, 5, root)
+
+
+def test_data_and_model_of_a_checkpoint_give_nothing_to_other_classes(toy: Path) -> None:
+    words = ("--data", "OtherData", "--data.root", "here", "--data.max_agents", "3", "--model.lr", "0.25")
+    data_of("fit", "--model", "ToyModel", *words, "--trainer.max_epochs", "1", "--out", "run")
+    checkpoint = ("--ckpt_path", "run/checkpoints/last.ckpt")
+    same = data_of("validate", *checkpoint, "--data", "tests.toys.OtherData")
+    assert (same.root, same.max_agents, ToyModel.seen["model"].lr) == ("here", 3, 0.25)
+    other = data_of("validate", *checkpoint, "--data", "ToyData")
+    assert (other.root, other.max_agents, ToyModel.seen["model"].lr) == ("nowhere", 3, 0.25)  # slots are linked
+    for named in ('{"class_path": "ToyData"}', '{"class_path": "ToyData", "init_args": {}}'):
+        assert data_of("validate", *checkpoint, "--data", named).root == "nowhere"
+
+
+def test_of_two_classes_the_last_flag_wins_and_the_first_leaves_nothing(toy: Path) -> None:
+    words = ("--data", "OtherData", "--data.class_path=OtherData", "--data", "ToyData", "--trainer.max_epochs", "1")
+    data = data_of("fit", "--model", "ToyModel", *words, "--out", "one")
+    assert (type(data), data.root) == (ToyData, "nowhere")
+
+
+# -- layers ----------------------------------------------------------------------------------------
+
+
+def settled(layers: Sequence[dict[str, Any]], *flags: str) -> list[dict[str, Any]]:
+    named = [Layer(f"{number}.yaml", options) for number, options in enumerate(layers)]
+    return [layer.options for layer in class_options.settle(named, flags).layers]
+
+
+A, B = {"class_path": "A", "init_args": {"x": 1}}, {"class_path": "B", "init_args": {"y": 2}}
+
+
+def test_options_of_no_class_belong_to_the_class_below_them() -> None:
+    loose = {"data": {"init_args": {"z": 3}}}
+    assert settled([{"data": A}, loose, {"data": B}]) == [{}, {}, {"data": B}]
+    assert settled([loose, {"data": A}, {"data": B}]) == [loose, {}, {"data": B}]
+    assert settled([{"data": A}, loose]) == [{"data": A}, loose]
+    assert settled([{"data": A}, loose], "--data", "B") == [{}, {}]
+
+
+def test_layers_given_are_not_changed() -> None:
+    given = Layer("a.yaml", {"data": {"class_path": "A", "init_args": {"x": [1]}}})
+    class_options.settle([given, Layer("b.yaml", {"data": B})], ["--data.x", "[2]"])
+    assert given.options == {"data": {"class_path": "A", "init_args": {"x": [1]}}}
+
+
+def test_only_what_is_replaced_whole_is_taken_out() -> None:
+    lower = {"trainer": {"logger": A, "max_steps": 5, "callbacks": [A]}, "sampler": {"guidance": {"kind": "self"}}}
+    assert settled([lower, {"trainer": {"logger": B}}])[0] == {
+        "trainer": {"max_steps": 5, "callbacks": [A]},
+        "sampler": {"guidance": {"kind": "self"}},
+    }
+    assert settled([lower, {"trainer": {"max_steps": 6}, "sampler": {"guidance": {"weight": 1}}}])[0] == lower
+    assert settled([lower], "--trainer.callbacks+", "B", "--trainer.logger", "some.A", "--trainer.max_steps", "7") == [
+        lower
+    ]
+    assert settled([lower], "--trainer.logger=B")[0]["trainer"] == {"max_steps": 5, "callbacks": [A]}
+    nested = {"data": {"class_path": "A", "init_args": {"data": [A]}}}
+    bare = {"data": {"class_path": "A", "init_args": {}}}
+    assert settled([nested], "--data.data", "[]") == settled([nested], "--data.init_args.data=[]") == [bare]
+    assert settled([nested], "--data.data.x", "1") == [nested]

@@ -1,0 +1,279 @@
+"""`magnet data`: what it says, and its exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnet import cli
+from magnet.cli import data, data_options
+from magnet.cli.data_shown import NOTES_SHOWN, show_notes
+from magnet.datamodules import catalogue
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with a fake download, dl, and its store."""
+    folder = tmp_path_factory.mktemp("data")
+    assert cli.main(["data", "fake", "dd100", str(folder / "dl"), "--frames", "90"]) == 0
+    words = ["--root", str(folder / "dl"), "--out", str(folder / "store"), "--body", str(folder / "dl/body.npz")]
+    assert cli.main(["data", "prepare", "dd100", *words, "--workers", "1"]) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(made, tmp_path, monkeypatch) -> Path:
+    """A copy to spoil, and the folder to work in."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_list_tells_who_may_use_each_data_set_where_to_ask_and_what_must_lie_where(capsys):
+    assert cli.main(["data", "list"]) == 0
+    said = capsys.readouterr().out
+    for name, entry in catalogue.NAMES.items():
+        reader = entry.load_reader()
+        assert cli.main(["data", "list", name]) == 0
+        alone = capsys.readouterr().out
+        assert alone in said and alone.startswith(f"{name}  {reader.title}\n")
+        for part in (reader.licence, reader.source, *(word for line in reader.layout for word in line)):
+            assert part in alone
+        assert f"magnet data prepare {name} --root DOWNLOAD" in alone and f"magnet data fake {name} FAKE" in alone
+    assert "synthetic has no files" in said
+    assert cli.main(["data", "list", "dd10"]) == 2
+    assert "no data set 'dd10'; did you mean dd100?" in capsys.readouterr().err
+
+
+def test_a_store_is_described(made, capsys):
+    assert cli.main(["data", "info", str(made / "store")]) == 0
+    said = capsys.readouterr().out
+    for part in ("DD100", "made-up-smplx", "30 fps", "train", "of 2", "frames of one person"):
+        assert part in said
+
+
+def test_a_download_is_recognised_checked_and_drawn(copy, capsys):
+    assert cli.main(["data", "check", "dl", "--body", "dl/body.npz", "--workers", "1", "--limit", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "DD100" in said and "all assertions hold" in said
+    assert (copy / "dd100_check.png").stat().st_size > 10_000
+
+
+def test_a_check_is_drawn_with_the_open_body_where_the_own_is_not_given(copy, capsys):
+    assert cli.main(["data", "check", "store", "--picture", "seen.png"]) == 0
+    assert "picture: seen.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("which", ["train-*", "clips-*", "betas-*"])
+def test_a_check_finds_one_changed_byte(copy, capsys, which):
+    file = next((copy / "store").glob(which))
+    content = bytearray(file.read_bytes())
+    content[-5] ^= 1
+    file.write_bytes(content)
+    assert cli.main(["data", "check", "store", "--picture", "none"]) == 1
+    said = capsys.readouterr()
+    assert f"{file.name} is damaged: its checksum" in said.err and "1 problems" in said.out
+
+
+def check_options() -> list[list[str]]:
+    """Every option of a check but those that go for stores, with some value."""
+    one = argparse.ArgumentParser()
+    data.add_check(one)
+    given = [action for action in one._actions if action.option_strings]
+    words = [[action.option_strings[-1], *(["1"] if action.nargs != 0 else [])] for action in given]
+    return [w for w in words if w[0] not in ("--help", "--body", "--picture", "--workers")] + [["--reader.people", "1"]]
+
+
+@pytest.mark.parametrize("words", check_options(), ids=lambda words: words[0])
+def test_a_check_of_a_store_refuses_options_that_would_change_nothing(made, capsys, words):
+    words = [word.replace("1", "+z") if words[0] == "--up" else word for word in words]
+    assert cli.main(["data", "check", str(made / "store"), "--picture", "none", *words]) == 2
+    assert f"has no use for {words[0]}; leave it out" in capsys.readouterr().err
+
+
+def test_a_check_finds_another_body(copy, capsys):
+    from magnet.datamodules.fakes.body import arrays
+
+    other = {**arrays(), "v_template": 1.1 * arrays()["v_template"]}
+    np.savez(copy / "other.npz", **other)
+    assert cli.main(["data", "check", "store", "--picture", "none", "--body", "other.npz"]) == 1
+    assert "has other joints at rest" in capsys.readouterr().err
+    assert cli.main(["data", "check", "store", "--picture", "none", "--body", "dl/body.npz"]) == 0
+
+
+def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
+    takes = [take.name for take in catalogue.find("dd100").load_reader()("dl").found()]
+    (copy / "mine.txt").write_text("".join(f"{name} train\n" for name in (*takes, *(f"gone{k}" for k in range(7)))))
+    words = ["--body", "dl/body.npz", "--workers", "1", "--splits", "mine.txt", "--limit", "1"]
+    assert cli.main(["data", "check", "dl", "--picture", "none", *words]) == 0
+    assert cli.main(["data", "prepare", "dd100", "--root", "dl", "--out", "other", *words]) == 0
+    assert cli.main(["data", "info", "other"]) == 0
+    assert cli.main(["data", "check", "other", "--picture", "none"]) == 0
+    said = capsys.readouterr().out
+    wanted = "7 names of the lists are not in the download: gone0, gone1, gone2, gone3, gone4 and 2 more"
+    assert said.count(wanted) == 4
+
+
+def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(copy, capsys):
+    files = sorted((copy / "dl").rglob("*_00.npy"))
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    words = ["prepare", "dd100", "--root", "dl", "--out", "store", "--body", "dl/body.npz", "--workers", "1"]
+    assert cli.main(["data", *words]) == 0
+    said = capsys.readouterr().out
+    assert "skipped 1 takes:" in said and files[0].name in said and "1 were skipped" in said
+    for file in files:
+        file.write_bytes(b"")
+    assert cli.main(["data", *words]) == 2
+    assert "DD100: none of 4 takes could be used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("lst", "did you mean data list?"),
+        ("prepare", "name is missing"),
+        ("prepare dd100", "--root is missing (folder of the download, or of your own recordings)"),
+        ("prepare interX --root dl --out o", "did you mean interx"),
+        ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
+        ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --reader.wrong 1", "its options are"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --workers 0", "workers: got 0"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --up=up", "up: got 'up'"),
+        ("info dl", "is not a prepared store"),
+        ("check nowhere", "is not a folder"),
+        ("check empty", "neither a prepared store nor a download"),
+        ("fake dd100 dl", "is not empty"),
+        ("prepare cmu --root dl --out o", "cmu trains without being prepared"),
+        ("fake dd100", "out is missing"),
+        ("fake dd100 new --takes 0", "takes: got 0"),
+        ("fake cmu new --frames 0", "frames: got 0"),
+        ("check dl --body dl/body.npz --limit 0", "limit: got 0"),
+        ("check dl --body dl/body.npz --workers 0", "workers: got 0"),
+        ("download dd100", "given out by its authors alone"),
+        ("download cmu", "out is missing"),
+    ],
+)
+def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message):
+    (copy / "empty").mkdir()
+    assert cli.main(["data", *words.split()]) == 2
+    said = capsys.readouterr().err
+    assert message in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["prepare", "check dl", "check store", "info"])
+def test_an_empty_split_is_said_loudly(copy, capsys, command):
+    takes = [take.name for take in catalogue.find("dd100").load_reader()(copy / "dl").takes()]
+    (copy / "mine.txt").write_text(f"{takes[0]} train\n{takes[1]} test\n")
+    work = ("--splits", "mine.txt", "--body", "dl/body.npz", "--workers", "1")
+    prepare = ("data", "prepare", "dd100", "--root", "dl", "--out", "store", *work)
+    words = {
+        "prepare": prepare,
+        "check dl": ("data", "check", "dl", "--picture", "none", *work),
+        "check store": ("data", "check", "store", "--picture", "none"),
+        "info": ("data", "info", "store"),
+    }[command]
+    if "store" in words and command != "prepare":
+        assert cli.main(list(prepare)) == 0
+        capsys.readouterr()
+    assert cli.main(list(words)) == 0
+    heard = capsys.readouterr().err
+    assert "WARNING: split val is EMPTY: training goes without validation" in heard and "--splits FILE" in heard
+    assert "split train" not in heard and "split test" not in heard
+
+
+@pytest.mark.parametrize("command", data.COMMANDS)
+def test_names_and_folders_may_stand_before_between_and_after_options(command, monkeypatch):
+    add, _, what = data.COMMANDS[command]
+    seen = []
+    monkeypatch.setitem(data.COMMANDS, command, (add, lambda given: seen.append(given) or 0, what))
+    one = argparse.ArgumentParser()
+    add(one)
+    places = [f"place{k}" for k, action in enumerate(a for a in one._actions if not a.option_strings)]
+    option = next((a.option_strings[0] for a in one._actions if a.option_strings and a.nargs is None), None)
+    for k in range(len(places) + 1):
+        words = [*places[:k], *([option, "1"] if option else []), *places[k:]]
+        assert cli.main(["data", command, *words]) == 0
+    assert all({**vars(given), "parser": None} == {**vars(seen[0]), "parser": None} for given in seen)
+    assert set(places) <= set(map(str, vars(seen[0]).values()))
+
+
+def test_help_shows_a_data_sets_own_options(capsys):
+    assert cli.main(["data", "prepare", "interx", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--workers" in said and "--reader.split" in said and "paper" in said
+    assert cli.main(["data"]) == 0 and "magnet data fake" in capsys.readouterr().out
+
+
+def test_readers_options_are_read_by_their_types():
+    kind = catalogue.find("embody3d").load_reader()
+    got = data_options.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
+    assert got == {"people": [2, 3], "good": 0}
+
+
+def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
+    from magnet.datamodules.reading import download
+
+    asked = []
+
+    def fetch(subjects, out, progress=None, **where):
+        asked.append((list(subjects), Path(out), where))
+        progress("60_01.amc", 10, 20)
+        return download.Downloaded(Path(out), ("60.asf",), ("61.asf",), ())
+
+    monkeypatch.setattr(download, "download_cmu", fetch)
+    assert cli.main(["data", "download", "cmu", str(tmp_path), "--subjects", "2,60", "--base_url", "http://x"]) == 0
+    assert asked == [(["2", "60"], tmp_path, {"base_url": "http://x"})]
+    assert "1 files fetched, 1 were there" in capsys.readouterr().out
+
+
+def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(copy, capsys):
+    file = min((copy / "dl").rglob("*_00.npy"))
+    file.write_bytes(file.read_bytes()[:100])
+    assert cli.main(["data", "check", "dl", "--picture", "none", "--body", "dl/body.npz"]) == 1
+    said = capsys.readouterr()
+    assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out
+
+
+def test_the_store_may_be_named_last_in_place_of_out(made, tmp_path, capsys):
+    words = [
+        "data",
+        "prepare",
+        "dd100",
+        "--root",
+        str(made / "dl"),
+        "--body",
+        str(made / "dl/body.npz"),
+        "--limit",
+        "1",
+    ]
+    assert cli.main([*words, "--workers", "1", str(tmp_path / "store")]) == 0
+    assert (tmp_path / "store/manifest.json").is_file()
+    assert cli.main([*words, str(tmp_path / "store"), "--out", str(tmp_path / "other")]) == 2
+    assert "give one" in capsys.readouterr().err
+
+
+def test_of_notes_that_differ_in_numbers_alone_the_first_are_shown(capsys):
+    show_notes([f"off by {k / 10} cm (1 takes)" for k in range(NOTES_SHOWN + 3)] + ["another"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == NOTES_SHOWN + 2 and "note: another" in lines
+    assert lines[-1] == "  ... and 3 more like: off by # cm (# takes)"
+
+
+def test_a_folder_of_ones_own_is_recognised_by_its_files_and_a_wrong_table_is_named(tmp_path, capsys):
+    catalogue.find("scenes").load_fake()(tmp_path / "dl", 4, 40)
+    words = ["data", "check", str(tmp_path / "dl"), "--body", str(tmp_path / "dl/body.npz"), "--picture", "none"]
+    assert cli.main([*words, "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "Scenes of SMPL's family" in said and "amass1 (A, B)" in said
+    (tmp_path / "dl/people.csv").write_text("scene,file\ntango,gone.npz\n")
+    assert cli.main(words) == 2
+    assert "people.csv, line 2: gone.npz: no such file" in capsys.readouterr().err
+    (tmp_path / "dl/people.csv").unlink()
+    (tmp_path / "dl/more.bvh").touch()
+    assert cli.main(words) == 2
+    assert "could be bvh or scenes: say which with --name" in capsys.readouterr().err

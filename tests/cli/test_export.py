@@ -1,0 +1,162 @@
+"""`magnet export` as a person would use it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from magnet import cli
+from magnet.body import JOINT_NAMES, PARENTS, load_body, on_floor
+from magnet.export import save_bvh
+from magnet.export.page.rig import world_rotations
+from magnet.export.rig import UP
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+from tests.export import strangers
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    return random_scene(2, 12, 2, torch.Generator().manual_seed(5)).save(tmp_path / "duet.npz")
+
+
+def test_one_scene_of_several_becomes_one_file(stored: Path, capsys: pytest.CaptureFixture[str]):
+    out = stored.with_name("one.glb")
+    assert cli.main(["export", str(stored), str(out), "--scene", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 people, 12 frames at 30 fps, 0.4 s" in printed and f"written: {out}" in printed
+    assert out.read_bytes()[:4] == b"glTF"
+
+
+def test_one_person_of_several_is_written_alone(stored: Path, capsys: pytest.CaptureFixture[str]):
+    out = stored.with_name("second.npz")
+    assert cli.main(["export", str(stored), str(out), "--person", "1"]) == 0
+    assert "2 scenes of 1 person" in capsys.readouterr().out
+    assert Scene.load(out).present.tolist() == [[False, True]] * 2
+
+
+def test_skeletons_of_two_people_become_one_scene(stored: Path, capsys: pytest.CaptureFixture[str]):
+    scene, body = Scene.load(stored).select([0]), load_body()
+    paths = [str(path) for path in save_bvh(scene, stored.with_name("a.bvh"), body, unit="cm")]
+    out = stored.with_name("back.npz")
+    assert cli.main(["export", *paths, str(out), "--fps", "60"]) == 0
+    assert "a_0.bvh: the body's own skeleton; unit cm, y up" in capsys.readouterr().out
+    back = Scene.load(out)
+    assert (back.fps, back.frames, back.agents) == (60.0, 23, 2)
+    assert (body.joints(back)[:, ::2] - body.joints(scene)).abs().max() < 1e-4
+
+
+def test_smplx_keys_and_back(stored: Path):
+    out, again = stored.with_name("smplx.npz"), stored.with_name("again.npz")
+    assert cli.main(["export", str(stored), str(out), "--scene", "0", "--smplx"]) == 0
+    assert cli.main(["export", str(out), str(again)]) == 0
+    body = load_body()
+    assert (body.joints(Scene.load(again)) - body.joints(Scene.load(stored).select([0]))).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("suffix", ["npz", "bvh", "glb", "csv", "mp4", "gif", "png", "html"])
+def test_every_suffix_is_written_by_the_command(suffix: str, stored: Path, capsys: pytest.CaptureFixture[str]):
+    if suffix == "mp4":
+        pytest.importorskip("av", reason="PyAV is not installed")
+    out = stored.with_name(f"a.{suffix}")
+    assert cli.main(["export", str(stored), str(out), "--scene", "0", "--style", "skeleton", "--fps", "10"]) == 0
+    written = re.findall(r"written: (\S+) ", capsys.readouterr().out)
+    assert written and all(Path(path).suffix == out.suffix and Path(path).stat().st_size > 1000 for path in written)
+    assert len(written) == (2 if suffix == "bvh" else 1)
+
+
+@pytest.mark.parametrize(("naming", "metres", "up"), [("biped", 0.0254, "z"), ("mixamo", 0.01, "y")])
+def test_a_skeleton_of_other_names_pose_unit_and_axis_comes_in(naming, metres, up, stored: Path, capsys):
+    scene, body = Scene.load(stored).select([0]), load_body()
+    spread = np.zeros((22, 3))
+    spread[[1, 2, 16, 17], 2] = np.radians([8.0, -8.0, -45.0, 45.0])  # an A pose is the file's zero
+    local = Rotation.from_rotvec(spread).as_matrix()
+    betas = scene.betas[0, 0]
+    eye = torch.eye(4)
+    rest_at = body.forward_kinematics(torch.from_numpy(local[1:]).float(), eye, betas)
+    paths = []
+    for p in range(2):
+        turned = world_rotations(scene)[0, :, p].double().numpy()
+        rest_world = np.stack(list(walked(local)))
+        arrays = [turned, rest_world, rest_at.double().numpy(), scene.T_world_root[0, :, p, :3, 3].double().numpy()]
+        path = stored.with_name(f"{naming}_{p}.bvh")
+        frame = UP[up].T
+        strangers.rerigged(
+            path, strangers.NAMINGS[naming], JOINT_NAMES, PARENTS, *arrays, fps=30.0, metres=metres, up=frame
+        )
+        paths.append(str(path))
+    out = stored.with_name("mine.npz")
+    assert cli.main(["export", *paths, str(out), "--keep-floor"]) == 0
+    printed = capsys.readouterr().out
+    assert f"22 joints mapped; unit {'inch' if up == 'z' else 'cm'}, {up} up" in printed
+    away = (body.joints(Scene.load(out))[0, :, 0] - body.joints(scene)[0, :, 0]).norm(dim=-1)
+    assert away.mean() < 0.01
+
+
+def walked(local: np.ndarray) -> Iterator[np.ndarray]:
+    """World rotations of a tree of local ones. (22, 3, 3)"""
+    world: list[np.ndarray] = []
+    for j, parent in enumerate(PARENTS):
+        world.append(local[j] if parent < 0 else world[parent] @ local[j])
+        yield world[-1]
+
+
+WRONG = {
+    ("duet.npz", "out.fbx"): "nothing writes .fbx; .*let Blender convert it",
+    ("duet.npz", "out.xyz"): r"nothing writes .xyz; use .npz, .bvh",
+    ("none.npz", "out.glb"): "none.npz: no such file",
+    ("duet.npz", "out.glb", "--person", "2"): "--person 2: the scene has 0, 1",
+    ("duet.npz", "out.glb", "--scene", "7"): "--scene 7: the file has scenes 0 to 1",
+    ("broken.bvh", "out.npz"): "not a BVH file",
+    ("duet.npz", "out.glb", "--body", "none.npz"): "none.npz: no such body file",
+    ("duet.npz", "broken.bvh", "out.glb"): "expected .npz or .bvh files, all of one kind",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_a_person_can_put_right_is_said_in_one_line(words, stored: Path, monkeypatch, capsys):
+    monkeypatch.chdir(stored.parent)
+    Path("broken.bvh").write_text("no such thing")
+    assert cli.main(["export", *words]) == 2
+    error = capsys.readouterr().err
+    assert re.search(WRONG[words], error) and error.count("\n") == 1
+
+
+def test_help_names_every_suffix_without_importing_torch():
+    code = (
+        "import sys; from magnet import cli; cli.main(['export', '--help']); "
+        "sys.exit(3 if 'torch' in sys.modules else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    from magnet.export.formats import WRITTEN
+
+    assert all(suffix in done.stdout for suffix in WRITTEN)
+
+
+def test_people_are_put_on_the_floor_where_one_asks_for_it(tmp_path: Path, capsys):
+    scene = random_scene(2, 20, 2, torch.Generator().manual_seed(0))
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[1, :, :, 1, 3] += 3.0
+    high = scene.replace(T_world_root=T_world_root).save(tmp_path / "high.npz")
+    out = tmp_path / "low.npz"
+    assert cli.main(["export", str(high), str(out), "--on-floor"]) == 0
+    assert "everybody stands" in capsys.readouterr().out
+    assert torch.equal(Scene.load(out).T_world_root, on_floor(Scene.load(high)).T_world_root)
+    assert Scene.load(out).T_world_root[..., 1, 3].max() < 1.5
+    assert cli.main(["export", str(high), str(out), "--on-floor", "--keep-floor"]) == 2
+    assert "choose one" in capsys.readouterr().err
+
+
+def test_a_file_without_scenes_is_named(tmp_path: Path, capsys):
+    empty = random_scene(1, 8, 1, torch.Generator().manual_seed(0)).select([]).save(tmp_path / "none.npz")
+    assert cli.main(["export", str(empty), str(tmp_path / "o.glb")]) == 2
+    assert "none.npz: holds no scenes" in capsys.readouterr().err

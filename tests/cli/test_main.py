@@ -1,0 +1,221 @@
+"""The command line: what is answered without a model, and what errors say."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet import __version__, cli
+from magnet.cli import train
+from magnet.cli.errors import CommandError
+from magnet.cli.main import COMMANDS, usage
+from tests import toys
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
+
+
+def loaded_by(*arguments: str) -> tuple[str, set[str]]:
+    """What a command prints, and which modules it imports, in a process of its own."""
+    code = f"import sys; from magnet.cli import main; main({list(arguments)!r}); print('\\n#', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    text, _, modules = done.stdout.rpartition("\n# ")
+    return text, set(modules.split())
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty working folder, and toys in place of the real models and data."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MAGNET_DEBUG", raising=False)
+    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
+    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    return tmp_path
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Standard error of a command that must end with exit code 2 and no traceback."""
+    assert cli.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ()])
+def test_help_and_version_import_nothing_heavy(arguments: tuple[str, ...]) -> None:
+    text, modules = loaded_by(*arguments)
+    assert __version__ in text
+    assert not modules & set(HEAVY)
+    assert len(modules) < 200
+
+
+def test_help_names_every_command() -> None:
+    assert all(f"  {name} " in usage() for name in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("demo", "--sample", "3"), ("export", "a.npz", "b.glb", "--sce", "0"), ("view", "a.npz", "--ht", "x.html")],
+)
+def test_options_are_written_out(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"unrecognized arguments: {words[-2]}" in complaint(capsys, *words)
+
+
+def test_importing_magnet_imports_nothing_heavy() -> None:
+    code = "import sys, magnet; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert not set(done.stdout.split()) & set(HEAVY)
+
+
+def test_python_m_magnet_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "magnet", "--version"], capture_output=True, text=True, timeout=60)
+    assert done.stdout == f"magnet {__version__}\n"
+    done = subprocess.run([sys.executable, "-m", "magnet", "tset"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "did you mean test?" in done.stderr
+
+
+def test_tasks_are_listed_with_what_they_sample(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks"]) == 0
+    text = capsys.readouterr().out
+    assert "joint_future" in text
+    assert "P(A" in text
+
+
+def test_fit_help_explains_every_field(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fit", "--help"]) == 0
+    text = capsys.readouterr().out
+    for field, meaning in {"--model.lr": "step size", "--data.takes": "how many", "--out": "folder of the run"}.items():
+        assert field in text
+        assert meaning in text
+
+
+def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["test", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "--sampler.steps" in text
+    assert "--samples" in text
+    assert "--task joint_future: " in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fti"], "did you mean fit?"),
+        (["xyzzy"], "there are fit, validate"),
+        (["test", "--task", "joint_futur"], "did you mean joint_future?"),
+        (["test", "--task=nothing_like_it"], "There are "),
+        (["fit"], "say which model: --model ToyModel"),
+        (["fit", "--model", "Nosuch"], "no model Nosuch; there are ToyModel"),
+        (["fit", "--model", "ToyModel", "--lr", "1"], "no option --lr; did you mean --model.lr?"),
+        (["fit", "--model", "ToyModel", "--model.lrr", "1"], "no option --model.lrr; did you mean --model.lr?"),
+        (["fit", "--model", "ToyModel", "--data.max_agents", "two"], "got two, expected a whole number"),
+        (["test", "generation"], "generation is no option; did you mean --task generation?"),
+        (["test", "2"], "options are written --NAME VALUE"),
+        (["test", "--out", __file__], "got a file, expected a folder"),
+        (["test", "--frames", "9"], "did you mean --data.window_frames?"),
+        (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
+        (["test", "--sampler.rolling", "four"], "--sampler.rolling: got four, expected a whole number or null"),
+        (["test", "--task", "inbetweening", "--task.keys", "20"], "--task.keys: got 20, expected a list such as [0,1]"),
+        (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
+        (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),
+        (["fit", "--config", "nosuch.yaml"], "no configuration file nosuch.yaml"),
+        (["fit", "--model", "ToyModel", "--ckpt_path", "last"], "no run with a checkpoints/last.ckpt"),
+        (["test", "--ckpt_path"], "--ckpt_path: got nothing, expected a value"),
+        (["test", "--ckpt_path", "nosuch.ckpt"], "no checkpoint nosuch.ckpt"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_would_be_right(
+    toy: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    said = complaint(capsys, *arguments)
+    assert message in said and len(said.splitlines()) == 1
+    assert not (toy / "runs").exists()
+
+
+def test_options_that_a_class_refuses_are_told_in_its_own_words(
+    toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: object, *_: object) -> None:
+        raise ValueError("takes: got 0, expected at least 1")
+
+    monkeypatch.setattr(toys.LightningDataModule, "__init__", refuse)
+    error = complaint(capsys, "fit", "--model", "ToyModel", "--trainer.accelerator", "cpu")
+    assert "magnet: error: takes: got 0, expected at least 1 (" in error and "subtypes" not in error
+
+
+def test_a_denoiser_without_a_tokenizer_is_refused_before_anything_is_written(
+    toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = complaint(capsys, "fit", "--model", "magnet.denoiser.module.Denoiser", "--trainer.accelerator", "cpu")
+    assert "has no tokenizer" in error
+    assert not (toy / "runs").exists()
+
+
+def test_a_config_that_is_no_mapping_is_refused(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (toy / "list.yaml").write_text("- 1\n")
+    (toy / "broken.yaml").write_text("model: [\n")
+    assert "list.yaml holds list" in complaint(capsys, "fit", "--config", "list.yaml")
+    assert "broken.yaml is no YAML" in complaint(capsys, "fit", "--config", "broken.yaml")
+
+
+class Bomb:
+    """Writes a file when it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (Path.write_text, (Path("exploded"), "boom"))
+
+
+def test_a_bad_checkpoint_is_refused_in_a_line(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.save({"weights": torch.ones(1)}, toy / "none.ckpt")
+    torch.save({"state_dict": {}, "bomb": Bomb()}, toy / "bomb.ckpt")
+    (toy / "text.ckpt").write_text("hello")
+    (toy / "short.ckpt").write_bytes((toy / "none.ckpt").read_bytes()[:200])
+    assert "no state_dict" in complaint(capsys, "test", "--ckpt_path", "none.ckpt")
+    assert "could run code" in complaint(capsys, "test", "--ckpt_path", "bomb.ckpt")
+    assert not (toy / "exploded").exists()
+    for name in ("text.ckpt", "short.ckpt"):
+        error = complaint(capsys, "test", "--ckpt_path", name)
+        assert f"{name}: not a checkpoint" in error
+        assert len(error.splitlines()) == 1
+
+
+def test_a_class_from_nowhere_is_not_imported_for_a_checkpoint(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (toy / "stranger.py").write_text("from pathlib import Path\nPath('exploded').touch()\n")
+    config = {"model": {"class_path": "stranger.Model", "init_args": {}}, "data": None}
+    torch.save({"state_dict": {}, "magnet_config": config}, toy / "a.ckpt")
+    assert "stranger.Model, which is not part of magnet" in complaint(capsys, "test", "--ckpt_path", "a.ckpt")
+    assert not (toy / "exploded").exists()
+
+
+def test_a_missing_wandb_names_the_install(
+    toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.cli.run_folder.find_spec", lambda name: None)
+    error = complaint(capsys, "fit", "--model", "ToyModel", "--wandb", "offline")
+    assert 'pip install "magnet-motion[wandb]"' in error
+
+
+def test_debug_shows_the_traceback(toy: Path) -> None:
+    with pytest.raises(CommandError):
+        cli.main(["test", "--debug", "--ckpt_path", "nosuch.ckpt"])
+
+
+def test_our_own_faults_are_not_hidden(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: object) -> None:
+        raise AttributeError("a bug")
+
+    monkeypatch.setattr(toys.ToyModel, "on_fit_start", broken)
+    with pytest.raises(AttributeError, match="a bug"):
+        cli.main(["fit", "--model", "ToyModel", "--trainer.accelerator", "cpu"])
+
+
+@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]), ids=lambda page: page.name)
+def test_every_training_that_a_page_names_says_what_is_trained(page: Path) -> None:
+    for line in re.findall(r"^ {4}(magnet fit .*)", page.read_text(), re.MULTILINE):
+        assert "--config" in line or "--model " in line, line

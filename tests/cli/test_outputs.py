@@ -1,0 +1,37 @@
+"""What `magnet test` prints: the main numbers, or all; and what it writes: always all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from magnet.cli import outputs
+from magnet.evaluation.evaluator import UNALIGNED, Evaluation
+from magnet.evaluation.results import Results
+from tests.evaluation.test_evaluator import data, run
+
+
+@pytest.fixture(scope="module")
+def tested() -> Evaluation:
+    return run(data())
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_files_hold_everything_whatever_is_printed(
+    tested: Evaluation, tmp_path: Path, capsys: pytest.CaptureFixture[str], full: bool
+) -> None:
+    outputs.show_results(tested, tmp_path, {"task": "JointFuture"}, full)
+    printed = capsys.readouterr().out
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    assert rows.keys() == tested.results.rows.keys() == Results.load_csv(tmp_path / "results.csv").rows.keys()
+    assert {"fd_pair@second1", "mpjpe_best@0.5s", "turn_rate@agent1", "mpjpe_low"} <= rows["magnet"].keys()
+    for method in rows:
+        shown = method not in UNALIGNED or full
+        assert any(line.strip().startswith(f"{method}  ") for line in printed.splitlines()) == shown, method
+    assert ("turning:" in printed or "turning (" in printed) == full
+    assert ("[" in printed.split("sampling:")[0]) == full, "intervals"
+    assert ("--full" in printed) != full
+    widest = max(map(len, printed.split("FD (m²)")[0].splitlines()))
+    assert widest <= outputs.WIDE

@@ -1,0 +1,173 @@
+"""`magnet tasks` and `magnet tasks show`."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+from PIL import Image
+
+from magnet import __version__, cli
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks import registry
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Somebody else's task.
+
+    Args:
+        keep: how many more tokens are given.
+    """
+
+    formula: ClassVar[str] = "P(everything | [a little])"
+    keep: int = 1
+    who: tuple[int, ...] = field(default_factory=lambda: (0, 1))
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        known = grid.past()
+        known[: grid.context + self.keep] = True
+        return MaskSchedule.together(known, ~known, grid)
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
+    registry.discover()
+    entry = registry.Registered("foreign", Foreign, "strange-tasks 3.1")
+    monkeypatch.setitem(registry._tasks, "foreign", entry)
+    monkeypatch.setitem(registry._failures, "broken", ImportError("no module named [nowhere]"))
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert cli.main(["tasks", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert cli.main(["tasks", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_the_list_names_formula_origin_version_and_fields(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys)
+    for entry in registry.entries():
+        assert entry.name in text
+        assert entry.task.formula in text
+    assert f"joint_future  magnet {__version__}" in text
+    assert "foreign  strange-tasks 3.1" in text
+    assert "--task.keep 1  --task.who [0,1]" in text
+    assert "--task.offset 1.0" in text
+
+
+def test_failures_stand_at_the_end_with_their_errors(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys)
+    assert text.index("broken  failed to load") > text.index("partner_prediction")
+    assert "ImportError: no module named [nowhere]" in text
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_show_prints_the_formula_and_how_to_get_a_picture(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    text = printed(capsys, "show", name, "--moments", "5")
+    assert registry.get(name).formula in text
+    assert f"--out {name}.png" in text
+    assert " 9 " in text
+
+
+def test_show_writes_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "new" / "plan.png"
+    text = printed(capsys, "show", "agentic_async", "--out", str(out), "--people", "3", "--task.offset", "0.5")
+    assert text.strip() == str(out)
+    with Image.open(out) as image:
+        assert min(image.size) > 400
+        assert len(image.convert("RGB").getcolors(100_000)) > 20
+
+
+def test_fields_change_the_plan(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    first = printed(capsys, "show", "agentic_async", "--task.order=[1]")
+    assert first != printed(capsys, "show", "agentic_async")
+    assert "o o o o o o 9" in printed(capsys, "show", "foreign", "--task.keep", "2", "--window", "16")
+
+
+def test_show_help_explains_sizes_and_fields(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+    text = printed(capsys, "show", "foreign", "--help")
+    assert "how many more tokens are given" in text
+    assert "--people" in text
+    assert "--out" in printed(capsys, "show", "--help")
+
+
+@pytest.mark.parametrize("command", ["test", "predict"])
+def test_help_of_a_command_explains_every_field_of_every_task(capsys: pytest.CaptureFixture[str], command: str) -> None:
+    assert cli.main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    sections = dict(re.findall(r"^--task (\w+): (.*?)(?=^--task |\Z)", text, re.MULTILINE | re.DOTALL))
+    assert list(sections) == registry.names()
+    for entry in registry.entries():
+        section = " ".join(sections[entry.name].split())
+        names = [each.name for each in dataclasses.fields(entry.task)]
+        assert re.findall(r"--task\.(\w+) ", section) == names
+        explained = " ".join((inspect.getdoc(entry.task) or "").split())
+        for name in names:
+            found = re.search(rf"\b{name}: (.*?)(?: \w+: |$)", explained)
+            assert found
+            assert found[1].rstrip(".") in section
+        assert ("(no fields)" in section) == (not names)
+        assert "as above" not in section
+
+
+def test_help_names_tasks_and_not_what_stands_for_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["test", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"--task NAME: One of {', '.join(registry.names())}; default: joint_future." in text
+    for internal in ("NamedTask", "cli.tasks", "stands for", "class_path"):
+        assert internal not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["shwo"], "magnet tasks show NAME"),
+        (["list", "all"], "magnet tasks show NAME"),
+        (["show"], "there are agentic_async"),
+        (["show", "joint_futur"], "did you mean joint_future?"),
+        (["show", "agentic_async", "--task.ofset", "1"], "no option --task.ofset; did you mean --task.offset?"),
+        (["show", "agentic_async", "--poeple", "3"], "no option --poeple; did you mean --people?"),
+        (["show", "agentic_async", "--task.offset", "half"], "--task.offset: got half, expected a number"),
+        (["show", "agentic_async", "--task.offset", "2"], "expected 0 to 1"),
+        (["show", "partner_inpainting", "--people", "1"], "name some of the 1 agents"),
+        (["show", "joint_future", "--context", "0"], "give it context frames"),
+        (["show", "joint_future", "--tokens", "0"], "tokens: got 0, expected at least 1"),
+        (["show", "joint_future", "--moments", "1"], "4 or more"),
+        (["show", "joint_future", "--out", "plan.svg"], "written as .png"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_would_be_right(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert message in complaint(capsys, *arguments)
+
+
+def test_show_imports_no_lightning() -> None:
+    code = (
+        "import sys; from magnet.cli import main; main(['tasks', 'show', 'joint_future']); "
+        "print('\\n#', *(m for m in ('lightning', 'magnet.denoiser.module', 'matplotlib') if m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "#"
+
+
+def test_a_wrong_flag_is_named_whatever_the_checkpoint_remembers(capsys):
+    """The options of the shipped model are longer than any path may be."""
+    from magnet import cli
+
+    assert cli.main(["test", "--taks", "joint_future"]) == 2
+    said = capsys.readouterr().err
+    assert "no option --taks" in said and "--task" in said

@@ -1,0 +1,208 @@
+"""Training and testing by command: what wins over what, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from magnet import cli
+from magnet.cli import train
+from tests.toys import OtherData, ToyData, ToyModel
+
+CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty working folder, and toys in place of the real models and data."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
+    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    return tmp_path
+
+
+@pytest.fixture
+def trained(toy: Path) -> Path:
+    """A run of two epochs with options that are nobody's default."""
+    options = ("--model.lr", "0.25", "--data", "OtherData", "--data.root", "here", "--data.takes", "7")
+    linked = ("--data.max_agents", "3", "--data.window_frames", "32", "--trainer.max_epochs", "2")
+    assert cli.main(["fit", "--model", "ToyModel", *options, *linked, "--out", "trained", *CPU]) == 0
+    return toy / "trained"
+
+
+def go(*arguments: str) -> tuple[ToyModel, Any]:
+    """Run a command that must succeed; the model and the data it built."""
+    ToyModel.seen = {}
+    assert cli.main([*arguments, *CPU]) == 0
+    return ToyModel.seen["model"], ToyModel.seen["data"]
+
+
+def test_linked_options_follow_the_data_in_training(trained: Path) -> None:
+    model = ToyModel.seen["model"]
+    assert (model.max_agents, model.window) == (3, 8)
+
+
+@pytest.mark.parametrize("command", ["test", "validate", "predict"])
+def test_what_was_linked_in_training_is_the_same_in_every_command(trained: Path, command: str) -> None:
+    model, data = go(command, "--ckpt_path", "trained/checkpoints/last.ckpt")
+    assert (model.max_agents, model.window, model.lr) == (3, 8, 0.25)
+    assert type(data) is OtherData
+    assert (data.max_agents, data.window_frames, data.root, data.takes) == (3, 32, "here", 7)
+
+
+def test_weights_of_the_checkpoint_are_the_ones_tested(trained: Path) -> None:
+    model, _ = go("test", "--ckpt_path", "trained/checkpoints/last.ckpt")
+    stored = torch.load(trained / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    assert torch.equal(model.weight, stored["weight"])
+
+
+def test_a_flag_beats_a_file_beats_the_checkpoint_beats_the_default(trained: Path, toy: Path) -> None:
+    (toy / "my.yaml").write_text("model: {class_path: ToyModel, init_args: {lr: 0.5}}\n")
+    checkpoint = ("--ckpt_path", "trained/checkpoints/last.ckpt")
+    assert go("test", *checkpoint)[0].lr == 0.25
+    assert go("test", *checkpoint, "--config", "my.yaml")[0].lr == 0.5
+    assert go("test", *checkpoint, "--config", "my.yaml", "--model.lr", "0.75")[0].lr == 0.75
+    assert go("test", "--model.lr", "0.75", "--config=my.yaml", *checkpoint)[0].lr == 0.75
+
+
+def test_a_file_may_name_the_checkpoint(trained: Path, toy: Path) -> None:
+    (toy / "my.yaml").write_text("ckpt_path: trained/checkpoints/last.ckpt\nmodel: {init_args: {lr: 0.5}}\n")
+    model, _ = go("test", "--config", "my.yaml")
+    assert (model.lr, model.max_agents) == (0.5, 3)
+
+
+def test_other_data_takes_over_nothing_but_what_is_linked(trained: Path) -> None:
+    model, data = go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--data", "ToyData")
+    assert type(data) is ToyData
+    assert (data.max_agents, data.window_frames, data.root) == (3, 32, "nowhere")
+    assert (model.max_agents, model.window) == (3, 8)
+
+
+def test_explicit_data_options_beat_what_is_linked(trained: Path) -> None:
+    model, data = go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--data.max_agents", "2")
+    assert (data.max_agents, model.max_agents) == (2, 3)
+
+
+def test_options_that_no_longer_exist_are_left_out(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = trained / "checkpoints" / "older.ckpt"
+    checkpoint = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
+    checkpoint["magnet_config"]["data"]["init_args"]["gone"] = 1
+    torch.save(checkpoint, path)
+    _, data = go("test", "--ckpt_path", str(path))
+    assert data.takes == 7
+    assert "data options gone no longer exist" in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_shape_is_refused_in_a_line(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = cli.main(["test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--model.window", "4", *CPU])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert "weight is [3, 8] there and [3, 4] in this model" in error
+    assert "Traceback" not in error
+
+
+def test_training_goes_on_where_it_stopped(trained: Path, toy: Path) -> None:
+    model, data = go("fit", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs", "3")
+    assert (model.trainer.global_step, model.max_agents, model.lr, data.takes) == (6, 3, 0.25, 7)
+    once, _ = go(
+        "fit", "--config", "trained/config.yaml", "--out", "once", "--trainer.max_epochs", "3", "--ckpt_path=null"
+    )
+    assert torch.equal(once.weight, model.weight)
+
+
+def test_a_finished_run_is_not_overwritten(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (trained / "checkpoints" / "last.ckpt").read_bytes()
+    assert cli.main(["fit", "--model", "ToyModel", "--out", "trained", *CPU]) == 2
+    assert "holds a training run already" in capsys.readouterr().err
+    assert (trained / "checkpoints" / "last.ckpt").read_bytes() == before
+
+
+@pytest.mark.parametrize(("command", "start"), [("validate", "validation"), ("test", "test"), ("predict", "predict")])
+def test_a_run_that_never_began_leaves_nothing_behind(
+    trained: Path, toy: Path, monkeypatch: pytest.MonkeyPatch, command: str, start: str
+) -> None:
+    def refuse(self: object) -> None:
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(ToyModel, f"on_{start}_start", refuse)
+    before = set(toy.rglob("*"))
+    assert cli.main([command, "--ckpt_path", "trained/checkpoints/last.ckpt", *CPU]) == 2
+    assert set(toy.rglob("*")) == before
+
+
+def test_a_run_records_how_it_came_about(trained: Path) -> None:
+    facts = json.loads((trained / "run.json").read_text())
+    assert facts["seed"] == 1111
+    assert facts["packages"]["torch"] == torch.__version__
+    assert {"command", "git", "started", "python", "checkpoint"} <= set(facts)
+    assert (trained / "metrics.csv").exists()
+    checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
+    assert checkpoint["magnet_config"]["data"]["init_args"]["takes"] == 7
+
+
+def test_the_configuration_of_a_run_repeats_it(trained: Path) -> None:
+    go("fit", "--config", "trained/config.yaml", "--out", "again")
+    first, again = (yaml.safe_load((Path(run) / "config.yaml").read_text()) for run in ("trained", "again"))
+    assert first | {"out": None} == again | {"out": None}
+
+
+def test_print_config_is_a_configuration(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--model", "ToyModel", "--model.lr", "0.3", "--data.root", "there", "--seed_everything", "5"]
+    assert cli.main(["fit", *words, "--print_config"]) == 0
+    first = capsys.readouterr().out
+    (toy / "mine.yaml").write_text(first)
+    assert cli.main(["fit", "--config", "mine.yaml", "--print_config"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out) == yaml.safe_load(first)
+    assert yaml.safe_load(first)["model"]["init_args"]["lr"] == 0.3
+
+
+def test_latest_leads_to_the_newest_run(toy: Path) -> None:
+    (toy / "salsa.yaml").write_text("model: {class_path: ToyModel}\ntrainer: {max_epochs: 1}\n")
+    for _ in range(2):
+        go("fit", "--config", "salsa.yaml")
+    runs = sorted(path for path in (toy / "runs" / "salsa").iterdir() if not path.is_symlink())
+    assert len(runs) == 2
+    newest = max(runs, key=lambda run: (run / "checkpoints" / "last.ckpt").stat().st_mtime)
+    assert (toy / "runs" / "salsa" / "latest").resolve() == newest.resolve()
+    go("test", "--ckpt_path", "last", "--out", "elsewhere")
+    go("test", "--ckpt_path", "last")
+
+
+def test_sampling_options_reach_the_model(trained: Path) -> None:
+    words = ("--task", "generation", "--samples", "3", "--sampler.steps", "7", "--baselines", "false")
+    go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", *words)
+    evaluation = ToyModel.seen["evaluation"]
+    assert type(evaluation.task).__name__ == "Generation"
+    assert (evaluation.samples, evaluation.options.steps, evaluation.baselines) == (3, 7, False)
+
+
+@pytest.mark.parametrize("given", [(), ("--full",)])
+def test_one_flag_asks_for_the_full_table(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...]
+) -> None:
+    """Whatever stands around it: it takes no value."""
+    asked: list[bool] = []
+    monkeypatch.setattr(train.outputs, "show_results", lambda *words: asked.append(words[-1]))
+    monkeypatch.setattr(ToyModel, "on_test_end", lambda self: setattr(self.evaluation, "results", 1), raising=False)
+    monkeypatch.setattr(
+        ToyModel, "configure_test", lambda self, evaluation: setattr(self, "evaluation", evaluation), raising=False
+    )
+    go("test", *given, "--ckpt_path", "trained/checkpoints/last.ckpt", "--samples", "2")
+    assert asked == [bool(given)]
+
+
+def test_joint_future_is_the_task_when_none_is_named(trained: Path) -> None:
+    go("predict", "--ckpt_path", "trained/checkpoints/last.ckpt")
+    assert type(ToyModel.seen["evaluation"].task).__name__ == "JointFuture"
+    assert ToyModel.seen["evaluation"].samples == 10
+
+
+def test_results_are_written_as_json_and_csv(trained: Path, toy: Path) -> None:
+    go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--out", "tested")
+    assert set(json.loads((toy / "tested" / "results.json").read_text())) == {"test/loss"}
+    assert (toy / "tested" / "results.csv").read_text().startswith("metric,value\ntest/loss,")

@@ -1,0 +1,205 @@
+import math
+
+import lightning as L
+import pytest
+import torch
+
+from magnet.denoiser.module import Denoiser
+from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluation, aligned
+from magnet.generation.conditioning import SamplerOptions
+from magnet.motion.frames import canonical_frame, from_planar, to_planar
+from magnet.motion.scene import Scene, concatenate
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+from tests.datamodules.fakes import FakeData, random_clip
+
+FAST = SamplerOptions(steps=2, stride=2)
+
+
+def data(clips: list | None = None, **options) -> FakeData:
+    clips = clips or [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(3)]
+    sizes = {"max_agents": 3, "context_frames": 16, "horizon_frames": 20, "test_batch_size": 3}
+    return FakeData(clips, **{**sizes, **options})
+
+
+def prepared(**options) -> tuple[Denoiser, Evaluation, L.Trainer]:
+    model = tiny_denoiser(max_agents=3)
+    evaluation = Evaluation(**{"samples": 3, "options": FAST, "baseline_stride": 10, **options})
+    model.configure_test(evaluation)
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
+    return model, evaluation, trainer
+
+
+def run(datamodule: FakeData, **options) -> Evaluation:
+    model, evaluation, trainer = prepared(**options)
+    trainer.test(model, datamodule=datamodule, verbose=False)
+    return evaluation
+
+
+def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluation]:
+    """All scenes that `magnet predict` writes, whatever batches they came in."""
+    model, evaluation, trainer = prepared(**options)
+    return concatenate(trainer.predict(model, datamodule=datamodule)), evaluation
+
+
+def test_every_method_is_measured_on_the_same_scenes():
+    results = run(data()).results
+    answering = {MODEL, "NN", "RS", "zero velocity", "ridge", "NN, not aligned", "RS, not aligned"}
+    assert set(results.rows) == answering | {TRUTH, TRAINING}
+    for method in answering:
+        assert {"fd", "mi", "fs", "ip_ratio", "mpjpe", "mpjve", "mpjpe@0.5s"} <= set(results.rows[method])
+    assert {"fd", "fd_pair", "fs", "ip_ratio"} <= set(results.rows[TRAINING])
+    assert not {name for name in results.rows[TRAINING] if name.startswith(("mpj", "div"))}
+    assert results.rows[MODEL]["div"] > 0
+    for method in ("NN", "zero velocity", "ridge"):
+        assert results.rows[method]["div"] == 0
+    assert {method for method, row in results.rows.items() if "nearest_training" in row} == {MODEL, TRUTH}
+    assert results.rows["ridge"]["mpjpe"] < results.rows["zero velocity"]["mpjpe"]
+    assert results.meta["test scenes"] == 9
+
+
+def test_a_training_stretch_met_again_is_found_by_nearest_neighbour():
+    clips = [random_clip("a", 120, 2, split=split) for split in ("train", "test")]
+    row = run(data(clips)).results.rows["NN"]
+    assert row["mpjpe"] < 0.5 * run(data(clips)).results.rows["RS"]["mpjpe"]
+
+
+class NoisyData(FakeData):
+    """Test scenes in which everything that a schedule does not know has been replaced by noise."""
+
+    known: torch.Tensor
+
+    def test_dataloader(self):
+        generator = torch.Generator().manual_seed(5)
+        for scene in super().test_dataloader():
+            noise = random_scene(scene.scenes, scene.frames, scene.agents, generator)
+            keep = self.known.repeat_interleave(4, dim=0)[: scene.frames, :, None, None]
+            yield scene.replace(
+                body_rot=torch.where(keep[..., None], scene.body_rot, noise.body_rot),
+                T_world_root=torch.where(keep, scene.T_world_root, noise.T_world_root),
+            )
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
+    """From the data loader on: the samples that are measured are bit-identical when the rest is noise."""
+    seen: list[Scene] = []
+    options = {"max_agents": 3, "context_frames": 16, "horizon_frames": 20, "test_batch_size": 3}
+    clips = [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(3)]
+    noisy = NoisyData(clips, **options)
+    task = registry.get(name)()
+    noisy.known = task.schedule(Grid(9, 3, 4, 2, 8, 2)).known
+    for datamodule in (FakeData(clips, **options), noisy):
+        model = tiny_denoiser(max_agents=3)
+        evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
+        evaluation.start(model, datamodule)
+        batch = next(iter(datamodule.test_dataloader()))
+        seen.append(evaluation.sample(model, batch, 2, evaluation._generators(model, batch.scenes)))
+    plain, replaced = seen
+    assert torch.equal(plain.body_rot, replaced.body_rot)
+    assert torch.equal(plain.T_world_root, replaced.T_world_root)
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_every_task_gives_a_table(name):
+    results = run(data(), task=registry.get(name)(), baselines=False).results
+    assert {"fd", "mi", "fs", "ip_ratio"} <= set(results.rows[MODEL])
+    assert ("mpjpe" in results.rows[MODEL]) == (name != "generation")
+
+
+def test_baselines_are_asked_only_where_their_past_is_given():
+    from magnet.tasks.partner import PartnerInpainting
+
+    assert set(run(data(), task=PartnerInpainting()).results.rows) == {MODEL, TRUTH, TRAINING}
+
+
+def test_scores_follow_the_seed():
+    same = [run(data(), baselines=False, seed=3).results.rows[MODEL] for _ in range(2)]
+    assert same[0] == same[1]
+    assert run(data(), baselines=False, seed=4).results.rows[MODEL] != same[0]
+
+
+def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in():
+    """Random retrieval draws, too: a scene's noise is its own."""
+    by_size = [run(data(test_batch_size=size)).results for size in (1, 3)]
+    for method in (MODEL, "RS"):
+        alone, together = (results.rows[method] for results in by_size)
+        assert alone.keys() == together.keys()
+        for metric in alone:
+            assert alone[metric] == pytest.approx(together[metric], rel=1e-3, abs=1e-4, nan_ok=True), (method, metric)
+    (alone, _), (together, _) = (predicted(data(test_batch_size=size)) for size in (1, 3))
+    torch.testing.assert_close(alone.body_rot, together.body_rot, rtol=0, atol=1e-4)
+    torch.testing.assert_close(alone.T_world_root, together.T_world_root, rtol=0, atol=1e-4)
+
+
+def test_no_two_samples_share_their_noise():
+    model, evaluation, _ = prepared()
+    seeds = [g.initial_seed() for g in evaluation._generators(model, 2)]
+    evaluation.scenes = 2
+    seeds += [g.initial_seed() for g in evaluation._generators(model, 1)]
+    assert len(set(seeds)) == len(seeds) == 9
+
+
+def test_prediction_counts_what_it_costs():
+    """Two denoising steps for the first token after the past, and one for each token that follows on the slope."""
+    scenes, evaluation = predicted(data())
+    health = evaluation.health
+    tokens = scenes.frames // 4
+    past = evaluation.context // 4
+    assert (evaluation.scenes, scenes.scenes, health.runs) == (9, 27, 3)
+    assert health.means()["calls"] == health.evaluations == FAST.steps + tokens - past - 1
+    assert evaluation.facts(prepared()[0])["health"]["evaluations"] == health.evaluations
+
+
+@pytest.mark.parametrize("name", ["generation", "partner_inpainting", "inbetweening"])
+def test_no_past_is_no_past_that_baselines_could_continue(name: str):
+    datamodule = data()
+    datamodule.context_frames = 0
+    results = run(datamodule, task=registry.get(name)()).results
+    assert set(results.rows) == {MODEL, TRUTH, TRAINING}
+    assert math.isfinite(results.rows[MODEL]["fd"])
+
+
+def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
+    datamodule = data()
+    datamodule.context_frames = 0
+    seen = run(datamodule, task=registry.get("generation")())
+    assert (seen.now, seen.past_is_given) == (0, False)
+    batch = next(iter(datamodule.test_dataloader()))
+    model = tiny_denoiser(max_agents=3)
+    made = seen.sample(model, batch, 3, seen._generators(model, batch.scenes))
+    yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
+    there = made.present[..., None]
+    middle = torch.where(there, ground, 0).sum(dim=1) / there.sum(dim=1)
+    assert middle.abs().max() < 1e-5
+    assert yaw[:, 0].abs().max() < 1e-5
+
+
+def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
+    monkeypatch.setattr("magnet.evaluation.evaluator.BASELINE_COMPOSED", 30)
+    clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]
+    results = run(data(clips, composed_test=2)).results
+    assert math.isfinite(results.rows["NN"]["mpjpe"])
+    assert math.isfinite(results.rows["ridge"]["mpjpe"])
+    assert math.isfinite(results.rows[MODEL]["nearest_training"])
+
+
+def test_aligned_scenes_share_one_world(scene):
+    seen = aligned(scene.transformed(from_planar(torch.tensor(1.0), torch.tensor([3.0, 2.0]))), 20)
+    yaw, ground = to_planar(canonical_frame(seen.T_world_root)[:, 20])
+    assert ground.mean(dim=1).abs().max() < 1e-5
+    assert yaw[:, 0].abs().max() < 1e-5
+
+
+def test_a_context_of_broken_tokens_is_refused():
+    datamodule = data()
+    datamodule.context_frames = 15
+    with pytest.raises(ValueError, match="context_frames is 15"):
+        run(datamodule)
+
+
+@pytest.mark.parametrize("name", ["samples", "baseline_stride"])
+def test_no_samples_and_no_stride_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: got 0, expected at least 1"):
+        run(data(), **{name: 0})

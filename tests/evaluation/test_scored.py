@@ -1,0 +1,207 @@
+"""What a test run scores: what was generated, frame by frame, in every row; and what it takes as independent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.denoiser.module import Denoiser
+from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluation, shared_world
+from magnet.motion.scene import Scene
+from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.inbetweening import Inbetweening
+from magnet.tasks.joint import JointFuture
+from magnet.testing import tiny_denoiser
+from tests.datamodules.fakes import random_clip
+from tests.evaluation.test_evaluator import FAST, data, run
+
+CONTEXT, HORIZON, TOKENS = 16, 20, 9
+
+
+@dataclass(frozen=True)
+class HalfGiven:
+    """A plug-in that gives all of the first agent, and of the last one the second token after the past."""
+
+    formula: ClassVar[str] = "P(the rest of B | A, some of B)"
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        known = grid.past()
+        known[:, 0] = True
+        known[grid.context + 1, -1] = True
+        return MaskSchedule.together(known, ~known, grid)
+
+
+def inbetween_by_hand(every: int) -> Tensor:
+    """Frames that are no keyframes: these are tokens each `every` from the past's last one on, and the last token."""
+    keys = {*range(CONTEXT // 4 - 1, TOKENS, every), TOKENS - 1}
+    return torch.tensor([[t // 4 not in keys] * 2 + [False] for t in range(CONTEXT, CONTEXT + HORIZON)])
+
+
+def half_given_by_hand() -> Tensor:
+    given = range(CONTEXT + 4, CONTEXT + 8)
+    return torch.tensor([[False, t not in given, False] for t in range(CONTEXT, CONTEXT + HORIZON)])
+
+
+CASES = {
+    **{f"a key each {every}": (Inbetweening(every=every), inbetween_by_hand(every)) for every in (8, 4, 2)},
+    "a plug-in": (HalfGiven(), half_given_by_hand()),
+}
+
+EACH = pytest.mark.parametrize(("task", "scored"), CASES.values(), ids=CASES.keys())
+
+
+def sampled(task: object) -> tuple[Evaluation, Denoiser, Scene, Scene]:
+    """A run's evaluation and model, its only batch of two people in three slots, and the samples that it draws."""
+    datamodule = data(test_batch_size=9)
+    model = tiny_denoiser(max_agents=3)
+    evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
+    evaluation.start(model, datamodule)
+    batch = next(iter(datamodule.test_dataloader()))
+    return evaluation, model, batch, evaluation.sample(model, batch, 2, evaluation._generators(model, batch.scenes))
+
+
+def mean_error(evaluation: Evaluation, made: Scene, batch: Scene, scored: Tensor) -> float:
+    """Distance of 21 joints over what is scored, as MPJPE has it. made (9 * S scenes, horizon)"""
+    truth = evaluation.body.joints(batch.slice(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
+    error = (evaluation.body.joints(made) - truth)[..., 1:, :].norm(dim=-1).mean(dim=-1)  # (9 S, T, P)
+    return float(error[:, scored].mean())
+
+
+@EACH
+def test_what_is_scored_is_what_was_generated(task: object, scored: Tensor) -> None:
+    evaluation, model, batch, _ = sampled(task)
+    assert torch.equal(evaluation.generated(model, batch), scored)
+
+
+@EACH
+def test_none_of_the_copied_truth_counts(task: object, scored: Tensor) -> None:
+    evaluation, model, batch, whole = sampled(task)
+    evaluation.step(model, batch, 0)
+    row = evaluation.metrics[MODEL].compute()
+    made = whole.slice(CONTEXT)
+    assert float(row["mpjpe"]) == pytest.approx(mean_error(evaluation, made, batch, scored), rel=1e-4)
+    people = torch.tensor([True, True, False]).expand(HORIZON, 3)
+    assert float(row["mpjpe"]) > 1.05 * mean_error(evaluation, made, batch, people)
+
+
+@EACH
+def test_what_was_given_comes_back_as_it_was_given(task: object, scored: Tensor) -> None:
+    """Whatever blending does to the frames around it."""
+    _, _, batch, whole = sampled(task)
+    given = torch.cat([torch.ones(CONTEXT, 3, dtype=torch.bool), ~scored])
+    truth = batch.repeat(2)
+    assert torch.equal(whole.body_rot[:, given], truth.body_rot[:, given])
+    assert torch.equal(whole.T_world_root[:, given], truth.T_world_root[:, given])
+    assert not torch.equal(whole.T_world_root[:, ~given], truth.T_world_root[:, ~given])
+
+
+@EACH
+def test_baselines_are_scored_over_the_same_frames(task: object, scored: Tensor) -> None:
+    datamodule = data(test_batch_size=9)
+    batch = next(iter(datamodule.test_dataloader()))
+    ran = run(datamodule, task=task)
+    still = batch.frames_at(torch.full((HORIZON,), CONTEXT - 1))
+    expected = mean_error(ran, still, batch, scored)
+    assert ran.results.rows["zero velocity"]["mpjpe"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_plan_is_that_of_the_slots_somebody_is_in() -> None:
+    """A task that picks the last agent generates the last person, not a free slot; so that is who is scored."""
+    scores = [run(data(max_agents=slots), task=HalfGiven(), baselines=False).results.rows[MODEL] for slots in (2, 3)]
+    assert scores[0]["mpjpe"] > 0
+    evaluation, model, batch, whole = sampled(HalfGiven())
+    scored = evaluation.generated(model, batch)
+    assert scored.any(dim=0).tolist() == [False, True, False]
+    changed = (whole.T_world_root != batch.repeat(2).T_world_root).flatten(3).any(dim=-1).any(dim=0)
+    assert torch.equal(changed[CONTEXT:], scored)
+
+
+def rows(model_slots: int, data_slots: int, baselines: bool) -> dict[str, dict[str, float]]:
+    datamodule = data(max_agents=data_slots)
+    model = tiny_denoiser(max_agents=model_slots)
+    evaluation = Evaluation(JointFuture(), samples=2, options=FAST, baselines=baselines, baseline_stride=20)
+    evaluation.start(model, datamodule)
+    for batch in datamodule.test_dataloader():
+        evaluation.step(model, batch, 0)
+    evaluation.finish(model)
+    return evaluation.results.rows
+
+
+@pytest.fixture(scope="module")
+def narrow() -> dict[str, dict[str, float]]:
+    """Every row of two people in two slots."""
+    return rows(2, 2, baselines=True)
+
+
+@pytest.mark.parametrize("slots", [3, 9])
+def test_free_slots_of_the_data_change_no_number(narrow: dict[str, dict[str, float]], slots: int) -> None:
+    wide = rows(2, slots, baselines=True)
+    assert wide.keys() == narrow.keys()
+    for method in wide:
+        assert wide[method] == pytest.approx(narrow[method], rel=1e-3, abs=1e-5, nan_ok=True), method
+
+
+@pytest.mark.parametrize("slots", [3, 9, 12])
+def test_a_model_of_any_number_of_slots_is_tested(narrow: dict[str, dict[str, float]], slots: int) -> None:
+    """Another number of slots is another network, so its numbers are others; of recordings they are the same."""
+    wide = rows(slots, 2 if slots == 3 else slots, baselines=False)
+    assert wide[MODEL].keys() == narrow[MODEL].keys() - {"nearest_training"} - _ends("nearest_training")
+    expected = {name: value for name, value in narrow[TRUTH].items() if "nearest" not in name}
+    assert wide[TRUTH] == pytest.approx(expected, rel=1e-3, abs=1e-5)
+
+
+def _ends(name: str) -> set[str]:
+    return {f"{name}_low", f"{name}_high"}
+
+
+def test_training_windows_that_are_the_test_scenes_are_at_no_distance_from_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames = CONTEXT + HORIZON
+    monkeypatch.setattr("magnet.evaluation.evaluator.WINDOW_STRIDE", frames)
+    clips = [random_clip("same", 4 * frames, 2, split=split) for split in ("train", "test")]
+    ran = run(data(clips), task=JointFuture(), baseline_stride=frames)
+    row = ran.results.rows[TRAINING]
+    assert row["fd"] < 1e-2 * ran.results.rows["RS"]["fd"]
+    assert row["fd_pair"] < 1e-2 * ran.results.rows["RS"]["fd_pair"]
+    assert row["jitter"] == pytest.approx(ran.results.rows["ground truth"]["jitter"], rel=1e-4)
+
+
+@pytest.mark.parametrize(("interval", "units"), [("scene", 9), ("take", 3), ("auto", 9)])
+def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
+    """Three recordings of 120 frames hold three scenes of 36 frames each side by side, however densely they begin."""
+    for stride in (None, 12, 5):
+        datamodule = data(test_stride=stride)
+        evaluation = Evaluation(options=FAST, baselines=False, interval=interval)
+        evaluation.start(tiny_denoiser(max_agents=3), datamodule)
+        assert len(set(evaluation.unit_of.values())) == units
+        assert len(evaluation.unit_of) == len(datamodule.test_draw())
+
+
+def test_intervals_go_by_recordings_where_there_are_enough() -> None:
+    clips = [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(5)]
+    evaluation = Evaluation(options=FAST, baselines=False)
+    evaluation.start(tiny_denoiser(max_agents=3), data(clips))
+    assert len(set(evaluation.unit_of.values())) == 5
+    with pytest.raises(ValueError, match="interval: got 'clip', expected auto, take, scene"):
+        Evaluation(options=FAST, interval="clip").start(tiny_denoiser(max_agents=3), data(clips))
+
+
+def test_a_worlds_middle_is_that_of_the_people_present() -> None:
+    scene = next(iter(data().test_dataloader()))
+    T_shared_world = shared_world(scene, CONTEXT - 1)
+    there = scene.transformed(T_shared_world).T_world_root[:, CONTEXT - 1, :2, :3, 3]
+    assert there.mean(dim=1)[:, [0, 2]].abs().max() < 1e-5
+
+
+def test_scenes_without_names_are_each_their_own() -> None:
+    evaluation, model, batch, _ = sampled(JointFuture())
+    for unnamed in (batch.replace(names=()), batch):
+        evaluation.step(model, unnamed, 0)
+        evaluation.finish(model)
+    row = evaluation.results.rows[MODEL]
+    assert row["mpjpe_low"] < row["mpjpe"] < row["mpjpe_high"]

@@ -1,0 +1,112 @@
+"""Files that can be watched, and clear words about those that cannot."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import Body
+from magnet.export.npz import save_smplx
+from magnet.export.page.takes import read_takes, same_length, take, takes
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path, scene: Scene, body: Body) -> None:
+    path = scene.save(tmp_path / "dance.npz")
+    found, _ = read_takes([path, path], body, context=8)
+    assert len(found) == 2 * scene.scenes
+    assert found[0].known[:8].all()
+    assert not found[0].known[8:].any()
+    assert {each.label for each in found} == {"dance · 1", "dance · 2"}
+
+
+def test_smplx_files_are_shown_where_they_were_written_from(tmp_path: Path, duet: Scene, body: Body) -> None:
+    path = save_smplx(duet, tmp_path / "dance.npz", body)[0]
+    found, _ = read_takes([path], body)
+    torch.testing.assert_close(found[0].scene.T_world_root, duet.T_world_root, atol=1e-5, rtol=0)
+
+
+def test_absent_people_are_not_shown_and_the_others_keep_their_slots(scene: Scene) -> None:
+    present = torch.tensor([[True, False, True]])
+    shown = take("x", scene.select([0]).replace(present=present))
+    assert shown.slots == (0, 2)
+    assert shown.scene.agents == 2
+
+
+def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scene) -> None:
+    given = torch.zeros(1, duet.frames, 2, dtype=torch.bool)
+    given[:, 5, 0] = True
+    said = duet.replace(given=given)
+    shown = take("x", said, context=8)
+    assert (shown.known == given[0].numpy()).all()
+    assert [shown.said(frame) for frame in (4, 5)] == ["", "given: person 1"]
+    assert take("x", duet, context=8).scene.given.sum() == 16
+    assert take("x", duet).scene.given is None
+
+
+def test_same_length_cuts_or_holds(duet: Scene) -> None:
+    short, long = take("a", duet.slice(0, 10)), take("b", duet)
+    assert same_length(long, short).frames == 10
+    held = same_length(short, long)
+    assert held.frames == 24
+    torch.testing.assert_close(held.T_world_root[:, -1], duet.T_world_root[:, 9])
+
+
+def test_mixed_frame_rates_are_named_with_their_files(tmp_path: Path, duet: Scene, body: Body) -> None:
+    paths = [duet.save(tmp_path / "a.npz"), duet.replace(fps=60.0).save(tmp_path / "b.npz")]
+    with pytest.raises(ValueError, match=r"mixed frame rates.*a\.npz has 30, b\.npz has 60"):
+        read_takes(paths, body)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("cut.npz", b"PK\x03\x04 half"), ("empty.npz", b""), ("words.npz", b"hello"), ("words.txt", b"hello")],
+)
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, body: Body, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+        read_takes([path], body)
+
+
+def test_a_damaged_archive_is_named(tmp_path: Path, body: Body, duet: Scene) -> None:
+    path = duet.save(tmp_path / "damaged.npz")
+    raw = bytearray(path.read_bytes())
+    raw[200:400] = bytes(200)
+    path.write_bytes(bytes(raw))
+    with pytest.raises(ValueError, match=r"damaged\.npz"):
+        read_takes([path], body)
+
+
+def test_a_missing_file_is_named(tmp_path: Path, body: Body) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_takes([tmp_path / "nowhere.npz"], body)
+
+
+def test_another_bodys_scene_asks_for_the_body(tmp_path: Path, duet: Scene, body: Body) -> None:
+    path = duet.replace(body="smplx-neutral").save(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"smplx-neutral.*--body"):
+        read_takes([path], body)
+
+
+def test_numbers_that_are_not_finite_and_empty_scenes_are_refused(duet: Scene) -> None:
+    broken = duet.T_world_root.clone()
+    broken[0, 5] = float("nan")
+    with pytest.raises(ValueError, match="first is frame 5"):
+        take("x", duet.replace(T_world_root=broken))
+    with pytest.raises(ValueError, match="nothing to see"):
+        take("x", duet.replace(present=torch.zeros(1, 2, dtype=torch.bool)))
+
+
+def test_only_the_first_samples_of_a_large_file_are_shown(generator: torch.Generator) -> None:
+    assert len(takes(random_scene(6, 8, 1, generator), "x", samples=3)) == 3
+
+
+def test_other_npz_files_are_refused_with_what_they_hold(tmp_path: Path, body: Body) -> None:
+    path = tmp_path / "other.npz"
+    np.savez(path, cats=np.zeros(3), meta=np.array(json.dumps({})))
+    with pytest.raises(ValueError, match=r"other\.npz"):
+        read_takes([path], body)

@@ -1,0 +1,78 @@
+"""Where given poses go on into generated ones."""
+
+import pytest
+import roma
+import torch
+
+from magnet.generation.blending import SPRING, go_on, spring_weights
+from magnet.motion.frames import canonical_frame
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Scene, Scene, torch.Tensor]:
+    """What is given, what is decoded, and where everybody stands."""
+    generator = torch.Generator().manual_seed(1)
+    given, decoded = (random_scene(2, 24, 3, generator) for _ in range(2))
+    return given, decoded.replace(betas=given.betas), canonical_frame(given.T_world_root)
+
+
+def spring(start: float, speed: float, frames: int, rate: float) -> list[float]:
+    """A critically damped spring, x'' = -2 r x' - r^2 x, in small steps."""
+    x, v, path, fine = start, speed, [], 2000
+    for _ in range(frames):
+        for _ in range(fine):
+            v += (-2 * rate * v - rate * rate * x) / fine
+            x += v / fine
+        path.append(x)
+    return path
+
+
+@pytest.mark.parametrize("blend", [4, 10, 25])
+def test_a_seam_fades_as_a_critically_damped_spring(blend):
+    keep = torch.zeros(14, 2, dtype=torch.bool)
+    keep[:3, 0], keep[2, 1] = True, True
+    stays, grows = spring_weights(keep, blend)
+    for agent, speed in ((0, 0.3), (1, 0.0)):  # how fast agent 1 was is not known
+        path = stays[3:, agent] * 2.0 + grows[3:, agent] * 0.3
+        assert torch.allclose(path, torch.tensor(spring(2.0, speed, 11, SPRING / blend)), atol=2e-3)
+
+
+def test_given_frames_come_back_and_nothing_in_front_of_a_seam_changes(pair):
+    given, decoded, T_world_can = pair
+    keep = torch.zeros(24, 3, dtype=torch.bool)
+    keep[6:12, 0], keep[:8, 1] = True, True
+    made = go_on(decoded, given, T_world_can, keep, 10)
+    assert torch.equal(made.T_world_root[:, 6:12, 0], given.T_world_root[:, 6:12, 0])
+    assert torch.equal(made.body_rot[:, :8, 1], given.body_rot[:, :8, 1])
+    for agent, until in ((0, 6), (2, 24)):
+        assert torch.allclose(made.T_world_root[:, :until, agent], decoded.T_world_root[:, :until, agent], atol=1e-5)
+        assert torch.allclose(made.body_rot[:, :until, agent], decoded.body_rot[:, :until, agent], atol=1e-5)
+
+
+def test_poses_go_on_where_and_as_fast_as_they_were(pair):
+    """A body that turns evenly, and a decode that lies elsewhere and turns at another speed."""
+    given, _, T_world_can = pair
+    time = torch.arange(24)[None, :, None, None, None] / 30
+    axis = torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3, 21, 3)
+    first = roma.rotvec_to_rotmat(axis * (0.2 + 0.9 * time))
+    second = roma.rotvec_to_rotmat(axis * (0.7 - 0.3 * time))
+    keep = torch.zeros(24, 3, dtype=torch.bool)
+    keep[:10] = True
+    given, decoded = given.replace(body_rot=first), given.replace(body_rot=second)
+    made = go_on(decoded, given, T_world_can, keep, 30)
+    angle = roma.rotmat_to_rotvec(made.body_rot)[..., 2]
+    step = angle.diff(dim=1)
+    assert torch.allclose(step[:, :9], torch.tensor(0.03), atol=1e-5)
+    assert (step[:, 9] - step[:, 8]).abs().max() < 0.008  # decoded poses alone would jump by 0.49 there
+    assert (step.diff(dim=1)).abs().max() < 0.008
+
+
+def test_without_blending_only_given_frames_are_put_back(pair):
+    given, decoded, T_world_can = pair
+    keep = torch.zeros(24, 3, dtype=torch.bool)
+    keep[:10] = True
+    made = go_on(decoded, given, T_world_can, keep, 0)
+    assert torch.allclose(made.body_rot[:, 10:], decoded.body_rot[:, 10:], atol=1e-5)
+    assert torch.equal(made.body_rot[:, :10], given.body_rot[:, :10])

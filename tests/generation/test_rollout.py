@@ -1,0 +1,360 @@
+"""Scenes that are handed out piece by piece are those that are made at once, and cost no more memory."""
+
+import itertools
+
+import pytest
+import torch
+
+from magnet.generation.blending import cat_time
+from magnet.generation.conditioning import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
+from magnet.generation.plan import endless, lows
+from magnet.generation.rollout import Stream
+from magnet.generation.world import Canvas, Health
+from magnet.motion.scene import Scene
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import NoiseStream
+from magnet.sampling.sampler import sample
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+from magnet.tasks.agentic import AgenticAsync
+from magnet.tasks.inbetweening import Inbetweening
+from magnet.tasks.joint import JointFuture
+from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
+from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing_poses import blocks_of
+from magnet.tokenizer.module import Tokenizer
+
+FAST = SamplerOptions(steps=2, stride=2)
+TOKENS = 45
+
+TASKS = {
+    **{name: registry.get(name)() for name in registry.names()},
+    "one agent's keyframes, far apart": Inbetweening(keys=(22, -1), agents=(1,)),
+    "one keyframe, nothing before": Inbetweening(keys=(30,), agents=(0,)),
+    "some given for long": PartnerInpainting((1,)),
+    "some end": PartnerPrediction((2,)),
+    "blocks": MotionControl((0, 2), block=2),
+    "turns": AgenticAsync(offset=0.5, order=(2, 0)),
+}
+FROM_NOTHING = ("generation", "one keyframe, nothing before")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_denoiser(max_agents=3, window=8)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Scene:
+    return random_scene(2, 4 * TOKENS, 3, torch.Generator().manual_seed(3))
+
+
+def at_once(model, scene: Scene, task, context: int, frames: int, options: SamplerOptions, seed: int = 0) -> Scene:
+    """The whole scene on one canvas: encoded, sampled and decoded in one go."""
+    tokens = -(-(context + frames) // 4)
+    grid = planning_grid(tokens, 3, context // 4, model.window, options)
+    schedule = task.schedule(grid)
+    given = scrub(scene, schedule.known)
+    canvas = Canvas(model, given, schedule, options, 1)
+    start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid))
+    generator = torch.Generator().manual_seed(seed)
+    noise = NoiseStream((scene.scenes, 3, model.layout.width), generator, eta=options.eta)
+    how = {"guidance": options.guidance, "noise": noise, "solver": options.solver}
+    out = sample(model.denoise, schedule, start, given.present, model.layout, settle=canvas.settle, **how)
+    with torch.no_grad():
+        return canvas.scene(out).slice(0, context + frames)
+
+
+def streamed(model, scene: Scene, task, context: int, frames: int | None, piece: int, options=FAST, seed: int = 0):
+    return model.stream(scene, task, context, frames, 1, options, torch.Generator().manual_seed(seed), piece=piece)
+
+
+def context_of(name: str) -> int:
+    return 0 if name in FROM_NOTHING else 8
+
+
+def close(a: Scene, b: Scene) -> bool:
+    return all(torch.allclose(value, getattr(b, name), atol=1e-5) for name, value in a.tensors().items())
+
+
+def same(a: Scene, b: Scene) -> bool:
+    return all(torch.equal(value, getattr(b, name)) for name, value in a.tensors().items())
+
+
+# -- the same scene ----------------------------------------------------------------------------
+
+
+CAUSAL = ("motion_control", "agentic_sync", "agentic_async", "blocks", "turns")
+
+
+@pytest.mark.parametrize(
+    ("name", "piece"), [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
+)
+def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
+    context = context_of(name)
+    frames = 4 * TOKENS - context - 3
+    pieces = list(streamed(model, recording, TASKS[name], context, frames, piece))
+    assert [made.frames for made in pieces[:-1]] == [4 * piece] * (len(pieces) - 1)
+    whole = cat_time(pieces)
+    assert whole.frames == context + frames
+    assert close(at_once(model, recording, TASKS[name], context, frames, FAST), whole)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(model, recording, name):
+    """Nor on when rows are let go: one piece holds them all."""
+    whole, pieces, rows = (
+        cat_time(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, piece))) for piece in (64, 5, 1)
+    )
+    assert same(whole, pieces) and same(whole, rows)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_the_same_happens_however_long_a_causal_scene_goes_on(model, recording, name):
+    """Live, nobody knows where it ends."""
+    long, short = (cat_time(list(streamed(model, recording, TASKS[name], 8, frames, 64))) for frames in (160, 96))
+    assert same(long.slice(0, short.frames), short)
+
+
+@pytest.mark.parametrize("name", CAUSAL)
+def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model, recording, name):
+    done: list[int] = []
+    pieces = model.stream(recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, piece=1)
+    blocks = list(blocks_of(TASKS[name].schedule(planning_grid(26, 3, 2, 8, FAST))))
+    for row in range(26):
+        next(pieces)
+        needed = [stages for stages, end in blocks if end <= row] + [b for b, end in blocks if end > row][: row >= 2]
+        assert len(done) == sum(len(stage.levels) - 1 for stages in needed for stage in stages)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        SamplerOptions(steps=2, stride=2, placement="integrate"),
+        SamplerOptions(steps=2, stride=3, placement="anchor", paste=False),
+        SamplerOptions(steps=2, stride=2, blend=17),
+        SamplerOptions(steps=2, stride=2, requantise=False),
+        SamplerOptions(steps=4, rolling=2),
+        SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
+        SamplerOptions(steps=4, rolling=2, eta=0.5),
+        SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
+        SamplerOptions(steps=5, rolling=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
+        SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
+        SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
+    ],
+    ids=str,
+)
+def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, options):
+    for task in (JointFuture(), PartnerInpainting((1,))):
+        pieces = list(streamed(model, recording, task, 8, 141, 5, options))
+        assert close(at_once(model, recording, task, 8, 141, options), cat_time(pieces))
+
+
+def test_generate_returns_the_pieces_of_a_stream_bit_for_bit(model, recording):
+    long = random_scene(2, 400, 3, torch.Generator().manual_seed(4))
+    for task in (JointFuture(), PartnerInpainting()):
+        pieces = list(streamed(model, long, task, 8, 392, 64))
+        assert [made.frames for made in pieces] == [256, 144]
+        assert same(cat_time(pieces), model.generate(long, task, 8, 392, 1, FAST, torch.Generator().manual_seed(0)))
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("depth", [1, 2])
+def test_long_given_stretches_are_encoded_in_pieces_as_they_are_whole(causal, depth):
+    """An encoder looks no further than the decoder's reach."""
+    model = tiny_denoiser(max_agents=2)
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        model.tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=depth, causal=causal).eval()
+    scene = random_scene(1, 400, 2, torch.Generator().manual_seed(5))
+    before, after = reach(model)
+
+    def embedded(scene: Scene) -> torch.Tensor:
+        model.tokenizer.requantise, kept = (lambda latent: latent), model.tokenizer.requantise
+        model.tokenizer.codebook.nearest = lambda vectors: vectors
+        try:
+            with torch.no_grad():
+                return model.encode(scene)
+        finally:
+            model.tokenizer.requantise = kept
+
+    whole = embedded(scene)
+    part = embedded(scene.slice(4 * (40 - before), 4 * (50 + after)))[:, before : before + 10]
+    assert torch.allclose(whole[:, 40:50], part, atol=1e-5)
+
+
+def test_whoever_ends_stands_still_across_pieces(model, recording):
+    whole = cat_time(list(streamed(model, recording, PartnerPrediction((0,)), 8, 100, 4)))
+    still = whole.T_world_root[:, 8:, 1:]
+    assert torch.equal(still, still[:, :1].expand_as(still))
+
+
+# -- memory and time ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_no_more_rows_are_held_for_a_longer_scene(model, name):
+    scene = random_scene(1, 480, 3, torch.Generator().manual_seed(6))
+
+    def most_rows(frames: int) -> int:
+        context = context_of(name)
+        options = SamplerOptions(steps=1, stride=4)
+        stream = Stream(model, scene, TASKS[name], context, frames - context, 1, options, None, None, None, 4)
+        held = 0
+        for _ in stream.pieces():
+            held = max(held, stream.tokens.shape[1] + stream.veil.shape[1])
+            held = max(held, stream.canvas.T_world_can.shape[1] // 4 + stream.canvas.given.frames // 4)
+        return held
+
+    assert most_rows(480) == most_rows(240) < 70
+
+
+def test_the_first_piece_comes_long_before_the_last(model, recording):
+    """A live viewer shows what is there already."""
+    done = []
+    pieces = model.stream(recording, JointFuture(), 8, 160, 1, FAST, progress=done.append, piece=4)
+    next(pieces)
+    whole = JointFuture().schedule(planning_grid(42, 3, 2, 8, FAST))
+    assert 0 < len(done) < 0.4 * whole.evaluations
+
+
+def test_nothing_that_the_stream_sets_is_left_set_between_pieces(model, recording):
+    pieces = streamed(model, recording, JointFuture(), 8, 100, 4)
+    with torch.autocast("cpu", torch.bfloat16):
+        next(pieces)
+        assert torch.is_autocast_enabled("cpu") and torch.is_grad_enabled()
+    next(pieces)
+    assert not torch.is_autocast_enabled("cpu") and torch.is_grad_enabled()
+
+
+# -- what is final when ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording, name):
+    context = context_of(name)
+    schedule = TASKS[name].schedule(Grid(TOKENS, 3, context // 4, 2, 8, 2))
+    given = scrub(recording, schedule.known)
+    canvas = Canvas(model, given, schedule, FAST, 1)
+    low = iter(lows(schedule))
+    before: list[tuple[torch.Tensor, torch.Tensor]] = [(torch.empty(0), canvas.T_world_can.clone())]
+
+    def settle(tokens: torch.Tensor, finished: torch.Tensor, apart: bool) -> torch.Tensor:
+        first = next(low)
+        after = canvas.settle(tokens.clone(), finished, apart)
+        old_tokens, old_world = before[-1]
+        if len(old_tokens):
+            assert torch.equal(old_tokens[:, :first], after[:, :first])
+        assert torch.equal(old_world[:, : 4 * first], canvas.T_world_can[:, : 4 * first])
+        before.append((after.clone(), canvas.T_world_can.clone()))
+        return after
+
+    start = known_tokens(model, given, schedule.known)
+    sample(model.denoise, schedule, start, given.present, model.layout, torch.Generator().manual_seed(0), settle)
+    assert next(low, None) is None
+
+
+# -- without end -------------------------------------------------------------------------------
+
+GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partner_prediction")
+
+
+@pytest.mark.parametrize(("name", "rolling"), [*((name, 0) for name in GOES_ON), ("joint_future", 2)])
+def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, rolling):
+    context = context_of(name)
+    options = SamplerOptions(steps=1 + 3 * bool(rolling), stride=4, rolling=rolling)
+    short = recording.slice(0, context).select([0])
+    ended, begun = (
+        cat_time(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 8)))
+        for frames in (400, None)
+    )
+    assert begun.frames == 8 * 32
+    assert same(ended, begun)
+
+
+@pytest.mark.parametrize("name", ["partner_inpainting", "motion_control", "inbetweening"])
+def test_tasks_that_are_given_something_later_need_an_end(model, recording, name):
+    with pytest.raises(ValueError, match="so it has an end"):
+        streamed(model, recording, TASKS[name], context_of(name), None, 8)
+
+
+def test_a_plan_that_does_not_repeat_itself_needs_an_end():
+    class Odd(JointFuture):
+        def schedule(self, grid: Grid):
+            plan = super().schedule(grid)
+            return type(plan)(plan.tokens, plan.agents, plan.stages[:1], plan.known)
+
+    with pytest.raises(ValueError, match="does not repeat itself"):
+        endless(Odd(), Grid(4, 3, 2, 2, 8, 2), 3)
+
+
+def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
+    with pytest.raises(ValueError, match="piece: got 0"):
+        streamed(model, recording, JointFuture(), 8, 20, 0)
+    with pytest.raises(ValueError, match="context of 7 frames"):
+        streamed(model, recording, JointFuture(), 7, 20, 4)
+    with pytest.raises(ValueError, match="the task needs 400 frames, the scene has 180"):
+        streamed(model, recording, PartnerInpainting(), 8, 392, 4)
+
+
+# -- one generator for each scene --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("solver", "eta"), [("ddim", 0.0), ("ddim", 1.0), ("dpmpp_2m", 0.0)])
+@pytest.mark.parametrize("name", registry.names())
+def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, solver, eta):
+    context, options = context_of(name), SamplerOptions(steps=3, stride=2, eta=eta, solver=solver)
+
+    def run(scene: Scene, seeds: range, samples: int) -> Scene:
+        each = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return model.generate(scene, TASKS[name], context, 48 - context, samples, options, each)
+
+    batch = run(recording, range(4), 2)
+    for number in range(4):
+        single = run(recording.select([number // 2]), range(number, number + 1), 1)
+        assert close(single, batch.select([number]))
+
+
+def test_as_many_generators_as_scenes_are_needed(model, recording):
+    with pytest.raises(ValueError, match="got 2 generators for 4 scenes"):
+        model.generate(recording, JointFuture(), 8, 8, 2, FAST, [torch.Generator(), torch.Generator()])
+
+
+# -- what it costs -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "guidance", "views", "branches"),
+    [
+        ("joint_future", Guidance(), 1, 1),
+        ("joint_future", Guidance("history"), 1, 2),
+        ("joint_future", Guidance("self"), 1, 5),  # everybody, nobody, and each of three alone
+        ("joint_future", Guidance("partner"), 1, 5),
+        ("joint_future", Guidance(smooth=0.01), 1, 1),
+        ("agentic_sync", Guidance(), 3, 1),
+        ("agentic_sync", Guidance("history"), 3, 2),
+        ("agentic_async", Guidance(), 1, 1),  # nobody is hidden from one that another sees
+        ("agentic_async", Guidance("history"), 1, 2),
+    ],
+)
+def test_calls_and_evaluations_are_counted(model, recording, name, guidance, views, branches):
+    health = Health()
+    options = SamplerOptions(steps=3, stride=2, guidance=guidance)
+    schedule = registry.get(name)().schedule(planning_grid(7, 3, 4, 8, options))
+    for _ in range(2):
+        model.generate(recording, registry.get(name)(), 16, 12, 2, options, health=health)
+    assert health.calls == 2 * schedule.evaluations
+    assert health.evaluations == schedule.evaluations * views * branches
+    means = health.means()
+    assert (means["calls"], means["evaluations"]) == (schedule.evaluations, health.evaluations)
+
+
+@pytest.mark.parametrize("name", ["partner_inpainting", "inbetweening", "motion_control"])
+def test_a_scene_that_ends_within_a_token_is_enough_for_tasks_given_all_of_it(name, generator):
+    """32 and 150 frames, the defaults of `magnet test`, are 45 tokens and a half."""
+    model = tiny_denoiser(max_agents=2, window=8)
+    scene = random_scene(1, 34, 2, generator)
+    out = model.generate(scene, registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))
+    assert out.frames == 34
+    with pytest.raises(ValueError, match="the task needs"):
+        model.generate(scene.slice(0, 30), registry.get(name)(), 8, 26, options=SamplerOptions(steps=2))

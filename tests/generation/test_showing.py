@@ -1,0 +1,123 @@
+"""Bodies of causal plans are made from what is known by then, and stay."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from magnet.generation.conditioning import SamplerOptions, known_tokens, reach, scrub
+from magnet.generation.showing import Expected, bodies, own_view, show
+from magnet.generation.world import Canvas
+from magnet.motion.frames import canonical_frame, posed
+from magnet.motion.scene import Scene
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.schedule import Grid, Stage
+from magnet.tasks.partner import MotionControl
+from magnet.testing import random_scene, tiny_denoiser
+
+TOKENS, PAST = 14, 4
+BARE = SamplerOptions(steps=2, paste=False, blend=0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_denoiser(max_agents=3, window=8)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return random_scene(2, 4 * TOKENS, 3, torch.Generator().manual_seed(3))
+
+
+def finished(model, scene: Scene, options: SamplerOptions) -> tuple[Canvas, torch.Tensor]:
+    """A canvas on which everybody is placed where they were, and their true tokens."""
+    schedule = MotionControl((0,)).schedule(Grid(TOKENS, 3, PAST, 2, 8, 2))
+    canvas = Canvas(model, scrub(scene, schedule.known), schedule, options, 1)
+    canvas.placed[:] = True
+    canvas.T_world_can = canonical_frame(scene.T_world_root)
+    return canvas, known_tokens(model, scene, torch.ones_like(schedule.known))
+
+
+def same(a: Scene, b: Scene) -> bool:
+    return torch.equal(a.body_rot, b.body_rot) and torch.equal(a.T_world_root, b.T_world_root)
+
+
+@torch.no_grad()
+def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
+    """As if the clip ended there."""
+    canvas, tokens = finished(model, scene, BARE)
+    made = bodies(canvas, tokens, 6, 8, 8)
+    latent, steps, _ = model.layout.unpack(model.statistics.restore(tokens[:, :8]))
+    clip = posed(model.tokenizer.decode(latent, scene.betas, steps), canvas.T_world_can[:, :32], scene.slice(0, 32))
+    assert torch.allclose(made.body_rot, clip.body_rot[:, 24:], atol=1e-5)
+    assert torch.allclose(made.T_world_root, clip.T_world_root[:, 24:], atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", [BARE, SamplerOptions(steps=2), SamplerOptions(steps=2, blend=3)], ids=str)
+def test_nothing_behind_a_block_reaches_its_bodies(model, scene, options):
+    canvas, tokens = finished(model, scene, options)
+    other, changed = finished(model, scene, options)
+    changed[:, 8:] = 7.0
+    other.given.T_world_root[:, 32:] += 3.0
+    other.T_world_can[:, 32:] = torch.eye(4)
+    assert same(bodies(canvas, tokens, 6, 8, 8), bodies(other, changed, 6, 8, 8))
+
+
+@torch.no_grad()
+def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene):
+    canvas, tokens = finished(model, scene, BARE)
+    ahead = reach(model)[1]
+    behind = tokens[:, 8 : 8 + ahead], torch.ones(3, dtype=torch.bool)
+    expected = bodies(canvas, tokens, 6, 8, 8, behind)
+    known = bodies(canvas, tokens, 6, 8, 8 + ahead)
+    assert torch.allclose(expected.body_rot, known.body_rot, atol=1e-4)
+    assert not torch.allclose(bodies(canvas, tokens, 6, 8, 8).body_rot, known.body_rot, atol=1e-3)
+
+
+@torch.no_grad()
+def test_what_has_been_shown_is_given_and_the_next_block_goes_on_from_there(model, scene):
+    canvas, tokens = finished(model, scene, SamplerOptions(steps=2))
+    show(canvas, tokens, 6, 6, None)
+    first = canvas.given.slice(0, 24)
+    first = first.replace(body_rot=first.body_rot.clone(), T_world_root=first.T_world_root.clone())
+    tokens = tokens + 0.5 * torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1))
+    show(canvas, tokens, 7, 7, None)
+    assert same(canvas.given.slice(0, 24), first)
+    assert torch.equal(canvas.given.body_rot[:, :28, 1:], scene.body_rot[:, :28, 1:])  # given, as it was
+    step = canvas.given.T_world_root[:, :28, 0, :3, 3].diff(dim=1).norm(dim=-1)
+    assert step[:, 23].max() < 2 * step[:, 16:23].max()
+
+
+def test_each_agents_first_word_of_what_comes_counts():
+    """Later stages of the same block have seen more."""
+    rows = torch.full((2, 3, 2), LEVELS)
+    rows[:, :2] = 0
+    first, second = rows.clone(), rows.clone()
+    first[1, 2, 0], second[:, 2, 0], second[1, 2, 1] = 0, 0, 0
+    one, two = torch.full((1, 5, 2, 4), 1.0), torch.full((1, 5, 2, 4), 2.0)
+    expected = Expected(4)
+    expected.keep(Stage(5, first, ahead=2), one)
+    tokens, told = expected.behind(8)
+    assert tokens.shape == (1, 2, 2, 4) and told.tolist() == [True, False]
+    expected.keep(Stage(5, second, ahead=2), two)
+    tokens, told = expected.behind(8)
+    assert told.all() and (tokens[:, :, 0] == 1).all() and (tokens[:, :, 1] == 2).all()
+    assert expected.behind(9) is None
+
+
+def test_every_agent_is_read_from_its_own_view_without_guidance():
+    """Scenes first, then views, then branches."""
+    hidden = torch.zeros(3, 2, 3, dtype=torch.bool)
+    hidden[0, 1, 1] = hidden[2, 1, 0] = True
+    views, of = hidden.unique(dim=0, return_inverse=True)
+    stage = Stage(0, torch.zeros(2, 2, 3, dtype=torch.long), hidden)
+    clean = torch.zeros(2, len(views), 4, 2, 3, 1)
+    clean += 100 * torch.arange(2).view(2, 1, 1, 1, 1, 1) + 10 * torch.arange(len(views)).view(1, -1, 1, 1, 1, 1)
+    clean += torch.arange(4).view(1, 1, 4, 1, 1, 1)
+    seen = own_view(clean.flatten(0, 2), stage, 2)
+    for scene in range(2):
+        for agent in range(3):
+            assert (seen[scene, :, agent] == 100 * scene + 10 * int(of[agent])).all()
+    plain = own_view(clean[:, 0].flatten(0, 1), dataclasses.replace(stage, hidden=None), 2)
+    assert plain.shape == (2, 2, 3, 1) and (plain[1] == 100).all()

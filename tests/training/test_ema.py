@@ -1,0 +1,65 @@
+import torch
+
+from magnet import weights
+from magnet.denoiser.module import Denoiser
+from magnet.testing import random_scene
+from magnet.tokenizer.module import Tokenizer
+from magnet.training.ema import WeightEMA
+from tests.denoiser.test_module import build, data, save, trainer
+
+
+class Watch(WeightEMA):
+    """Also keeps every step's own weights."""
+
+    def __init__(self, decay: float) -> None:
+        super().__init__(decay)
+        self.seen: list[torch.Tensor] = []
+
+    def on_train_batch_end(self, trainer, pl_module, *args, **kwargs) -> None:
+        self.seen.append(pl_module.transformer.leave.weight.detach().clone())
+        super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
+
+
+def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_path):
+    model = build(tmp_path, learning_rate=1e-2)
+    before = {name: value.clone() for name, value in model.tokenizer.state_dict().items()}
+    watch = Watch(0.5)
+    run = trainer(6, callbacks=[watch])
+    run.fit(model, datamodule=data())
+    # At the end of training the model itself becomes the average; the last checkpoint agrees.
+    run.save_checkpoint(tmp_path / "ema.ckpt")
+    expected = watch.seen[0]
+    for n, current in enumerate(watch.seen[1:], 1):
+        decay = min(0.5, (1 + n) / (10 + n))
+        expected = decay * expected + (1 - decay) * current
+    loaded = Denoiser.load(tmp_path / "ema.ckpt")
+    assert torch.allclose(loaded.transformer.leave.weight, expected, atol=1e-6)
+    assert not torch.allclose(loaded.transformer.leave.weight, watch.seen[-1], atol=1e-6)
+    assert all(torch.equal(value, before[name]) for name, value in loaded.tokenizer.state_dict().items())
+    assert loaded.statistics.ready
+
+
+def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):
+    model = build(tmp_path)
+    run = trainer(2)
+    run.fit(model, datamodule=data())
+    run.save_checkpoint(tmp_path / "model.ckpt")
+    folder = weights.write(weights.read(tmp_path / "model.ckpt"), tmp_path / "release", half=False)
+    loaded, released = Denoiser.load(tmp_path / "model.ckpt"), Denoiser.load(folder)
+    assert all(torch.equal(x, released.state_dict()[name]) for name, x in loaded.state_dict().items())
+
+
+def test_a_denoiser_never_runs_with_another_tokenizer_than_its_own(tmp_path):
+    """A file of another tokenizer now lies where the checkpoint's was: the checkpoint's own is brought back."""
+    model = build(tmp_path)
+    run = trainer(1)
+    run.fit(model, datamodule=data())
+    run.save_checkpoint(tmp_path / "model.ckpt")
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(1))
+    expected = model.eval().encode(scene)
+    other = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=True)
+    other.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    save(other, tmp_path / "tokenizer.ckpt")
+    loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True).eval()
+    assert not loaded.tokenizer.hparams["causal"]
+    assert torch.equal(loaded.encode(scene), expected)
