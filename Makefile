@@ -7,7 +7,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-browser test-blender test-all check lint type format clean distclean
+.PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format clean distclean
 
 help:  ## list what make can do
 	@echo "magnet: diffusion forcing for the motion of several people"
@@ -40,6 +40,10 @@ setup: $(READY)  ## make the virtual environment with the pinned packages
 demo: $(READY)  ## run the main job on the embedded default: several people move together
 	@echo "demo: magnet demo"
 	@$(PY) -m magnet demo
+
+train-duet: $(READY)  ## the shipped model from recordings (MAGNET_CMU) to weights; again: goes on
+	@echo "train-duet: scripts/train_duet.py, into runs/train_duet; DUET='--steps denoiser=100' hands it options"
+	@$(PY) scripts/train_duet.py $(DUET)
 
 test: $(READY)  ## run the tests, without the slow ones
 	@echo "test: pytest, without the slow tests"

@@ -66,6 +66,7 @@ def main() -> None:
     options.add_argument("checkpoint", type=Path)
     options.add_argument("name")
     options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
+    options.add_argument("--folder", type=Path, default=weights.FOLDER, help="where the model's folder is made")
     given = options.parse_args()
     about = ABOUT | {"recordings": manifest()} | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
     checkpoint = weights.read(given.checkpoint)
@@ -73,7 +74,7 @@ def main() -> None:
         checkpoint = weights.with_decoder(checkpoint, weights.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
-    folder = weights.write(checkpoint, weights.FOLDER / given.name, without_folders(about))
+    folder = weights.write(checkpoint, given.folder / given.name, without_folders(about))
     parts = sorted(folder.glob("*.safetensors"))
     size = sum(part.stat().st_size for part in parts) / 1e6
     print(f"{folder}: {len(parts)} parts, {size:.1f} MB")

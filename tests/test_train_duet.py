@@ -1,0 +1,89 @@
+"""The recipe of the shipped model, from recordings to weights."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from magnet import weights
+from magnet.denoiser.module import Denoiser
+from magnet.testing import tiny_denoiser
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDINGS = os.environ.get("MAGNET_CMU") or str(ROOT.parent / "shared" / "data" / "cmu")
+
+
+def loaded() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("train_duet", ROOT / "scripts" / "train_duet.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+recipe = loaded()
+
+
+def save(folder: Path, step: int) -> None:
+    path = recipe.last_checkpoint(folder)
+    path.parent.mkdir(parents=True)
+    torch.save({"global_step": step, "state_dict": tiny_denoiser().state_dict()}, path)
+
+
+def test_stages_take_the_steps_of_their_configurations_unless_told_otherwise() -> None:
+    plain = recipe.wished_steps([])
+    assert set(plain) == set(recipe.STAGES) and min(plain.values()) >= 1000
+    assert recipe.wished_steps(["denoiser=7"]) == {**plain, "denoiser": 7}
+    for wrong in ("denoiser", "denoiser=", "denoiser=0", "painter=3", "denoiser=-1"):
+        with pytest.raises(ValueError, match="expected STAGE=N"):
+            recipe.wished_steps([wrong])
+
+
+def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_checkpoint(tmp_path: Path) -> None:
+    tokenizer = str(recipe.last_checkpoint(tmp_path / "tokenizer"))
+    for stage, flag in (("denoiser", "--model.tokenizer"), ("decoder", "--model.start_from")):
+        command = recipe.fit_command(stage, tmp_path, 9, ["--data.batch_size=4"])
+        assert command[command.index(flag) + 1] == tokenizer
+        assert command[command.index("--trainer.max_steps") + 1] == "9"
+        assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
+    assert recipe.steps_done(tmp_path / "denoiser") == 0
+    save(tmp_path / "denoiser", 5)
+    assert recipe.steps_done(tmp_path / "denoiser") == 5
+    command = recipe.fit_command("denoiser", tmp_path, 9, [])
+    assert command[command.index("--ckpt_path") + 1] == str(recipe.last_checkpoint(tmp_path / "denoiser"))
+
+
+def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Path, monkeypatch, capsys) -> None:
+    save(tmp_path / "tokenizer", 3)
+    ran: list[list[str]] = []
+    monkeypatch.setattr(recipe, "run", lambda command, what: ran.append(command))
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "decoder=5"])
+    configs = [command[command.index("--config") + 1] for command in ran[:-1]]
+    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_decoder"]
+    assert "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
+    assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
+    monkeypatch.undo()
+    with pytest.raises(SystemExit, match="run the same command again"):
+        recipe.run(["false"], "a stage")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path(RECORDINGS).is_dir(), reason="needs CMU's recordings: set MAGNET_CMU")
+def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
+    monkeypatch.setenv("MAGNET_CMU", RECORDINGS)
+    small = ["--", "--data.batch_size=4", "--data.epoch_size=8"]
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "decoder=1", *small])
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "decoder=1", *small])
+    said = capfd.readouterr().out
+    assert "tokenizer: has its 1 steps already" in said and "denoiser, step 1 to 2: done" in said
+    model = Denoiser.load(tmp_path / "weights" / "duet")
+    released = weights.read(tmp_path / "weights" / "duet")["state_dict"]
+    decoder = weights.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
+    name = next(name for name in decoder if name.startswith("decoder.") and decoder[name].dim() == 1)
+    assert torch.equal(released[f"tokenizer.{name}"], decoder[name])
+    assert model.normalizer.ready
