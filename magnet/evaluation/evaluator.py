@@ -126,7 +126,7 @@ class Evaluation:
 
     def _read_test_scenes(self, datamodule: MotionDataModule) -> None:
         """How many test scenes there are, the slots they need, and which of them are not independent."""
-        store, draw = datamodule.store("test"), datamodule.test_draw()
+        store, draw = datamodule.store("test"), datamodule.test_windows()
         frames = self.context + self.horizon
         self.total = max(len(draw), 1)
         self.slots = 1 + int(np.flatnonzero((draw.members >= 0).any(axis=0)).max(initial=0))

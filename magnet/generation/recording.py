@@ -210,7 +210,7 @@ class RecordedStream(Stream):
 def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, apart: bool = False) -> Scene:
     """A window as the model expects it to end, placed in the world; the canvas stays as it is.
 
-    tokens (1, N, P, D), estimate (1, W, P, D) normalized, wanted (W, P) bool: ever to be generated; apart as for
+    tokens (1, N, P, D), estimate (1, W, P, D) normalised, wanted (W, P) bool: ever to be generated; apart as for
     `Canvas.settle`. -> W frames
     """
     shown = copy.copy(canvas)

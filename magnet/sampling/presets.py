@@ -16,7 +16,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rolling": 0,  # 3.3: segment by segment
         "placement": "integrate",  # the paper predicts steps and integrates them
         "trust": 0.02,  # not read by `integrate`
-        "requantize": True,  # 3.1: what is decoded are codes
+        "requantise": True,  # 3.1: what is decoded are codes
         "paste": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM

@@ -14,7 +14,9 @@ from magnet import __version__, cli
 from magnet.cli import train
 from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, usage
+from magnet.datamodules import registry
 from tests import toys
+from tests.toys import OtherData, ToyData
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
@@ -34,7 +36,7 @@ def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MAGNET_DEBUG", raising=False)
     monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
     return tmp_path
 
 
