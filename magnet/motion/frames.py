@@ -174,7 +174,7 @@ def place(
     T_self_partner: Tensor | None,
     T_world_start: Tensor,
     placement: Placement = "integrate",
-    trust: float = 0.003,
+    pairwise_weight: float = 0.003,
     present: Tensor | None = None,
     fixed: Tensor | None = None,
     anchor: Tensor | None = None,
@@ -189,7 +189,7 @@ def place(
             drift apart slowly). `anchor`: one agent integrates, the others hang off it by its pairwise
             transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
             the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
-        trust: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
+        pairwise_weight: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
         present: (B, P) bool; relations to absent agents are not read. None: all are there.
         fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
         anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
@@ -206,7 +206,9 @@ def place(
         weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(steps.device), FIXED, 1.0)
         pairs = to_planar(T_self_partner.double())
         steps_planar = (step_yaw, step_ground)
-        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, trust, present, weight)).to(steps)
+        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, pairwise_weight, present, weight)).to(
+            steps
+        )
     yaw = start_yaw[:, None] + step_yaw.cumsum(dim=1)
     before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
     ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
@@ -228,17 +230,17 @@ def _fuse(
     pair_ground: Tensor,
     yaw: Tensor,
     ground: Tensor,
-    trust: float,
+    pairwise_weight: float,
     present: Tensor,
     own: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Frame by frame: minimise own * |pose - stepped pose|^2 + trust * sum |pair - predicted pair|^2.
+    """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
 
     Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    diag(own) + 2 trust (graph Laplacian of the people present). own (P,) is each agent's weight.
+    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
     """
     partner = partners(present.shape[1], present.device)
-    together = trust * (present[:, :, None] & present[:, None]).to(step_yaw)
+    together = pairwise_weight * (present[:, :, None] & present[:, None]).to(step_yaw)
     together.diagonal(dim1=1, dim2=2).zero_()
     system = torch.diag(own.to(step_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
     solve = torch.linalg.inv(system)

@@ -49,7 +49,7 @@ def ddim_step(
     now: Tensor,
     after: Tensor,
     eta: float = 0.0,
-    fresh: Tensor | None = None,
+    step_noise: Tensor | None = None,
     K: int = LEVELS,
 ) -> Tensor:
     """One DDIM step from levels `now` down to `after`, given the predicted clean value (Song et al. 2021, Eq. 12, 16).
@@ -60,16 +60,16 @@ def ddim_step(
         noisy, clean: (..., D).
         now, after: (..., D) int or broadcastable.
         eta: how much of the noise that is left is new: 0 none, the deterministic step; 1 as in ancestral sampling.
-        fresh: (..., D) new standard normal noise; needed where eta is not 0.
+        step_noise: (..., D) new standard normal noise; needed where eta is not 0.
         K: number of levels.
     """
     a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
     # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
     left = (1 - a_now).clamp_min(1e-12)
     noise = (noisy - a_now.sqrt() * clean) / left.sqrt()
-    if eta and fresh is not None:
+    if eta and step_noise is not None:
         renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
-        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * fresh
+        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * step_noise
     else:
         noise = (1 - a_after).sqrt() * noise
     moved = a_after.sqrt() * clean + noise
@@ -180,8 +180,8 @@ class NoiseStream:
         # Drawn once: the noise of a step then hangs on its place alone, in whatever order places are asked for.
         self._seeds = self._draw_seeds() if self.eta else []
 
-    def rows(self, count: int) -> tuple[Tensor, Tensor]:
-        """The noise of the next `count` token steps, and their veil, which stands in where a view hides them.
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """The noise of the next `count` token steps, and their mask_noise, which stands in where a view hides them.
 
         -> (B, count, P, D) each
         """
@@ -199,7 +199,7 @@ class NoiseStream:
             return torch.stack(each, dim=1)
         return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)
 
-    def at(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
+    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
         """New noise of the denoising steps that leave these levels, on token steps `first` and on.
 
         levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)

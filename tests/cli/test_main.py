@@ -122,7 +122,10 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
         (["test", "--out", __file__], "got a file, expected a folder"),
         (["test", "--frames", "9"], "did you mean --data.window_frames?"),
         (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
-        (["test", "--sampler.rolling", "four"], "--sampler.rolling: got four, expected a whole number or null"),
+        (
+            ["test", "--sampler.pyramid_offset", "four"],
+            "--sampler.pyramid_offset: got four, expected a whole number or null",
+        ),
         (["test", "--task", "inbetweening", "--task.keys", "20"], "--task.keys: got 20, expected a list such as [0,1]"),
         (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
         (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),

@@ -32,7 +32,7 @@ class HalfGiven:
         known = grid.past()
         known[:, 0] = True
         known[grid.context + 1, -1] = True
-        return MaskSchedule.together(known, ~known, grid)
+        return MaskSchedule.full_sequence(known, ~known, grid)
 
 
 def inbetween_by_hand(every: int) -> Tensor:
