@@ -5,7 +5,7 @@
 One table in markdown and JSON. A run that was stopped goes on where it was; `--only` picks rows by part of a name.
 Rows of one part of the table sample the same scenes with the same noise. Partner tasks score the person who is
 generated, and have a ground truth of their own. "All else replaced" gives the sampler other motion wherever the task
-gives nothing, which must not change a score; "relations leak" shows what happens with the paper's literal noise levels.
+gives nothing, which must not change a score; "pairs leak" shows what happens with the paper's literal noise levels.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPredic
 METRICS = ["fd", "div", "mi", "fs", "ip_ratio", "mpjpe@1s", "mpjpe@5s", "mpjpe_best", "mpjve", "jitter"]
 PARTNER = "one person: "
 REPLACED = ", all else replaced"
-LEAK = ", relations leak"
+LEAK = ", pairs leak"
 Generators = torch.Generator | Sequence[torch.Generator]
 
 
@@ -122,9 +122,9 @@ def measure(
 
 
 def leaking(model: Denoiser) -> Denoiser:
-    """The same weights, with relations as clean as their token, the paper read literally: not what they learnt."""
-    layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.relations, "token")
-    model.layout = model.transformer.layout = model.statistics.layout = layout
+    """The same weights, with pairs as clean as their token, the paper read literally: not what they learnt."""
+    layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.pairwise, "token")
+    model.layout = model.transformer.layout = layout
     return model
 
 

@@ -36,7 +36,7 @@ def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
 
 def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float]:
     """Mean errors of pairwise transforms: centimetres, degrees. (B, N, P, D) x 2"""
-    pairs = [planar_of(model.layout.unpack(model.statistics.restore(x[:, part]))[2]) for x in (tokens, truth)]
+    pairs = [planar_of(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2]) for x in (tokens, truth)]
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(pairs[0][0].shape)
     turned = pairs[0][0] - pairs[1][0]
     turned = torch.atan2(turned.sin(), turned.cos()).abs()[there]
@@ -57,7 +57,7 @@ def main() -> None:
     data.prepare_data()
     data.setup("test")
     scenes = concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)
-    truth = model.statistics.normalise(model.tokenize(scenes)[0])
+    truth = model.normalizer.normalize(model.tokenize(scenes)[0])
     posterior = model.posterior or PairwisePosterior(model.layout)
     model.posterior = None
     generator = torch.Generator().manual_seed(0)
@@ -67,7 +67,7 @@ def main() -> None:
         noise = torch.randn(truth.shape, generator=generator)
         noisy = add_noise(truth, noise, model.layout.spread(model.layout.group_levels(levels)))
         alone = model.denoise(noisy, levels, scenes.present)
-        fused = posterior(alone, noisy, levels, scenes.present, model.statistics)
+        fused = posterior(alone, noisy, levels, scenes.present, model.normalizer)
         each = {"shown": noisy, "network": alone, "posterior": fused}
         rows[name] = {how: errors(model, tokens, truth, scenes.present, part) for how, tokens in each.items()}
         told = " | ".join(f"{how} {cm:.1f} cm {degrees:.1f} deg" for how, (cm, degrees) in rows[name].items())

@@ -75,11 +75,11 @@ def tiny_denoiser(max_agents: int = 3, window: int = 8, seed: int = 0, **options
         torch.manual_seed(seed)
         tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
         generator = torch.Generator().manual_seed(seed)
-        tokenizer.prepare([random_scene(4, 32, 2, generator)])
+        tokenizer.init_codebook([random_scene(4, 32, 2, generator)])
         sizes = {"width": 32, "layers": 2, "heads": 2, "mlp_ratio": 2, "dropout": 0.0}
         model = Denoiser(max_agents=max_agents, window=window, **{**sizes, **options})
         model.build(tokenizer)
-        model.statistics.fit(*model.tokenize(random_scene(4, 32, max_agents, generator)))
+        model.fit_normalizer(*model.tokenize(random_scene(4, 32, max_agents, generator)))
     return model.eval()
 
 
@@ -108,7 +108,7 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
     The laws: a task is a frozen dataclass with a docstring and a formula; it plans the same twice; levels never
     rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
     clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
-    cannot influence the sample, nor can relations to it; what a stage hides from an agent cannot influence what the
+    cannot influence the sample, nor can pairs to it; what a stage hides from an agent cannot influence what the
     stage makes of that agent, not by way of the others either; no pose depends on what is not known yet when it is
     shown (`magnet.testing_poses.pose_law`); the same seed gives the same sample; and several scenes in a batch are
     sampled as each would be alone.
@@ -324,17 +324,17 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
     tokens, noise, mask_noise = drawn
     P = layout.agents
     there = torch.arange(P) < people
-    pairs = there[:, None] & there[partners(P)] if layout.slots else there[:, None]
+    both = there[:, None] & there[partners(P)] if layout.slots else there[:, None]
 
     def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """Tokens of an agent from its own, its relations and everybody's, all slots alike."""
-        latent, steps, relations = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
+        """Tokens of an agent from its own, its pairs and everybody's, all slots alike."""
+        latent, steps, pairs = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
         own = torch.cat([latent, steps.flatten(-2)], dim=-1) * there[:, None]
-        relations = relations * pairs[..., None, None]
+        pairs = pairs * both[..., None, None]
         everybody = own.sum(dim=2, keepdim=True).mean(dim=1, keepdim=True) / there.sum()
-        own = torch.tanh(own.roll(1, dims=1) + everybody + relations.flatten(3).sum(dim=-1, keepdim=True))
+        own = torch.tanh(own.roll(1, dims=1) + everybody + pairs.flatten(3).sum(dim=-1, keepdim=True))
         latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
-        return layout.pack(latent, steps, torch.tanh(relations + steps.mean(dim=(-1, -2))[..., None, None, None]))
+        return layout.pack(latent, steps, torch.tanh(pairs + steps.mean(dim=(-1, -2))[..., None, None, None]))
 
     canvas = begin(tokens, noise, schedule.known, layout)
     return run_stages(blind, schedule.stages, canvas, mask_noise, there.expand(len(tokens), P), layout)
@@ -342,14 +342,14 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:
     """Tokens of the same people in other slots: agent p becomes what agent order[p] was. (B, N, P, D) -> same"""
-    latent, steps, relations = layout.unpack(tokens)
+    latent, steps, pairs = layout.unpack(tokens)
     P = layout.agents
-    whole = relations.new_zeros(*relations.shape[:2], P, P, *relations.shape[4:])
+    whole = pairs.new_zeros(*pairs.shape[:2], P, P, *pairs.shape[4:])
     rows, columns = torch.arange(P)[:, None], partners(P)
     if layout.slots:
-        whole[:, :, rows, columns] = relations
-        relations = whole[:, :, order][:, :, :, order][:, :, rows, columns]
-    return layout.pack(latent[:, :, order], steps[:, :, order], relations)
+        whole[:, :, rows, columns] = pairs
+        pairs = whole[:, :, order][:, :, :, order][:, :, rows, columns]
+    return layout.pack(latent[:, :, order], steps[:, :, order], pairs)
 
 
 def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:

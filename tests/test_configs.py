@@ -24,7 +24,7 @@ SETS = {"duobox": "DuoBox", "dd100": "DD100", "remocap": "ReMoCap", "interx": "I
 ROWS: dict[str, dict[str, dict[str, Any] | None]] = {
     "Table 5": {
         "table5_without_vq_vae": {"model.init_args.tokenizer": "raw"},
-        "table5_without_pairwise": {"model.init_args.relations": False},
+        "table5_without_pairwise": {"model.init_args.pairwise": False},
     },
     "Table A.5": {
         "tableA5_without_agent_pe": {"model.init_args.agent_embedding": False},
@@ -35,7 +35,7 @@ ROWS: dict[str, dict[str, dict[str, Any] | None]] = {
         "tableA6_independent": {"sampler.noise_sampling": "independent"},
         "tableA6_joint": {},
     },
-    "not a table": {"eq7_one_level_a_token": {"model.init_args.relation_noise": "token"}},
+    "not a table": {"eq7_one_level_a_token": {"model.init_args.pairwise_noise": "token"}},
 }
 """Rows beside the full model, which is duobox_denoiser.yaml in all tables, and all that they change."""
 
@@ -145,7 +145,7 @@ def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -
     assert {key: tokenizer[f"model.init_args.{key}"] for key in sizes} == sizes
     sizes = {"width": 512, "layers": 6, "heads": 8, "mlp_ratio": 4, "level_width": 256, "agent_width": 256}
     assert {key: denoiser[f"model.init_args.{key}"] for key in sizes} == sizes
-    paper = {"rope": "hidden", "agent_embedding": True, "relations": True, "noise_levels": "per_token"}
+    paper = {"rope": "hidden", "agent_embedding": True, "pairwise": True, "noise_levels": "per_token"}
     assert {key: denoiser[f"model.init_args.{key}"] for key in paper} == paper
     assert denoiser["model.init_args.tokenizer"] == f"runs/{name}_tokenizer/latest/checkpoints/best.ckpt"
 

@@ -58,20 +58,20 @@ def test_guidance_and_smoothing_take_a_double_model(kind):
 def test_statistics_and_codes_keep_every_bit(dtype):
     model, other = tiny_denoiser(2), tiny_denoiser(2).to(dtype)
     kept = [name for name, module in model.named_modules() if isinstance(module, Float32)]
-    assert {name.split(".")[-1] for name in kept} == {"pose", "steps", "betas", "codebook", "statistics"}
+    assert {name.split(".")[-1] for name in kept} == {"pose", "steps", "betas", "quantizer", "normalizer"}
     for name in kept:
         theirs = other.get_submodule(name).state_dict()
         for key, value in model.get_submodule(name).state_dict().items():
             assert theirs[key].dtype == value.dtype and torch.equal(theirs[key], value)
     assert {parameter.dtype for parameter in other.parameters()} == {dtype}
-    assert torch.equal(other.float().statistics.mean, model.statistics.mean)
+    assert torch.equal(other.float().normalizer.mean, model.normalizer.mean)
 
 
 def test_what_keeps_its_precision_moves_with_its_model():
     model = tiny_denoiser(2).to("meta", torch.bfloat16)
-    assert {(buffer.device.type, buffer.dtype) for buffer in model.statistics.buffers()} == {
+    assert {(buffer.device.type, buffer.dtype) for buffer in model.normalizer.buffers()} == {
         ("meta", torch.float32),
-        ("meta", torch.int64),
+        ("meta", torch.bool),
     }
 
 

@@ -42,7 +42,7 @@ def test_among_three_each_knows_what_it_may():
     "options",
     [
         SamplerOptions(keep_given=False),
-        SamplerOptions(requantise=False, placement="anchor", blend=0, eta=0.0),
+        SamplerOptions(requantize=False, placement="anchor", blend=0, eta=0.0),
         SamplerOptions(guidance=Guidance("partner")),
         SamplerOptions(guidance=Guidance(smooth=0.01)),
         SamplerOptions(guidance=Guidance("history", stabilization_level=50)),

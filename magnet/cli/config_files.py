@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import yaml
 
 from magnet.cli.errors import CommandError
+from magnet.old_names import renamed_config, told
 
 EXTENDS = "extends"
 """Key under which a file names the files that it changes, relative to itself."""
@@ -47,6 +49,9 @@ def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
     if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
         raise CommandError(f"{file}: {EXTENDS} is {named!r}, expected a file or a list of files")
     before = [layer for name in named for layer in read_layers(str(Path(file).parent / name), (*within, here))]
+    options, changed = renamed_config(options)
+    if changed:
+        print(f"magnet: {file}: {told(changed)}", file=sys.stderr)
     return [*before, Layer(file, options)]
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from magnet.denoiser.losses import masked_mean
 from magnet.motion.frames import partners, pose_features
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, relations_by_frame
+from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
-from magnet.tokenizer.losses import length, matrices, moved, over_ground
+from magnet.tokenizer.losses import length, matrices, moved, world_velocity
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -39,10 +39,10 @@ def decoded_losses(
 ) -> dict[str, Tensor]:
     """`body_losses` on the least noisy scenes of a batch, `decoded_share` of them.
 
-    clean (B, N, P, D) predicted, normalised; tokens the true ones in real units; levels (B, N, P); there as below.
+    clean (B, N, P, D) predicted, normalized; tokens the true ones in real units; levels (B, N, P); there as below.
     """
     signal = alpha_bar(levels)
-    chosen = surest(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
+    chosen = least_noisy(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
     few, kind = scene.select(chosen), model.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
     people, true_pose = few.present, pose_features(few)
@@ -56,7 +56,7 @@ def decoded_losses(
 
     with torch.autocast(kind, enabled=False):
         return body_losses(
-            model.statistics.restore(clean[chosen]),
+            model.normalizer.denormalize(clean[chosen]),
             tokens[chosen],
             true_pose,
             few.betas,
@@ -68,7 +68,7 @@ def decoded_losses(
         )
 
 
-def surest(signal: Tensor, there: Tensor, count: int) -> Tensor:
+def least_noisy(signal: Tensor, there: Tensor, count: int) -> Tensor:
     """The scenes of a batch whose tokens are least noisy: only there a mean is close to a motion.
 
     signal (B, N, P) share of signal, there (B, N, P, G) bool -> (count,) int
@@ -107,8 +107,8 @@ def body_losses(
         the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres. hands: error
         of the vectors from one's own wrists to a partner's that were recorded within reach, metres.
     """
-    latent, steps, relations = layout.unpack(tokens)
-    _, true_steps, true_relations = layout.unpack(truth)
+    latent, steps, pairs = layout.unpack(tokens)
+    _, true_steps, true_pairs = layout.unpack(truth)
     shape = betas[:, None]
     mine = joints(*matrices(decode(latent, betas, steps)), shape)  # (B, T, P, 22, 3)
     real = joints(*matrices(true_pose), shape)
@@ -117,13 +117,13 @@ def body_losses(
     own = counts[..., 0]
     losses = {"pose": masked_mean(weight * _mean_length(mine - real), own)}
 
-    velocity = over_ground(mine, by_frame(steps)) - over_ground(real, by_frame(true_steps))
+    velocity = world_velocity(mine, by_frame(steps)) - world_velocity(real, by_frame(true_steps))
     both = own[:, 1:] & own[:, :-1]
     losses["motion"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
     if layout.slots:
         other = partners(layout.agents, tokens.device)
-        seen = moved(relations_by_frame(relations), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)
-        seen_real = moved(relations_by_frame(true_relations), real[:, :, other])
+        seen = moved(pairwise_by_frame(pairs), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)
+        seen_real = moved(pairwise_by_frame(true_pairs), real[:, :, other])
         least = torch.minimum(weight[..., None], weight[:, :, other])
         losses["partner"] = masked_mean(least * _mean_length(seen - seen_real), counts[..., 1:])
         reach, real_reach = _between_wrists(mine, seen), _between_wrists(real, seen_real)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.motion.frames import partners
-from magnet.motion.tokens import TokenLayout, by_frame, relations_by_frame
+from magnet.motion.tokens import TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
 
 Weighting = Literal["uniform", "min_snr"]
@@ -37,20 +37,20 @@ def token_losses(
 ) -> dict[str, Tensor]:
     """Huber loss of each part of a token, each part averaged by itself (Eq. 9, 10).
 
-    clean, truth (B, N, P, D) normalised; there (B, N, P, 1 + slots) bool, which groups speak of people
+    clean, truth (B, N, P, D) normalized; there (B, N, P, 1 + slots) bool, which groups speak of people
     who are there in valid frames; weights (B, N, P, 1 + slots) of each group's error, None: all 1. 512 latent numbers
     against 36 P transforms: one common mean would drown the transforms.
     """
     error = F.smooth_l1_loss(clean, truth, reduction="none")
     if weights is not None:
         error = error * layout.spread(weights)
-    latent, steps, relations = layout.unpack(error)
+    latent, steps, pairs = layout.unpack(error)
     losses = {
         "latent": masked_mean(latent, there[..., :1]),
         "step": masked_mean(steps.flatten(-2), there[..., :1]),
     }
     if layout.slots:
-        losses["relation"] = masked_mean(relations.flatten(-2), there[..., 1:, None])
+        losses["pairwise"] = masked_mean(pairs.flatten(-2), there[..., 1:, None])
     return losses
 
 
@@ -63,9 +63,9 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     numbers and ground vectors.
     """
     P = layout.agents
-    _, steps, relations = layout.unpack(tokens)
+    _, steps, pairs = layout.unpack(tokens)
     turn, shift = _planar(by_frame(steps))  # (B, T, P, 2) each
-    pair_turn, pair_shift = _planar(relations_by_frame(relations))  # (B, T, P, P - 1, 2)
+    pair_turn, pair_shift = _planar(pairwise_by_frame(pairs))  # (B, T, P, P - 1, 2)
     partner = partners(P, tokens.device)
     own_turn, own_shift = turn[:, 1:, :, None], shift[:, 1:, :, None]
     other_turn, other_shift = turn[:, 1:, partner], shift[:, 1:, partner]

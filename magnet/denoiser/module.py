@@ -19,18 +19,20 @@ from magnet.denoiser.levels import NoiseLevels
 from magnet.denoiser.losses import Weighting
 from magnet.denoiser.objective import training_losses
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
-from magnet.denoiser.statistics import Statistics
+from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.transformer import Rope, Transformer
 from magnet.evaluation.evaluator import Evaluation
 from magnet.generation import rollout
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
+from magnet.old_names import renamed_checkpoint
 from magnet.precision import dtype_of, require_float32_scenes
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.module import RawPose, Tokenizer
+from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
 
-Target = Literal["quantised", "continuous"]
+Target = Literal["quantized", "continuous"]
 
 
 class Denoiser(L.LightningModule):
@@ -51,16 +53,16 @@ class Denoiser(L.LightningModule):
         dropout: in attention and MLPs; the paper does not say.
         level_width: size of the noise-level embedding, paper Table A.2.
         agent_width: size of the agent embedding, paper Table A.2.
-        slot_width: size of the level embedding of each partner slot (ours; see relation_noise).
+        slot_width: size of the level embedding of each partner slot (ours; see pairwise_noise).
         rope: where time enters: `hidden` as in paper Table A.2, `heads` as usual elsewhere, `none` (ablation,
             Table A.5).
         agent_embedding: False takes the agents' identities away (ablation, paper Table A.5).
-        relations: False takes pairwise transforms out of the tokens (ablation, paper Table 5).
+        pairwise: False takes pairwise transforms out of the tokens (ablation, paper Table 5).
         causal_block: token steps of a block of attention: a token sees blocks up to its own, so that what is finished
             is not changed by what is not (ours). 0: everything sees everything, as in the paper.
-        target: what of the pose is generated: `quantised`, the tokenizer's codes, as in the paper, or `continuous`,
+        target: what of the pose is generated: `quantized`, the tokenizer's codes, as in the paper, or `continuous`,
             its encoder's latents before they are snapped to codes (ours); sampling follows.
-        relation_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
+        pairwise_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
             `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
         pairwise_posterior: replaces predicted pairwise transforms by their posterior, given what is shown of them and
             the predicted steps (ours), see `PairwisePosterior`.
@@ -73,7 +75,7 @@ class Denoiser(L.LightningModule):
         own_past: share of the scenes with a past whose past is shown as the model would have made it (ours).
         latent_weight: lambda_0 of paper Eq. 10.
         step_weight: lambda_1 of paper Eq. 10.
-        relation_weight: lambda_2 of paper Eq. 10.
+        pairwise_weight: lambda_2 of paper Eq. 10.
         near_weight: adds the error of pairwise transforms in which centimetres near a partner count (ours); see
             `magnet.denoiser.losses.near_loss`.
         consistency_weight: lambda_3 of paper Eq. 10, for rotation and translation alike.
@@ -84,9 +86,8 @@ class Denoiser(L.LightningModule):
         hands_weight: adds the error of vectors between people's wrists within reach, in metres (ours).
         decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these four.
         start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
-            starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalised.
-        std_floor: smallest standard deviation used for z-scores.
-        pairwise_metres: metres in a pairwise transform that count as one when tokens are normalised (ours): the
+            starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalized.
+        pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
             smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
@@ -110,10 +111,10 @@ class Denoiser(L.LightningModule):
         slot_width: int = 32,
         rope: Rope = "hidden",
         agent_embedding: bool = True,
-        relations: bool = True,
+        pairwise: bool = True,
         causal_block: int = 0,
-        target: Target = "quantised",
-        relation_noise: Literal["noisier_end", "token"] = "noisier_end",
+        target: Target = "quantized",
+        pairwise_noise: Literal["noisier_end", "token"] = "noisier_end",
         pairwise_posterior: bool = False,
         noise_levels: NoiseLevels = "per_token",
         level_shift: float = 1.0,
@@ -122,7 +123,7 @@ class Denoiser(L.LightningModule):
         own_past: float = 0.0,
         latent_weight: float = 1.0,
         step_weight: float = 1.0,
-        relation_weight: float = 1.0,
+        pairwise_weight: float = 1.0,
         near_weight: float = 0.0,
         consistency_weight: float = 0.1,
         consistency_warmup: int = 1000,
@@ -132,7 +133,6 @@ class Denoiser(L.LightningModule):
         hands_weight: float = 0.0,
         decoded_share: float = 0.25,
         start_from: str | None = None,
-        std_floor: float = 1e-2,
         pairwise_metres: float = 0.0,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
@@ -163,8 +163,8 @@ class Denoiser(L.LightningModule):
         """Make the parts whose sizes depend on the tokenizer."""
         h: Any = self.hparams
         self.tokenizer = tokenizer.requires_grad_(False).eval()
-        self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.relations, h.relation_noise)
-        self.statistics = Statistics(self.layout, h.std_floor, h.pairwise_metres)
+        self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.pairwise, h.pairwise_noise)
+        self.normalizer = Normalizer(self.layout.width, floor=0.0)
         self.transformer = Transformer(
             self.layout,
             width=h.width,
@@ -182,9 +182,9 @@ class Denoiser(L.LightningModule):
         self.posterior = PairwisePosterior(self.layout) if h.pairwise_posterior and self.layout.slots else None
 
     @property
-    def quantised(self) -> bool:
+    def quantized(self) -> bool:
         """Whether latents are codes, in training and so in sampling."""
-        return bool(self.hparams["target"] == "quantised")
+        return bool(self.hparams["target"] == "quantized")
 
     @property
     def built(self) -> bool:
@@ -213,6 +213,7 @@ class Denoiser(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
+        checkpoint.update(renamed_checkpoint(checkpoint))
         if "tokenizer_hyper_parameters" not in checkpoint:
             raise ValueError("this is not a denoiser's checkpoint: it carries no tokenizer")
         stored = checkpoint["tokenizer_hyper_parameters"]
@@ -245,18 +246,18 @@ class Denoiser(L.LightningModule):
     # -- what the model does -------------------------------------------------------------------
 
     def encode(self, scene: Scene) -> Tensor:
-        """Latents of those present, codes if `quantised`; invalid frames are not looked at. -> (B, N, P, C) float32
+        """Latents of those present, codes if `quantized`; invalid frames are not looked at. -> (B, N, P, C) float32
 
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         """
-        people = self.tokenizer.encode_scene(scene.people().pad_frames(STRIDE), self.quantised).float()[:, 1:-1, 0]
+        people = self.tokenizer.encode_scene(scene.people().pad_frames(STRIDE), self.quantized).float()[:, 1:-1, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
 
     def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """Predict clean tokens. noisy (B, N, P, D) normalised, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
+        """Predict clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
 
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
@@ -265,12 +266,12 @@ class Denoiser(L.LightningModule):
         if self.posterior is None:
             return clean
         with torch.autocast(noisy.device.type, enabled=False):  # half precision would blur the transforms
-            return self.posterior(clean.float(), noisy.float(), levels, present, self.statistics)
+            return self.posterior(clean.float(), noisy.float(), levels, present, self.normalizer)
 
     def _without_lead(self, tokens: Tensor) -> Tensor:
         lead = slice(self.layout.latent, self.layout.latent + 9)
         identity = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], device=tokens.device)
-        still = (identity - self.statistics.mean[lead]) / self.statistics.std[lead]
+        still = (identity - self.normalizer.mean[lead]) / self.normalizer.std[lead]
         tokens = tokens.clone()
         tokens[:, 0, :, lead] = still.to(tokens.dtype)
         return tokens
@@ -296,10 +297,10 @@ class Denoiser(L.LightningModule):
         require_float32_scenes(self.trainer.precision)
 
     def on_fit_start(self) -> None:
-        if not self.statistics.ready:
+        if not self.normalizer.ready:
             if self.hparams["start_from"]:
                 starting.start_from(self, self.hparams["start_from"])
-            if not self.statistics.ready:
+            if not self.normalizer.ready:
                 self._fit_statistics()
         if self.hparams["compile"]:
             for block in self.transformer.blocks:
@@ -311,9 +312,13 @@ class Denoiser(L.LightningModule):
         datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
         scenes = [scene.to(self.device) for scene in datamodule.statistics_batches()]
         if isinstance(self.tokenizer, RawPose):
-            self.tokenizer.set_statistics(scenes)
+            self.tokenizer.fit_normalizers(scenes)
         parts = [self.tokenize(scene) for scene in scenes]
-        self.statistics.fit(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
+        self.fit_normalizer(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
+
+    def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
+        """Set how tokens are normalized from real ones, as `tokenize` returns them."""
+        self.normalizer.set(*token_statistics(self.layout, tokens, there, self.hparams["pairwise_metres"]))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         generator = step_generator(

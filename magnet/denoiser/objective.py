@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.levels import draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
-from magnet.denoiser.own_past import with_own_past
+from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import add_noise
 
@@ -24,25 +24,25 @@ def training_losses(model: Denoiser, scene: Scene, generator: torch.Generator) -
     layout = model.layout
     with torch.no_grad():
         tokens, there = model.tokenize(scene)
-        truth = model.statistics.normalise(tokens)
+        truth = model.normalizer.normalize(tokens)
         B, N, P, _ = truth.shape
         levels = draw_levels(h.noise_levels, B, N, P, generator, h.level_shift)
         group_levels = layout.group_levels(levels)
         noise = torch.randn(truth.shape, generator=generator, device=truth.device)
         shown = truth
         if model.training and h.own_past:
-            shown = with_own_past(model, truth, levels, scene.pad_agents(P), h.own_past, generator)
+            shown = with_self_forcing(model, truth, levels, scene.pad_agents(P), h.own_past, generator)
         noisy = add_noise(shown, noise, layout.spread(group_levels))
         weights = snr_weights(group_levels, h.snr_most) if h.weighting == "min_snr" else None
     clean = model.denoise(noisy, levels, scene.pad_agents(P).present).float()
     losses = token_losses(clean, truth, layout, there, weights)
     total = h.latent_weight * losses["latent"] + h.step_weight * losses["step"]
     if layout.slots:
-        predicted = model.statistics.restore(clean)
+        predicted = model.normalizer.denormalize(clean)
         rotation, translation = consistency_losses(predicted, layout, there)
         losses["consistency"] = rotation + translation
         ramp = min(1.0, (model.global_step + 1) / max(h.consistency_warmup, 1)) if model.training else 1.0
-        total = total + h.relation_weight * losses["relation"] + ramp * h.consistency_weight * losses["consistency"]
+        total = total + h.pairwise_weight * losses["pairwise"] + ramp * h.consistency_weight * losses["consistency"]
         if h.near_weight:
             losses["near"] = near_loss(predicted, tokens, layout, there, group_levels)
             total = total + h.near_weight * losses["near"]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from magnet.denoiser.statistics import Statistics
 from magnet.motion.frames import partners, turn
 from magnet.motion.pose_graph import Planar, solve_pose_graph
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, relations_by_frame, relations_by_token
+from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
+from magnet.tokenizer.normalizer import Normalizer
 
 KNOTS = 11
 """Noise levels at which a learnt deviation is stored; between them it is interpolated."""
@@ -43,28 +43,28 @@ class PairwisePosterior(nn.Module):
         self.log_step_ground = nn.Parameter(torch.full((KNOTS,), 0.006).log())
         self.log_step_yaw = nn.Parameter(torch.full((KNOTS,), 0.015).log())
 
-    def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, statistics: Statistics) -> Tensor:
+    def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Tensor:
         """The same prediction with better pairwise transforms.
 
         Args:
-            clean: (B, N, P, D) what the network predicts, normalised.
+            clean: (B, N, P, D) what the network predicts, normalized.
             noisy: (B, N, P, D) what it was shown.
             levels: (B, N, P) int.
             present: (B, P) bool; pairs with somebody absent stay as they are.
-            statistics: how tokens are normalised.
+            normalizer: how tokens are normalized.
 
         Returns:
             (B, N, P, D). Everything but pairwise transforms is `clean`'s.
         """
         layout = self.layout
         group_levels = layout.group_levels(levels)
-        latent, steps, predicted = layout.unpack(statistics.restore(clean))
-        shown = shown_clean(noisy, group_levels, layout, statistics)
+        latent, steps, predicted = layout.unpack(normalizer.denormalize(clean))
+        shown = shown_clean(noisy, group_levels, layout, normalizer)
         _, shown_steps, shown_pairs = layout.unpack(shown)
         known = (levels == 0)[..., None, None]
         steps = torch.where(known, shown_steps, steps)
-        fused = self._fused(steps, predicted, shown_pairs, group_levels, present, statistics)
-        packed = statistics.normalise(layout.pack(latent, steps, fused.to(clean.dtype)))
+        fused = self._fused(steps, predicted, shown_pairs, group_levels, present, normalizer)
+        packed = normalizer.normalize(layout.pack(latent, steps, fused.to(clean.dtype)))
         pairs = layout.group_present(present)
         pairs = torch.cat([torch.zeros_like(pairs[..., :1]), pairs[..., 1:]], dim=-1)[:, None]
         return torch.where(layout.spread(pairs), packed, clean)
@@ -76,7 +76,7 @@ class PairwisePosterior(nn.Module):
         shown: Tensor,
         group_levels: Tensor,
         present: Tensor,
-        statistics: Statistics,
+        normalizer: Normalizer,
     ) -> Tensor:
         """Posterior means in 9-D, as tokens hold them. -> (B, N, P, P - 1, 4, 9)"""
         step = planar_of(by_frame(steps))
@@ -89,9 +89,9 @@ class PairwisePosterior(nn.Module):
         # Where the window stands in the world is arbitrary: the first frame's steps tie nobody to anything.
         first = torch.zeros_like(step_yaw[:, :1])
         step_yaw, step_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (step_yaw, step_ground))
-        guess = planar_of(relations_by_frame(predicted))
-        seen = planar_of(relations_by_frame(shown))
-        ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, statistics)
+        guess = planar_of(pairwise_by_frame(predicted))
+        seen = planar_of(pairwise_by_frame(shown))
+        ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, normalizer)
         weights = {
             "yaw": (precision(self._at(self.log_pair_yaw, pair_levels)) * there, precision(yaw_noise) * there),
             "ground": (precision(self._at(self.log_pair_ground, pair_levels)) * there, precision(ground_noise) * there),
@@ -110,7 +110,7 @@ class PairwisePosterior(nn.Module):
         partner = partners(self.layout.agents, steps.device)
         apart = solved_yaw[:, :, partner] - solved_yaw[..., None]
         away = turn(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
-        return relations_by_token(nine_of(apart, away))
+        return pairwise_by_token(nine_of(apart, away))
 
     def _at(self, knots: Tensor, levels: Tensor) -> Tensor:
         """A learnt deviation at some levels. levels (...) int -> (...)"""
@@ -119,13 +119,13 @@ class PairwisePosterior(nn.Module):
         return torch.lerp(knots[low], knots[low + 1], place - low).exp()
 
 
-def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, statistics: Statistics) -> Tensor:
+def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> Tensor:
     """What noisy tokens say of the clean ones without knowing anything else, in real units; at level K nothing."""
     scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)
-    return statistics.restore(noisy / layout.spread(scale))
+    return normalizer.denormalize(noisy / layout.spread(scale))
 
 
-def shown_deviation(pair_levels: Tensor, layout: TokenLayout, statistics: Statistics) -> tuple[Tensor, Tensor]:
+def shown_deviation(pair_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> tuple[Tensor, Tensor]:
     """Standard deviation of what is shown of pairwise transforms. (...) int -> metres (...), radians (...)
 
     A heading is read off four of the nine numbers (`planar_of`): about a turn, their noise of standard deviation s in
@@ -134,7 +134,7 @@ def shown_deviation(pair_levels: Tensor, layout: TokenLayout, statistics: Statis
     alpha = alpha_bar(pair_levels)
     noise = ((1 - alpha) / alpha.clamp_min(1e-6)).sqrt()
     first = layout.latent + 9 * STRIDE
-    std = statistics.std[first : first + 9]
+    std = normalizer.std[first : first + 9]
     cosine, sine = std[[0]].square().mean(), std[[2]].square().mean()
     turning = noise * ((cosine + sine) / 2).sqrt()
     moving = noise * std[[6, 8]].square().mean().sqrt()

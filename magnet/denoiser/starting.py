@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from magnet import weights
+from magnet.denoiser.statistics import with_pairwise_metres
 from magnet.tokenizer.module import RawPose, Tokenizer
 
 if TYPE_CHECKING:
@@ -45,9 +46,9 @@ def denoiser_of(path: str | Path) -> dict[str, Any]:
 
 
 def start_from(model: Denoiser, path: str | Path) -> None:
-    """Take over another denoiser's transformer, and how tokens are normalised where both tokenizers are the same.
+    """Take over another denoiser's transformer, and how tokens are normalized where both tokenizers are the same.
 
-    With another tokenizer latents mean something else, and `model.statistics` is left to be fitted anew.
+    With another tokenizer latents mean something else, and `model.normalizer` is left to be fitted anew.
 
     Raises:
         ValueError: the checkpoint is of a model of other sizes.
@@ -64,15 +65,18 @@ def start_from(model: Denoiser, path: str | Path) -> None:
     theirs, mine = _part(state, "tokenizer."), model.tokenizer.state_dict()
     same = theirs.keys() == mine.keys() and all(torch.equal(value, mine[name].cpu()) for name, value in theirs.items())
     if same:
-        model.statistics.load_state_dict(_part(state, "statistics."))
+        model.normalizer.load_state_dict(_part(state, "normalizer."))
         _rescale(model)
 
 
 @torch.no_grad()
 def _rescale(model: Denoiser) -> None:
     """Another scale of pairwise transforms, with weights that make the same of it."""
-    grown = model.statistics.set_pairwise_metres()
-    first, last = model.transformer.enter[0], model.transformer.leave
+    before = model.normalizer.std.clone()
+    after = with_pairwise_metres(model.layout, before, model.hparams["pairwise_metres"])
+    model.normalizer.std.copy_(after)
+    grown = after / before
+    first, last = model.transformer.in_proj[0], model.transformer.out_proj
     assert isinstance(first, nn.Linear)
     first.weight[:, : len(grown)].mul_(grown)
     last.weight.div_(grown[:, None])

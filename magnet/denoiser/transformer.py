@@ -134,7 +134,7 @@ class Transformer(nn.Module):
         self.slot_width = slot_width
         self.agent = nn.Parameter(torch.randn(layout.agents, agent_width) * 0.02) if agent_embedding else None
         enter = layout.width + level_width + layout.slots * slot_width + (agent_width if agent_embedding else 0)
-        self.enter = nn.Sequential(
+        self.in_proj = nn.Sequential(
             *(nn.Linear(enter, width), nn.LayerNorm(width), nn.GELU()),
             *(nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()),
             *(nn.Linear(width, width), nn.LayerNorm(width)),
@@ -142,13 +142,13 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(
             Block(width, heads, mlp_ratio, dropout, rope_heads=rope == "heads") for _ in range(layers)
         )
-        self.leave = nn.Linear(width, layout.width)
+        self.out_proj = nn.Linear(width, layout.width)
         self.register_buffer("groups", layout.groups(), persistent=False)
 
     groups: Tensor
 
     def forward(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """noisy (B, N, P, D) normalised, levels (B, N, P) int in 0..K, present (B, P) bool -> (B, N, P, D)
+        """noisy (B, N, P, D) normalized, levels (B, N, P) int in 0..K, present (B, P) bool -> (B, N, P, D)
 
         Absent agents are not looked at, so they change nothing; their own output is meaningless.
         """
@@ -161,7 +161,7 @@ class Transformer(nn.Module):
             parts.append(sinusoids(group_levels[..., 1:], self.slot_width).flatten(-2).to(noisy.dtype))
         if self.agent is not None:
             parts.append(self.agent.to(noisy.dtype).expand(B, N, P, -1))
-        return self.leave(self._blocks(self.enter(torch.cat(parts, dim=-1)), present))
+        return self.out_proj(self._blocks(self.in_proj(torch.cat(parts, dim=-1)), present))
 
     def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
         """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)"""

@@ -104,7 +104,7 @@ class _Gltf:
         component: int,
         kind: str,
         target: int | None = None,
-        normalised: bool = False,
+        normalized: bool = False,
         bounds: bool = False,
     ) -> int:
         """Put numbers into the buffer. (N,) or (N, C) -> number of the accessor"""
@@ -117,7 +117,7 @@ class _Gltf:
             "count": len(array),
             "type": kind,
         }
-        if normalised:
+        if normalized:
             item["normalized"] = True
         if bounds:
             flat = array.reshape(len(array), -1)
@@ -132,7 +132,7 @@ class _Gltf:
         return {
             "indices": self.accessor(faces.reshape(-1), wide, "SCALAR", INDICES),
             "JOINTS_0": self.accessor(joints, BYTE, "VEC4", VERTEX_DATA),
-            "WEIGHTS_0": self.accessor(weights, SHORT, "VEC4", VERTEX_DATA, normalised=True),
+            "WEIGHTS_0": self.accessor(weights, SHORT, "VEC4", VERTEX_DATA, normalized=True),
         }
 
     def shape_of(self, body: Skinned, betas: Tensor) -> dict[str, int]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
 from magnet.motion.scene import Scene, empty_scene
-from magnet.motion.tokens import STRIDE, by_token, relations_by_token
+from magnet.motion.tokens import STRIDE, by_token, pairwise_by_token
 from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
@@ -45,7 +45,7 @@ class SamplerOptions:
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
             (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
-        requantise: snap generated latents to the nearest code before they are decoded and built on, as the reference
+        requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
             does. None: if codes are what the model was trained to generate (`target` of the denoiser).
         keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
@@ -66,7 +66,7 @@ class SamplerOptions:
     pyramid_offset: int | None = None
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
-    requantise: bool | None = None
+    requantize: bool | None = None
     keep_given: bool = True
     blend: int = 10
     eta: float = 1.0
@@ -236,8 +236,8 @@ def known_tokens(
         if start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
         steps[:, start:stop, agents] = own
-    relations = relations_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
-    return model.statistics.normalise(model.layout.pack(latent, steps, relations))
+    pairs = pairwise_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
+    return model.normalizer.normalize(model.layout.pack(latent, steps, pairs))
 
 
 def encodings(

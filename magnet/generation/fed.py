@@ -31,8 +31,8 @@ class FedStream(Stream):
         generator: source of randomness, on the model's device.
 
     Raises:
-        ValueError: the task reads ahead, or its plan does not repeat itself; the model was trained with relations that
-            tell of people who are not known; or a past that `magnet.generation.inputs` refuses.
+        ValueError: the task reads ahead, or its plan does not repeat itself; the model was trained with pairwise
+            transforms that tell of people who are not known; or a past that `magnet.generation.inputs` refuses.
     """
 
     fed = True
@@ -46,10 +46,10 @@ class FedStream(Stream):
         generator: Generators = None,
     ) -> None:
         model.require_tokenizer()
-        if model.layout.relation_noise == "token":
+        if model.layout.pairwise_noise == "token":
             raise ValueError(
-                "relation_noise='token': tokens of those who are given tell where the others are, and nobody knows "
-                "that live; train with relation_noise='noisier_end'"
+                "pairwise_noise='token': tokens of those who are given tell where the others are, and nobody knows "
+                "that live; train with pairwise_noise='noisier_end'"
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, PIECE)

@@ -28,7 +28,7 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
             or counts that are none.
     """
     model.require_tokenizer()
-    if not model.statistics.ready:
+    if not model.normalizer.ready:
         raise ValueError("the denoiser has never been trained: its statistics are not set; load a checkpoint")
     require_whole("context", context, 0)
     if context % STRIDE:

@@ -214,7 +214,7 @@ def preview(
 ) -> Scene:
     """A window as the model expects it to end, placed in the world; the canvas stays as it is.
 
-    tokens (1, N, P, D), estimate (1, W, P, D) normalised, wanted (W, P) bool: ever to be generated; decentralized as
+    tokens (1, N, P, D), estimate (1, W, P, D) normalized, wanted (W, P) bool: ever to be generated; decentralized as
     for `Canvas.make_consistent`. -> W frames
     """
     shown = copy.copy(canvas)

@@ -157,9 +157,9 @@ class Stream:
         if frames is not None and bool(self.known[past:].any()):
             free = layout.agents - grid.agents
             self.cuts = torch.nn.functional.pad(task_sight(task, grid), (0, free), value=grid.tokens)
-        # The paper read literally: a known token holds its relations to everybody, also to those not known. It leaks.
+        # The paper read literally: a known token holds its pairs to everybody, also to those not known. It leaks.
         self.related: Tensor | None = None
-        if layout.relation_noise == "token":
+        if layout.pairwise_noise == "token":
             self.related = torch.zeros_like(self.known)
             self.related[: scene.frames // STRIDE] = True
         check_given(self.scene, self.known, o.any_floor)

@@ -112,7 +112,7 @@ def bodies(
     model, options = canvas.model, canvas.options
     lead = LEAD if first else 0
     low = max(first - bool(first) - reach(model)[0], 0)
-    latent, steps, _ = model.layout.unpack(model.statistics.restore(tokens[:, low:near]))
+    latent, steps, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
     if expected is not None:
         later, ways = continuation(canvas, latent, steps, expected)
         latent, steps = torch.cat([latent, later], dim=1), torch.cat([steps, ways], dim=1)
@@ -134,7 +134,7 @@ def continuation(
     """Latents and steps to decode behind the last ones; whoever nothing is expected of goes on as in the last token."""
     tokens, told = expected
     told = told.to(latent.device)
-    later, ways, _ = canvas.model.layout.unpack(canvas.model.statistics.restore(tokens))
+    later, ways, _ = canvas.model.layout.unpack(canvas.model.normalizer.denormalize(tokens))
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])
     return later, torch.where(told[:, None, None], ways, steps[:, -1:])

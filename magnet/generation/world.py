@@ -27,7 +27,7 @@ from magnet.motion.frames import (
     to_9d,
 )
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE, by_frame, by_token, relations_by_frame, relations_by_token
+from magnet.motion.tokens import STRIDE, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.schedule import MaskSchedule
 
 if TYPE_CHECKING:
@@ -83,9 +83,9 @@ class SamplingStats:
         self.quantization_error_sum += float(away.sum())
         self.quantization_errors += len(away)
 
-    def add_pairwise_drift(self, relations: Tensor, implied: Tensor, counts: Tensor) -> None:
-        """relations, implied (B, n, P, slots, 4, 9), counts (B, n, P, slots) bool"""
-        away = (relations - implied)[..., 6:].norm(dim=-1).mean(dim=-1)[counts]
+    def add_pairwise_drift(self, pairs: Tensor, implied: Tensor, counts: Tensor) -> None:
+        """pairs, implied (B, n, P, slots, 4, 9), counts (B, n, P, slots) bool"""
+        away = (pairs - implied)[..., 6:].norm(dim=-1).mean(dim=-1)[counts]
         self.pairwise_drift_sum += float(away.sum())
         self.pairwise_drifts += len(away)
 
@@ -156,22 +156,22 @@ class Canvas:
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
             return canvas
-        layout, statistics = self.model.layout, self.model.statistics
+        layout, normalizer = self.model.layout, self.model.normalizer
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        latent, steps, relations = layout.unpack(statistics.restore(canvas[:, first:stop]))
-        if self.model.quantised if self.options.requantise is None else self.options.requantise:
+        latent, steps, pairs = layout.unpack(normalizer.denormalize(canvas[:, first:stop]))
+        if self.model.quantized if self.options.requantize is None else self.options.requantize:
             new = finished[first:stop].to(canvas.device)
-            code = self.model.tokenizer.requantise(latent)
+            code = self.model.tokenizer.requantize(latent)
             self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
-        moved = self._place_all(steps, relations if layout.slots else None, finished, first, stop, placement)
+        moved = self._place_all(steps, pairs if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
-            earlier = layout.unpack(statistics.restore(canvas[:, begin:first]))[0]
+            earlier = layout.unpack(normalizer.denormalize(canvas[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
         true_steps = self._steps(begin, stop)
-        implied = relations_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
+        implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
         settled = layout.pack(latent, true_steps, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
         if layout.slots:
@@ -179,9 +179,9 @@ class Canvas:
             if decentralized:
                 new = finished[first:stop].to(canvas.device)
                 together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
-            self.stats.add_pairwise_drift(relations, implied[:, first - begin :], together)
+            self.stats.add_pairwise_drift(pairs, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
-        canvas[:, begin:stop] = torch.where(changed, statistics.normalise(settled), canvas[:, begin:stop])
+        canvas[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), canvas[:, begin:stop])
         return self._enter(canvas, begin, stop)
 
     def _steps(self, first: int, stop: int) -> Tensor:
@@ -202,9 +202,9 @@ class Canvas:
         entered[0] = False  # nothing in front of these rows has moved
         if not bool(entered.any()):
             return canvas
-        layout, statistics = self.model.layout, self.model.statistics
-        latent, _, relations = layout.unpack(canvas[:, first:until])
-        true = statistics.normalise(layout.pack(latent, self._steps(first, until), relations))
+        layout, normalizer = self.model.layout, self.model.normalizer
+        latent, _, pairs = layout.unpack(canvas[:, first:until])
+        true = normalizer.normalize(layout.pack(latent, self._steps(first, until), pairs))
         number = torch.arange(layout.width, device=canvas.device)
         step = (number >= layout.latent) & (number < layout.latent + 9)
         canvas[:, first:until] = torch.where(entered[..., None] & step, true, canvas[:, first:until])
@@ -228,7 +228,7 @@ class Canvas:
     def _place_all(
         self,
         steps: Tensor,
-        relations: Tensor | None,
+        pairs: Tensor | None,
         finished: Tensor,
         first: int,
         stop: int,
@@ -239,23 +239,23 @@ class Canvas:
         for start, end in spans(finished, self.placed, first, stop):
             part = slice(start - first, end - first)
             new = finished[start]
-            pairs = None if relations is None else relations[:, part]
-            self._place(steps[:, part], pairs, start, end, new, placement)
+            near = None if pairs is None else pairs[:, part]
+            self._place(steps[:, part], near, start, end, new, placement)
             self.placed[start:end] |= new
             moved |= self._arrive(end, new)
         return moved
 
     def _place(
-        self, steps: Tensor, relations: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
+        self, steps: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
     ) -> None:
-        """Put newly generated agents into the world from their predicted steps and relations. new (P,) bool"""
+        """Put newly generated agents into the world from their predicted steps and pairs. new (P,) bool"""
         new = new.to(steps.device)
         known = self.placed[first].to(steps.device)
         true_steps = from_9d(by_frame(self._steps(first, stop)))
         T_prev_can = torch.where(known[:, None, None], true_steps, project_se2(from_9d(by_frame(steps))))
         T_self_partner = None
-        if relations is not None:
-            T_self_partner = from_9d(relations_by_frame(relations))
+        if pairs is not None:
+            T_self_partner = from_9d(pairwise_by_frame(pairs))
         there = self.given.present & (known | new)  # of others, nothing is known here
         placed = place(
             T_prev_can,
@@ -362,7 +362,7 @@ class Canvas:
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
         behind, ahead = reach(self.model)
         near = slice(max(low - behind, 0), high + ahead)
-        latent, steps, _ = layout.unpack(self.model.statistics.restore(canvas[:, near]))
+        latent, steps, _ = layout.unpack(self.model.normalizer.denormalize(canvas[:, near]))
         features = self.model.tokenizer.decode(latent, self.given.betas, steps)
         frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
         given = self.given.slice(low * STRIDE, high * STRIDE)

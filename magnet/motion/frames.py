@@ -226,7 +226,7 @@ def place(
             transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
             the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
         pairwise_weight: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
-        present: (B, P) bool; relations to absent agents are not read. None: all are there.
+        present: (B, P) bool; pairs to absent agents are not read. None: all are there.
         fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
         anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
 

@@ -31,12 +31,12 @@ class TokenLayout:
 
     latent: int = 512
     agents: int = 2
-    relations: bool = True  # False: tokens carry no pairwise transforms (paper Table 5)
-    relation_noise: Literal["noisier_end", "token"] = "noisier_end"  # "token" is the paper read literally; it leaks
+    pairwise: bool = True  # False: tokens carry no pairwise transforms (paper Table 5)
+    pairwise_noise: Literal["noisier_end", "token"] = "noisier_end"  # "token" is the paper read literally; it leaks
 
     @property
     def slots(self) -> int:
-        return self.agents - 1 if self.relations else 0
+        return self.agents - 1 if self.pairwise else 0
 
     @property
     def width(self) -> int:
@@ -49,15 +49,15 @@ class TokenLayout:
         return torch.arange(len(sizes), device=device).repeat_interleave(torch.tensor(sizes, device=device))
 
     def group_levels(self, levels: Tensor) -> Tensor:
-        """Noise level of each group: a relation is as noisy as its noisier end. (..., P) -> (..., P, 1 + slots)
+        """Noise level of each group: pairwise ones are as noisy as their noisier end. (..., P) -> (..., P, 1 + slots)
 
-        Otherwise a clean token would give away where its unknown partner is: `relation_noise="token"`
+        Otherwise a clean token would give away where its unknown partner is: `pairwise_noise="token"`
         does that, for comparison.
         """
         own = levels[..., None]
         if not self.slots:
             return own
-        if self.relation_noise == "token":
+        if self.pairwise_noise == "token":
             return own.expand(*levels.shape, 1 + self.slots)
         return torch.cat([own, torch.maximum(own, levels[..., partners(self.agents, levels.device)])], dim=-1)
 
@@ -72,18 +72,18 @@ class TokenLayout:
         """One value a group to one value a number. (..., 1 + slots) -> (..., D)"""
         return grouped[..., self.groups(grouped.device)]
 
-    def pack(self, latent: Tensor, steps: Tensor, relations: Tensor) -> Tensor:
+    def pack(self, latent: Tensor, steps: Tensor, pairs: Tensor) -> Tensor:
         """(B, N, P, C), (B, N, P, 4, 9), (B, N, P, P - 1, 4, 9) -> (B, N, P, D)"""
         parts = [latent, steps.flatten(-2)]
         if self.slots:
-            parts.append(relations.flatten(-3))
+            parts.append(pairs.flatten(-3))
         return torch.cat(parts, dim=-1)
 
     def unpack(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Inverse of `pack`; without relations the last one has no slots."""
+        """Inverse of `pack`; without pairs the last one has no slots."""
         sizes = [self.latent, 9 * STRIDE, 9 * STRIDE * self.slots]
-        latent, steps, relations = tokens.split(sizes, dim=-1)
-        return latent, steps.unflatten(-1, (STRIDE, 9)), relations.unflatten(-1, (self.slots, STRIDE, 9))
+        latent, steps, pairs = tokens.split(sizes, dim=-1)
+        return latent, steps.unflatten(-1, (STRIDE, 9)), pairs.unflatten(-1, (self.slots, STRIDE, 9))
 
 
 def by_token(frames: Tensor) -> Tensor:
@@ -115,14 +115,14 @@ def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
 
 def transforms(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
     """Steps and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
-    return by_token(to_9d(canonical_steps(T_world_can))), relations_by_token(to_9d(pairwise(T_world_can)))
+    return by_token(to_9d(canonical_steps(T_world_can))), pairwise_by_token(to_9d(pairwise(T_world_can)))
 
 
-def relations_by_token(pairs: Tensor) -> Tensor:
+def pairwise_by_token(pairs: Tensor) -> Tensor:
     """Group pairwise numbers of frames into tokens. (B, T, P, P - 1, 9) -> (B, N, P, P - 1, 4, 9)"""
     return by_token(pairs.flatten(-2)).unflatten(-1, pairs.shape[-2:]).transpose(-3, -2)
 
 
-def relations_by_frame(relations: Tensor) -> Tensor:
-    """Inverse of `relations_by_token`. (B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 9)"""
-    return relations.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)
+def pairwise_by_frame(pairs: Tensor) -> Tensor:
+    """Inverse of `pairwise_by_token`. (B, N, P, P - 1, 4, 9) -> (B, T, P, P - 1, 9)"""
+    return pairs.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)

@@ -16,7 +16,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pyramid_offset": 0,  # 3.3: segment by segment
         "placement": "integrate",  # the paper predicts steps and integrates them
         "pairwise_weight": 0.02,  # not read by `integrate`
-        "requantise": True,  # 3.1: what is decoded are codes
+        "requantize": True,  # 3.1: what is decoded are codes
         "keep_given": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM

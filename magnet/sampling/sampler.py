@@ -48,8 +48,8 @@ def sample(
     Args:
         denoise: the model.
         schedule: the plan.
-        tokens: (B, N, P, D) normalised tokens. Only those the schedule knows are read, and of those only
-            relations whose both ends are known; the rest may hold anything.
+        tokens: (B, N, P, D) normalized tokens. Only those the schedule knows are read, and of those only
+            pairs whose both ends are known; the rest may hold anything.
         present: (B, P) bool.
         layout: which numbers of a token share a level.
         generator: source of all noise, on the tokens' device; or one for each scene, see `NoiseStream`.
@@ -176,7 +176,7 @@ def _predict_in_views(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Each agent's tokens are predicted in its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
-    Agents that see the same share a view. A relation to somebody hidden is unknown too; it is predicted in that
+    Agents that see the same share a view. One to somebody hidden is unknown too; it is predicted in that
     agent's view if that one sees both, or else stays noise.
 
     Returns:

@@ -23,7 +23,7 @@ DRIFT_FRAMES = 6.0
 """Over how many frames a drift keeps its direction; what sampled feet slid by was nearly straight over ten."""
 
 
-def exchange_limbs(scene: Scene, probability: float, generator: torch.Generator) -> Scene:
+def swap_limbs(scene: Scene, probability: float, generator: torch.Generator) -> Scene:
     """Give each limb of each person, with a probability, the motion of that limb of somebody else in the batch.
 
     A few minutes of dance hold few pairs of an upper and a lower body; a pose coder should not learn which.
@@ -42,7 +42,7 @@ def exchange_limbs(scene: Scene, probability: float, generator: torch.Generator)
     return scene.replace(body_rot=mixed.unflatten(0, (B, P)).transpose(1, 2))
 
 
-def turn_joints(scene: Scene, angle: float, generator: torch.Generator) -> Scene:
+def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene:
     """Turn each joint of each person by a random rotation of its own, the same in all frames.
 
     Args:
@@ -60,7 +60,7 @@ def turn_joints(scene: Scene, angle: float, generator: torch.Generator) -> Scene
     )
 
 
-def drift(steps: Tensor, speed: float, generator: torch.Generator) -> Tensor:
+def root_noise(steps: Tensor, speed: float, generator: torch.Generator) -> Tensor:
     """Steps that lead people astray over the ground, slowly and each in another way, as sampled steps do.
 
     Args:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet import weights
+from magnet.old_names import renamed_checkpoint
 
 SHAPING = ("latent", "hidden", "codes", "levels", "depth", "causal")
 """Fields that decide the shape of the weights, or what they mean."""
@@ -32,6 +33,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
             checkpoint = weights.read(path)
         else:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+        checkpoint = renamed_checkpoint(checkpoint)
         fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
     except Exception as error:  # whatever a damaged or foreign file makes torch raise
         reason = str(error).strip().split("\n")[0]

@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet.motion.frames import canonical_frame, pose_features, posed
 from magnet.motion.scene import Scene, require_rate
 from magnet.motion.tokens import STRIDE, scene_steps
-from magnet.tokenizer.codebook import sum_over_processes
+from magnet.tokenizer.quantizer import sum_over_processes
 
 
 @dataclass(frozen=True)

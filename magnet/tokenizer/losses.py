@@ -26,7 +26,7 @@ BODY = 21 * 6
 """Where the 21 joint rotations of a pose end and T_can_root begins."""
 
 
-def proper(pose: Tensor) -> Tensor:
+def orthonormalize(pose: Tensor) -> Tensor:
     """The pose with true rotations in its 6-D numbers and the pelvis above its canonical frame. (..., 135) -> same"""
     rotations = torch.cat([pose[..., :BODY], pose[..., BODY : BODY + 6]], dim=-1).unflatten(-1, (22, 6))
     rotations = from_6d(rotations)[..., :2].transpose(-1, -2).flatten(-3)
@@ -92,7 +92,7 @@ def reconstruction_losses(
         losses["velocity"] = masked_mean(slip, both)
         losses["foot"] = masked_mean(slip[..., FEET], both)
         if steps is not None and true_steps is not None:
-            slide = (over_ground(mine, steps) - over_ground(real, true_steps))[..., TOES, :]
+            slide = (world_velocity(mine, steps) - world_velocity(real, true_steps))[..., TOES, :]
             losses["stance"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_steps))
     return losses
 
@@ -112,7 +112,7 @@ def moved(nine: Tensor, points: Tensor) -> Tensor:
     return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
-def over_ground(joints: Tensor, steps: Tensor) -> Tensor:
+def world_velocity(joints: Tensor, steps: Tensor) -> Tensor:
     """Way of joints from frame to frame in the world, as seen from the canonical frame before.
 
     (B, T, P, 22, 3) in canonical frames, (B, T, P, 9) -> (B, T - 1, P, 22, 3) metres
@@ -124,5 +124,5 @@ def standing(joints: Tensor, steps: Tensor) -> Tensor:
     """Which toes stand from a frame to the next, being low and slow. Arguments as above -> (B, T - 1, P, 2) bool"""
     height, speed = STANDS
     low = joints[..., TOES, 1] < height
-    slow = FPS * over_ground(joints, steps)[..., TOES, :].norm(dim=-1) < speed
+    slow = FPS * world_velocity(joints, steps)[..., TOES, :].norm(dim=-1) < speed
     return low[:, 1:] & low[:, :-1] & slow

@@ -16,13 +16,14 @@ from torchmetrics import MeanMetric
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_token
+from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
-from magnet.tokenizer.augment import drift, exchange_limbs, turn_joints
+from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
 from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
-from magnet.tokenizer.codebook import KMEANS_VECTORS, Codebook, Quantised
 from magnet.tokenizer.features import Features, features, fold, put, statistics, step_known, unfold
-from magnet.tokenizer.losses import masked_mean, matrices, proper, reconstruction_losses
+from magnet.tokenizer.losses import masked_mean, matrices, orthonormalize, reconstruction_losses
+from magnet.tokenizer.quantizer import KMEANS_VECTORS, Quantized, ResidualVQ
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_level
 from magnet.tokenizer.vqvae import VQVAE
@@ -68,7 +69,6 @@ class Tokenizer(L.LightningModule):
             whose encoder and decoder training starts from; codes start anew where there is another number of them.
         decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
             trained on them takes the new decoder as it is.
-        std_floor: smallest standard deviation used for z-scores of poses and steps.
         learning_rate: paper A.3.
         weight_decay: paper A.3.
         warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
@@ -99,7 +99,6 @@ class Tokenizer(L.LightningModule):
         turn_joints: float = 0.0,
         start_from: str | None = None,
         decoder_only: bool = False,
-        std_floor: float = 1e-2,
         learning_rate: float = 2e-4,
         weight_decay: float = 1e-4,
         warmup_steps: int = 0,
@@ -111,8 +110,8 @@ class Tokenizer(L.LightningModule):
         # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
         self.save_hyperparameters(fields)
         self.latent = latent
-        self.vqvae = VQVAE(POSE_FEATURES, latent, hidden, depth, causal, STRIDE, std_floor)
-        self.codebook = Codebook(codes, latent, levels, decay, revive_below)
+        self.vqvae = VQVAE(POSE_FEATURES, latent, hidden, depth, causal, STRIDE)
+        self.quantizer = ResidualVQ(codes, latent, levels, decay, revive_below)
         self.body: Body | None = None
         self.mpjpe = MeanMetric()
         self.local_mpjpe = MeanMetric()
@@ -121,22 +120,22 @@ class Tokenizer(L.LightningModule):
     # -- using it ------------------------------------------------------------------------------
 
     def encode(
-        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantise: bool = True
+        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
-        """Quantised latents, summed over levels.
+        """Quantized latents, summed over levels.
 
         Args:
             pose: (B, T, P, 135), T a multiple of 4.
             betas: (B, P, 10).
             steps: (B, T, P, 9), the identity at the first frame.
             valid: (B, T) bool, frames that may be looked at; None: all.
-            quantise: False: the encoder's latents as they are.
+            quantize: False: the encoder's latents as they are.
 
         Returns:
             (B, N, P, C) float32.
         """
         embedded = self._embed(pose, betas, steps, valid)
-        return self.codebook.nearest(embedded) if quantise else embedded.float()
+        return self.quantizer.nearest(embedded) if quantize else embedded.float()
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
         """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
@@ -155,14 +154,14 @@ class Tokenizer(L.LightningModule):
             parts.append(frames[:, (start - first) * STRIDE : (start - first + window) * STRIDE])
         return torch.cat(parts, dim=1)
 
-    def requantise(self, latent: Tensor) -> Tensor:
+    def requantize(self, latent: Tensor) -> Tensor:
         """The code nearest to each latent; with several levels, their sum. (..., C) -> same"""
-        return self.codebook.nearest(latent)
+        return self.quantizer.nearest(latent)
 
-    def encode_scene(self, scene: Scene, quantise: bool = True) -> Tensor:
+    def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
         """Latents of a scene, cut to whole tokens; frames that are not valid are not looked at."""
         seen = features(scene)
-        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid, quantise)
+        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid, quantize)
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
@@ -188,17 +187,17 @@ class Tokenizer(L.LightningModule):
         known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
         pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
         with torch.autocast(pose.device.type, enabled=False):
-            return proper(unfold(pose, latent))
+            return orthonormalize(unfold(pose, latent))
 
     # -- statistics and start ------------------------------------------------------------------
 
-    def set_statistics(self, scenes: Iterable[Scene]) -> None:
+    def fit_normalizers(self, scenes: Iterable[Scene]) -> None:
         """z-scores of poses, steps and shapes from scenes; kept in the checkpoint."""
         for name, (mean, std) in statistics(scenes).items():
             getattr(self.vqvae, name).set(mean, std)
 
     @torch.no_grad()
-    def prepare(self, scenes: Iterable[Scene]) -> None:
+    def init_codebook(self, scenes: Iterable[Scene]) -> None:
         """Statistics, then the k-means start of the codebook, from the first training batches; once only."""
         some = []
         for number, scene in enumerate(scenes):
@@ -206,16 +205,16 @@ class Tokenizer(L.LightningModule):
             if number + 1 == STATISTICS_BATCHES:
                 break
         if not self.vqvae.pose.ready:
-            self.set_statistics(some)
-        if self.codebook.started:
+            self.fit_normalizers(some)
+        if self.quantizer.initialized:
             return
         vectors: list[Tensor] = []
         for scene in some:
             seen = features(scene)
             vectors.append(self._embed(seen.pose, seen.betas, seen.steps, seen.valid)[seen.tokens])
-            if sum(map(len, vectors)) >= KMEANS_VECTORS * self.codebook.size:
+            if sum(map(len, vectors)) >= KMEANS_VECTORS * self.quantizer.size:
                 break
-        self.codebook.start(torch.cat(vectors), self._generator("start"))
+        self.quantizer.kmeans_init(torch.cat(vectors), self._generator("start"))
 
     def _generator(self, *what: int | str) -> torch.Generator:
         return torch.Generator(device=self.device).manual_seed(derive(self.hparams["seed"], *what))
@@ -232,26 +231,26 @@ class Tokenizer(L.LightningModule):
             self.body = load_body() if body is None else copy.deepcopy(body)
 
     @property
-    def _prepared(self) -> bool:
-        return bool(self.codebook.started) and bool(self.vqvae.pose.ready)
+    def _initialized(self) -> bool:
+        return bool(self.quantizer.initialized) and bool(self.vqvae.pose.ready)
 
     def on_fit_start(self) -> None:
-        if self.hparams["start_from"] and not self._prepared:
+        if self.hparams["start_from"] and not self._initialized:
             self._start_from(self.hparams["start_from"])
         if self.hparams["decoder_only"]:
-            if not self._prepared:
+            if not self._initialized:
                 raise ValueError("decoder_only: there are no codes to decode yet; give start_from a trained tokenizer")
-            self.codebook.frozen = True
+            self.quantizer.frozen = True
         batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
-        if not self._prepared and batches is not None:
-            self.prepare(batches())
+        if not self._initialized and batches is not None:
+            self.init_codebook(batches())
         if self.hparams["compile"]:
             self.vqvae.encoder.compile()
             self.vqvae.decoder.compile()
 
     def on_train_start(self) -> None:
-        if not self._prepared:
-            self.prepare(self.trainer.train_dataloader)  # type: ignore[arg-type]
+        if not self._initialized:
+            self.init_codebook(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
     def _start_from(self, path: str | Path) -> None:
         """Take over another tokenizer's networks and statistics, and its codes where there are as many."""
@@ -260,48 +259,48 @@ class Tokenizer(L.LightningModule):
         kept = {name: value for name, value in state.items() if name in mine and mine[name].shape == value.shape}
         if lost := [name for name in mine if name.startswith("vqvae.") and name not in kept]:
             raise ValueError(f"start_from: {path} has other networks than this tokenizer: {lost[0]} does not fit")
-        if "codebook.codes" not in kept:
-            kept = {name: value for name, value in kept.items() if not name.startswith("codebook.")}
+        if "quantizer.codes" not in kept:
+            kept = {name: value for name, value in kept.items() if not name.startswith("quantizer.")}
         self.load_state_dict(kept, strict=False)
 
     def _augmented(self, scene: Scene, batch_idx: int) -> Scene:
         h = self.hparams
         generator = self._generator("augment", self.global_step, batch_idx)
         if h["exchange_limbs"]:
-            scene = exchange_limbs(scene, h["exchange_limbs"], generator)
-        return turn_joints(scene, h["turn_joints"], generator) if h["turn_joints"] else scene
+            scene = swap_limbs(scene, h["exchange_limbs"], generator)
+        return joint_noise(scene, h["turn_joints"], generator) if h["turn_joints"] else scene
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         batch = self._augmented(batch, batch_idx)
         seen = features(batch)
-        losses, pose, quantised = self._losses(seen, batch_idx)
+        losses, pose, quantized = self._losses(seen, batch_idx)
         if self._trainer is not None:
             self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
             if self.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-                logged |= {f"train/{name}": value for name, value in by_level(quantised.counts).items()}
+                logged |= {f"train/{name}": value for name, value in by_level(quantized.counts).items()}
                 scenes = slice(0, GLANCE)
                 error, _ = self._joint_errors(pose.detach()[scenes], batch.select(scenes))
                 logged["train/mpjpe_cm"] = 100 * masked_mean(error, seen.counts[scenes])
             self.log_dict(logged, batch_size=batch.scenes)
         return losses["loss"]
 
-    def _losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantised]:
+    def _losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
         h = self.hparams
         with torch.set_grad_enabled(torch.is_grad_enabled() and not h["decoder_only"]):
             embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
-        quantised = self.codebook(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
+        quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         steps = seen.steps
         if self.training and h["drift"]:
-            steps = drift(steps, h["drift"], self._generator("drift", self.global_step, batch_idx))
-        pose = self._reconstruct(quantised.latent, seen.betas, by_token(steps), seen.valid)
+            steps = root_noise(steps, h["drift"], self._generator("drift", self.global_step, batch_idx))
+        pose = self._reconstruct(quantized.latent, seen.betas, by_token(steps), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
             bodies = any(h[f"{name}_weight"] for name in ("joint", "velocity", "foot", "stance"))
             joints = self._canonical_joints(seen) if bodies else None
             losses = reconstruction_losses(pose, seen.pose, seen.counts, joints, steps, seen.steps)
-        losses["commitment"] = quantised.commitment
-        return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantised
+        losses["commitment"] = quantized.commitment
+        return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantized
 
     def _canonical_joints(self, seen: Features):  # type: ignore[no-untyped-def]
         body = self._require_body()
@@ -336,12 +335,12 @@ class Tokenizer(L.LightningModule):
 
     def _evaluate(self, batch: Scene, stage: str) -> None:
         seen = features(batch)
-        losses, pose, quantised = self._losses(seen)
+        losses, pose, quantized = self._losses(seen)
         world, local = self._joint_errors(pose, batch)
         weight = seen.counts.sum()
         self.mpjpe.update(100 * masked_mean(world, seen.counts), weight)
         self.local_mpjpe.update(100 * masked_mean(local, seen.counts), weight)
-        self.code_use.update(quantised.counts)
+        self.code_use.update(quantized.counts)
         logged = {f"{stage}/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True)
         self.log(f"{stage}/mpjpe_cm", self.mpjpe, batch_size=batch.scenes, prog_bar=True)
@@ -367,10 +366,11 @@ class Tokenizer(L.LightningModule):
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
         """Freezing the weights freezes the codes too."""
-        self.codebook.frozen = not requires_grad
+        self.quantizer.frozen = not requires_grad
         return super().requires_grad_(requires_grad)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint.update(renamed_checkpoint(checkpoint))
         check_fields(checkpoint.get("hyper_parameters", {}), self.hparams)
 
     @classmethod

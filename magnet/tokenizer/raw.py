@@ -10,42 +10,38 @@ from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, by_frame, by_token
 from magnet.tokenizer.features import features, statistics
-from magnet.tokenizer.losses import proper
-from magnet.tokenizer.vqvae import Standard
+from magnet.tokenizer.losses import orthonormalize
+from magnet.tokenizer.normalizer import Normalizer
 
 
 class RawPose(nn.Module):
-    """Stands in for a tokenizer: the latent is the z-scored pose of four frames, 540 numbers. Nothing to train.
-
-    Args:
-        std_floor: smallest standard deviation used for z-scores.
-    """
+    """Stands in for a tokenizer: the latent is the z-scored pose of four frames, 540 numbers. Nothing to train."""
 
     latent: int = STRIDE * POSE_FEATURES
 
-    def __init__(self, std_floor: float = 1e-2) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.pose = Standard(POSE_FEATURES, std_floor)
+        self.pose = Normalizer(POSE_FEATURES)
 
-    def set_statistics(self, scenes: Iterable[Scene]) -> None:
+    def fit_normalizers(self, scenes: Iterable[Scene]) -> None:
         """z-scores from scenes; until then the latent is the plain pose."""
         self.pose.set(*statistics(scenes)["pose"])
 
     def encode(
-        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantise: bool = True
+        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
         """(B, T, P, 135) -> (B, N, P, 540); the rest is not read."""
-        return by_token(self.pose(pose)).flatten(-2)
+        return by_token(self.pose.normalize(pose)).flatten(-2)
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
         """(B, N, P, 540) -> (B, T, P, 135); the rest is not read."""
-        return proper(self.pose.restore(by_frame(latent.unflatten(-1, (STRIDE, POSE_FEATURES)))))
+        return orthonormalize(self.pose.denormalize(by_frame(latent.unflatten(-1, (STRIDE, POSE_FEATURES)))))
 
-    def requantise(self, latent: Tensor) -> Tensor:
+    def requantize(self, latent: Tensor) -> Tensor:
         """There is no codebook: the same latent."""
         return latent
 
-    def encode_scene(self, scene: Scene, quantise: bool = True) -> Tensor:
+    def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
         """-> (B, N, P, 540)"""
         seen = features(scene)
         return self.encode(seen.pose, seen.betas, seen.steps)

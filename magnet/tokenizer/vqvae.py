@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from magnet.precision import Float32, dtype_of
+from magnet.precision import dtype_of
+from magnet.tokenizer.normalizer import Normalizer
 
 STAGES = 2
 """Each stage halves the frame rate: 2 stages are the stride of 4 frames a token."""
@@ -45,12 +46,12 @@ class Block(nn.Module):
     def __init__(self, width: int, dilation: int, causal: bool) -> None:
         super().__init__()
         self.norm_1 = nn.LayerNorm(width)
-        self.look = Conv(width, width, 3, dilation=dilation, causal=causal)
+        self.conv = Conv(width, width, 3, dilation=dilation, causal=causal)
         self.norm_2 = nn.LayerNorm(width)
-        self.mix = nn.Linear(width, width)
+        self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.mix(F.gelu(self.norm_2(self.look(F.gelu(self.norm_1(x))))))
+        return x + self.proj(F.gelu(self.norm_2(self.conv(F.gelu(self.norm_1(x))))))
 
 
 def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
@@ -58,7 +59,7 @@ def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
     return nn.Sequential(*[Block(width, DILATION**i, causal) for i in reversed(range(depth))])
 
 
-class Double(nn.Module):
+class Upsample(nn.Module):
     """Twice as many steps, each said twice. (B, T, C) -> (B, 2 T, C)"""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -87,7 +88,7 @@ class Decoder(nn.Module):
         super().__init__()
         layers: list[nn.Module] = [Conv(inputs, hidden, 3, causal=causal), nn.GELU()]
         for _ in range(STAGES):
-            layers += [stack(hidden, depth, causal), Double(), Conv(hidden, hidden, 3, causal=causal)]
+            layers += [stack(hidden, depth, causal), Upsample(), Conv(hidden, hidden, 3, causal=causal)]
         layers += [nn.LayerNorm(hidden), nn.GELU(), Conv(hidden, outputs, 3, causal=causal)]
         self.layers = nn.Sequential(*layers)
         self.depth, self.causal = depth, causal
@@ -107,37 +108,6 @@ class Decoder(nn.Module):
         return self.layers(x)
 
 
-class Standard(Float32):
-    """z-scores by stored statistics; until they are set, the identity.
-
-    Args:
-        size: numbers standardised one by one.
-        floor: smallest standard deviation, so that numbers that hardly vary do not fill the range with noise.
-    """
-
-    mean: Tensor
-    std: Tensor
-    ready: Tensor  # () bool
-
-    def __init__(self, size: int, floor: float = 1e-2) -> None:
-        super().__init__()
-        self.floor = floor
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("std", torch.ones(size))
-        self.register_buffer("ready", torch.tensor(False))
-
-    def set(self, mean: Tensor, std: Tensor) -> None:
-        self.mean.copy_(mean)
-        self.std.copy_(std.clamp(min=self.floor))
-        self.ready.fill_(True)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return (x.float() - self.mean) / self.std
-
-    def restore(self, z: Tensor) -> Tensor:
-        return z.float() * self.std + self.mean
-
-
 class VQVAE(nn.Module):
     """Encoder and decoder of one agent's pose, with the statistics of what goes in and out.
 
@@ -151,19 +121,16 @@ class VQVAE(nn.Module):
         depth: residual blocks a stage.
         causal: no frame sees later ones.
         stride: frames in a token.
-        std_floor: smallest standard deviation of poses and steps.
     """
 
-    def __init__(
-        self, pose: int, latent: int, hidden: int, depth: int, causal: bool, stride: int, std_floor: float
-    ) -> None:
+    def __init__(self, pose: int, latent: int, hidden: int, depth: int, causal: bool, stride: int) -> None:
         super().__init__()
         self.stride, self.latent = stride, latent
-        self.pose = Standard(pose, std_floor)
-        self.steps = Standard(9, std_floor)
+        self.pose = Normalizer(pose)
+        self.steps = Normalizer(9)
         # Shape numbers come in units of a population's spread; few people in training must not narrow that,
         # or a new person would lie hundreds of deviations away.
-        self.betas = Standard(10, floor=1.0)
+        self.betas = Normalizer(10, floor=1.0)
         self.encoder = Encoder(pose + 10 + 9, hidden, latent, depth, causal)
         self.decoder = Decoder(latent + 10 + 9 * stride, hidden, pose, depth, causal)
 
@@ -172,9 +139,9 @@ class VQVAE(nn.Module):
 
         What is not known enters as the mean, whatever it holds.
         """
-        shape = self.betas(betas)[:, None].expand(-1, pose.shape[1], -1)
-        seen = torch.where(known[..., :1], self.pose(pose), 0.0)
-        moved = torch.where(known[..., 1:], self.steps(steps), 0.0)
+        shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
+        seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
+        moved = torch.where(known[..., 1:], self.steps.normalize(steps.float()), 0.0)
         inputs = torch.cat([seen, moved, shape], dim=-1)
         if not inputs.numel():  # convolutions refuse nothing
             return inputs.new_zeros(len(pose), pose.shape[1] // self.stride, self.latent)
@@ -182,11 +149,11 @@ class VQVAE(nn.Module):
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, known: Tensor | None = None) -> Tensor:
         """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
-        shape = self.betas(betas)[:, None].expand(-1, latent.shape[1], -1)
-        moved = self.steps(steps)
+        shape = self.betas.normalize(betas.float())[:, None].expand(-1, latent.shape[1], -1)
+        moved = self.steps.normalize(steps.float())
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
         inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)
         if not inputs.numel():
             return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
-        return self.pose.restore(self.decoder(inputs.to(dtype_of(self.decoder))))
+        return self.pose.denormalize(self.decoder(inputs.to(dtype_of(self.decoder))).float())

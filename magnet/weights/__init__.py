@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from magnet.files import file_hash, inside, write_whole
+from magnet.old_names import renamed_checkpoint
 
 FOLDER = Path(__file__).parent
 DEFAULT = "duet"
@@ -55,23 +56,24 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """A checkpoint as Lightning wants it, from a released folder or a file of Lightning's own.
+    """A checkpoint as Lightning wants it, from a released folder or a file of Lightning's own, of any version.
 
     Raises:
         ValueError: not a checkpoint, damaged, or of a later format.
     """
     path = Path(path)
     if path.is_dir():
-        return _read_folder(path)
+        return renamed_checkpoint(_read_folder(path))
     verify(path)
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise
     except Exception as error:
         raise ValueError(
             f"{path}: not a checkpoint that can be read safely ({type(error).__name__}: {error})"
         ) from error
+    return renamed_checkpoint(checkpoint) if isinstance(checkpoint, dict) else checkpoint
 
 
 def checksum_file(path: Path) -> Path:
@@ -179,7 +181,7 @@ def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[
         own = f"tokenizer.{name}"
         if name.startswith("vqvae.decoder."):
             state[own] = value
-        elif name.startswith(("vqvae.", "codebook.codes")) and not torch.equal(state[own], value):
+        elif name.startswith(("vqvae.", "quantizer.codes")) and not torch.equal(state[own], value):
             raise ValueError(f"this decoder belongs to other codes than the denoiser's: {name} differs")
     return checkpoint | {"state_dict": state, "tokenizer_hyper_parameters": dict(tokenizer["hyper_parameters"])}
 

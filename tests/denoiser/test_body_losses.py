@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from magnet.body import load_body
-from magnet.denoiser.body_losses import BODY_LOSSES, WITHIN_REACH, body_losses, surest
+from magnet.denoiser.body_losses import BODY_LOSSES, WITHIN_REACH, body_losses, least_noisy
 from magnet.denoiser.starting import start_from
+from magnet.denoiser.statistics import pairwise_ground
 from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, scene_transforms
@@ -18,8 +19,8 @@ def body():
 
 
 def tokens_of(scene: Scene) -> torch.Tensor:
-    steps, relations = scene_transforms(scene)
-    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, relations)
+    steps, pairs = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, pairs)
 
 
 def run(body, seen: Scene, real: Scene, signal: float = 1.0, there: torch.Tensor | None = None):
@@ -111,9 +112,9 @@ def test_noisy_tokens_count_less_and_absent_agents_not_at_all(body, generator):
 def test_the_surest_scenes_are_those_with_the_least_noise():
     signal = torch.tensor([0.1, 0.9, 0.5])[:, None, None].expand(3, 4, 2)
     there = torch.ones(3, 4, 2, 2, dtype=torch.bool)
-    assert surest(signal, there, 2).tolist() == [1, 2]
+    assert least_noisy(signal, there, 2).tolist() == [1, 2]
     there[1] = False
-    assert surest(signal, there, 2).tolist() == [2, 0], "a scene without anybody tells nothing"
+    assert least_noisy(signal, there, 2).tolist() == [2, 0], "a scene without anybody tells nothing"
 
 
 def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
@@ -130,25 +131,25 @@ def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
 def test_another_scale_of_pairwise_transforms_starts_as_the_same_model(tmp_path):
     """What it makes of clean tokens is the same in metres, and noise hides fewer of them."""
     first, second = tiny_denoiser(seed=1), tiny_denoiser(seed=2, pairwise_metres=0.25)
-    first.statistics.std.copy_(torch.rand(first.layout.width) + 0.5)
-    first.statistics.count.fill_(1)
+    first.normalizer.std.copy_(torch.rand(first.layout.width) + 0.5)
+    first.normalizer.ready.fill_(True)
     checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
     first.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, tmp_path / "first.ckpt")
     second.tokenizer.load_state_dict(first.tokenizer.state_dict())
     start_from(second, tmp_path / "first.ckpt")
-    ground = second.statistics.pairwise_ground()
+    ground = pairwise_ground(second.layout)
     assert int(ground.sum()) == 2 * 4 * second.layout.slots
-    assert torch.all(second.statistics.std[ground] == 0.25)
-    assert torch.equal(second.statistics.std[~ground], first.statistics.std[~ground])
+    assert torch.all(second.normalizer.std[ground] == 0.25)
+    assert torch.equal(second.normalizer.std[~ground], first.normalizer.std[~ground])
     scene = random_scene(2, 32, first.layout.agents, torch.Generator().manual_seed(0))
     made = []
     for model in (first.eval(), second.eval()):
         tokens, _ = model.tokenize(scene)
         levels = torch.zeros(tokens.shape[:3], dtype=torch.long)
         with torch.no_grad():
-            clean = model.denoise(model.statistics.normalise(tokens), levels, scene.present)
-        made.append(model.statistics.restore(clean))
+            clean = model.denoise(model.normalizer.normalize(tokens), levels, scene.present)
+        made.append(model.normalizer.denormalize(clean))
     assert torch.allclose(made[0], made[1], atol=1e-4)
 
 

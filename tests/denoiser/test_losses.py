@@ -7,15 +7,15 @@ from magnet.denoiser.losses import FINE_GROUND, FINE_YAW, NEAR, consistency_loss
 from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, from_planar, pairwise, propagated, to_9d
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import TokenLayout, relations_by_token, scene_transforms
+from magnet.motion.tokens import TokenLayout, pairwise_by_token, scene_transforms
 from magnet.sampling.noise import alpha_bar
 
 LAYOUT = TokenLayout(latent=8, agents=3)
 
 
 def packed(scene: Scene) -> torch.Tensor:
-    steps, relations = scene_transforms(scene)
-    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, relations)
+    steps, pairs = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, pairs)
 
 
 def everybody(scene: Scene) -> torch.Tensor:
@@ -30,10 +30,10 @@ def test_real_motion_is_consistent(scene: Scene):
 def test_consistency_equals_eq_11_computed_with_whole_matrices(scene: Scene, generator):
     tokens = packed(scene)
     yaw_noise = 0.1 * torch.randn(tokens.shape, generator=generator)
-    latent, steps, relations = LAYOUT.unpack(tokens)
+    latent, steps, pairs = LAYOUT.unpack(tokens)
     shift = LAYOUT.unpack(yaw_noise)[1].clone()
     shift[..., :6], shift[..., 7] = 0, 0  # ground shifts only, so that the transforms stay turns and shifts
-    noisy = LAYOUT.pack(latent, steps + shift, relations)
+    noisy = LAYOUT.pack(latent, steps + shift, pairs)
 
     T_prev_can = from_9d((steps + shift).transpose(2, 3).flatten(1, 2))
     T_self_partner = pairwise(canonical_frame(scene.T_world_root))
@@ -64,7 +64,7 @@ def test_each_part_is_averaged_by_itself(scene: Scene):
     clean[..., :8] += 2.0  # Huber of 2 is 1.5
     losses = token_losses(clean, truth, LAYOUT, everybody(scene))
     assert losses["latent"].item() == 1.5
-    assert losses["step"] == losses["relation"] == 0
+    assert losses["step"] == losses["pairwise"] == 0
 
 
 def test_steps_and_relations_have_finite_gradients_at_zero():
@@ -99,7 +99,7 @@ def test_weights_count_each_group_of_a_token_by_its_own(scene: Scene):
     losses = token_losses(truth + 2.0, truth, LAYOUT, there, weights)  # Huber of 2 is 1.5
     assert losses["latent"].item() == pytest.approx(1.5 * 3 / 3)
     assert losses["step"].item() == pytest.approx(1.5 * 3 / 3)
-    assert losses["relation"].item() == pytest.approx(1.5 * 0.5 / 6)
+    assert losses["pairwise"].item() == pytest.approx(1.5 * 0.5 / 6)
     ones = token_losses(truth + 2.0, truth, LAYOUT, there, torch.ones_like(weights))
     assert ones == token_losses(truth + 2.0, truth, LAYOUT, there)
 
@@ -112,7 +112,7 @@ def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_sho
     T_self_partner = pairwise(pairs) @ offset
     T_self_partner[..., [0, 2], 3] += moved
     latent, steps, _ = LAYOUT.unpack(truth)
-    clean = LAYOUT.pack(latent, steps, relations_by_token(to_9d(T_self_partner)))
+    clean = LAYOUT.pack(latent, steps, pairwise_by_token(to_9d(T_self_partner)))
     distance = pairwise(pairs)[..., [0, 2], 3].norm(dim=-1)
     off = math.hypot(0.05, FINE_GROUND) - FINE_GROUND + math.hypot(turned, FINE_YAW) - FINE_YAW
     levels = torch.full((*truth.shape[:3], 3), 300)

@@ -15,7 +15,7 @@ def tokenizer_file(tmp_path) -> str:
     from magnet.tokenizer.module import Tokenizer
 
     tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
-    tokenizer.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    tokenizer.init_codebook([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
     return save(tokenizer, tmp_path / "tokenizer.ckpt")
 
 
@@ -107,11 +107,11 @@ def test_statistics_make_training_tokens_standard(tmp_path):
     model = build(tmp_path)
     fitted(model, 1)
     tokens, there = zip(*(model.tokenize(scene) for scene in data().statistics_batches()), strict=True)
-    normal = model.statistics.normalise(torch.cat(tokens))
-    _, steps, relations = model.layout.unpack(normal)
+    normal = model.normalizer.normalize(torch.cat(tokens))
+    _, steps, pairs = model.layout.unpack(normal)
     there = torch.cat(there)
-    _, step_std, relation_std = model.layout.unpack(model.statistics.std)
-    for values, std in ((steps[there[..., 0]], step_std), (relations[there[..., 1:]], relation_std)):
+    _, step_std, pairwise_std = model.layout.unpack(model.normalizer.std)
+    for values, std in ((steps[there[..., 0]], step_std), (pairs[there[..., 1:]], pairwise_std)):
         values, std = values.reshape(-1, 9), std.reshape(-1, 9)[0]
         assert values.mean(0).abs().max() < 1e-3
         floored = std <= 0.0101
@@ -139,13 +139,13 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
 @pytest.mark.parametrize(
     "ablation",
     [
-        {"relations": False},
+        {"pairwise": False},
         {"rope": "none"},
         {"agent_embedding": False},
         {"noise_levels": "per_timestep"},
         {"noise_levels": "per_sequence"},
         {"noise_levels": "mixture"},
-        {"relation_noise": "token"},
+        {"pairwise_noise": "token"},
         {"rope": "heads"},
         {"causal_block": 2},
         {"target": "continuous"},

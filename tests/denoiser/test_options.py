@@ -5,7 +5,7 @@ import torch
 
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.own_past import with_own_past
+from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.world import SamplingStats
 from magnet.motion.scene import Scene
@@ -46,7 +46,7 @@ def test_options_come_back_with_a_checkpoint(model: Denoiser, tmp_path):
 
     loaded = Denoiser.load(save(model, tmp_path / "model.ckpt"))
     assert loaded.transformer.causal_block == model.hparams["causal_block"]
-    assert loaded.quantised == model.quantised
+    assert loaded.quantized == model.quantized
 
 
 def test_checkpoints_of_before_are_as_they_were(tmp_path):
@@ -59,14 +59,14 @@ def test_checkpoints_of_before_are_as_they_were(tmp_path):
         del checkpoint["hyper_parameters"][name]
     torch.save(checkpoint, path)
     old = Denoiser.load(path)
-    assert (old.transformer.causal_block, old.quantised, old.hparams["weighting"]) == (0, True, "uniform")
+    assert (old.transformer.causal_block, old.quantized, old.hparams["weighting"]) == (0, True, "uniform")
     assert Denoiser.load("duet").transformer.causal_block == 0
 
 
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        ({"target": "both"}, "target: got 'both', expected quantised or continuous"),
+        ({"target": "both"}, "target: got 'both', expected quantized or continuous"),
         ({"weighting": "max"}, "weighting: got 'max', expected uniform or min_snr"),
         ({"snr_most": 0.0}, "snr_most: got 0, expected a number, over 0|snr_most: got 0, expected over 0"),
     ],
@@ -76,14 +76,14 @@ def test_values_that_mean_nothing_are_refused(field, message):
         Denoiser(**field)
 
 
-# -- quantised or not ----------------------------------------------------------------------------
+# -- quantized or not ----------------------------------------------------------------------------
 
 
 def test_a_continuous_target_is_what_the_encoder_says_before_the_codebook(continuous: Denoiser, scene: Scene):
-    quantised = tiny_denoiser(max_agents=3, window=8)
-    plain, codes = continuous.encode(scene), quantised.encode(scene)
+    quantized = tiny_denoiser(max_agents=3, window=8)
+    plain, codes = continuous.encode(scene), quantized.encode(scene)
     assert not torch.equal(plain, codes)
-    assert torch.equal(continuous.tokenizer.requantise(plain), codes)
+    assert torch.equal(continuous.tokenizer.requantize(plain), codes)
 
 
 def quantization_errors(model: Denoiser, scene: Scene, **options) -> int:
@@ -93,15 +93,15 @@ def quantization_errors(model: Denoiser, scene: Scene, **options) -> int:
 
 
 def test_sampling_snaps_to_codes_where_codes_were_learnt_and_else_when_asked(continuous: Denoiser, scene: Scene):
-    quantised = tiny_denoiser(max_agents=3, window=8)
+    quantized = tiny_denoiser(max_agents=3, window=8)
     generated = 2 * 6 * 3  # scenes, tokens, people
     assert (
-        quantization_errors(quantised, scene) == generated
-        and quantization_errors(quantised, scene, requantise=False) == 0
+        quantization_errors(quantized, scene) == generated
+        and quantization_errors(quantized, scene, requantize=False) == 0
     )
     assert (
         quantization_errors(continuous, scene) == 0
-        and quantization_errors(continuous, scene, requantise=True) == generated
+        and quantization_errors(continuous, scene, requantize=True) == generated
     )
 
 
@@ -109,10 +109,10 @@ def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
     scene = random_scene(4, 32, 3, torch.Generator().manual_seed(0))
     levels = torch.full((4, 8, 3), 700)
     levels[:, :4] = 0
-    truth = continuous.statistics.normalise(continuous.tokenize(scene)[0])
-    made = with_own_past(continuous, truth, levels, scene, 1.0, torch.Generator().manual_seed(1))
-    latent = continuous.layout.unpack(continuous.statistics.restore(made))[0][:, :4]
-    assert (continuous.tokenizer.requantise(latent) - latent).abs().amax(dim=-1).min() > 1e-3
+    truth = continuous.normalizer.normalize(continuous.tokenize(scene)[0])
+    made = with_self_forcing(continuous, truth, levels, scene, 1.0, torch.Generator().manual_seed(1))
+    latent = continuous.layout.unpack(continuous.normalizer.denormalize(made))[0][:, :4]
+    assert (continuous.tokenizer.requantize(latent) - latent).abs().amax(dim=-1).min() > 1e-3
 
 
 # -- min-SNR -------------------------------------------------------------------------------------
@@ -129,6 +129,6 @@ def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, mon
         monkeypatch.setattr(objective, "draw_levels", lambda *_, at=at: at)
         a, b = (model._losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
         weight = snr_weights(torch.tensor(level), 3.0)
-        for name in ("latent", "step", "relation"):
+        for name in ("latent", "step", "pairwise"):
             assert torch.allclose(b[name], weight * a[name], rtol=1e-5)
         assert torch.equal(a["consistency"], b["consistency"])

@@ -22,22 +22,22 @@ def shown(model: Denoiser, level: int, people: int = 3, off: float = 0.1, seed: 
     generator = torch.Generator().manual_seed(seed)
     there = torch.arange(3) < people
     scene = random_scene(4, 32, 3, generator, present=there.expand(4, 3).clone())
-    truth = model.statistics.normalise(model.tokenize(scene)[0])
+    truth = model.normalizer.normalize(model.tokenize(scene)[0])
     layout = model.layout
     levels = torch.full(truth.shape[:3], level)
     noisy = add_noise(truth, torch.randn(truth.shape, generator=generator), layout.spread(layout.group_levels(levels)))
-    latent, steps, relations = layout.unpack(model.statistics.restore(truth))
-    moved = relations.clone()
+    latent, steps, pairs = layout.unpack(model.normalizer.denormalize(truth))
+    moved = pairs.clone()
     moved[..., 6] += off * torch.randn(moved.shape[:-1], generator=generator)
     moved[..., 8] += off * torch.randn(moved.shape[:-1], generator=generator)
-    guess = model.statistics.normalise(layout.pack(latent, steps, moved))
+    guess = model.normalizer.normalize(layout.pack(latent, steps, moved))
     return truth, guess, noisy, levels, scene.present
 
 
 def error(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor) -> float:
     """Mean distance in metres between where partners are seen and where they are."""
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(-1, tokens.shape[1], -1, -1, 4)
-    each = [planar_of(model.layout.unpack(model.statistics.restore(x))[2])[1] for x in (tokens, truth)]
+    each = [planar_of(model.layout.unpack(model.normalizer.denormalize(x))[2])[1] for x in (tokens, truth)]
     return float((each[0] - each[1]).norm(dim=-1)[there].mean())
 
 
@@ -47,7 +47,7 @@ def test_pairwise_transforms_come_nearer_than_the_guess_and_than_what_is_shown(
     model: Denoiser, level: int, people: int
 ):
     truth, guess, noisy, levels, present = shown(model, level, people)
-    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.statistics)
+    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
     left = error(model, better.detach(), truth, present)
     assert left < 0.5 * error(model, guess, truth, present)
     assert left < 0.5 * error(model, noisy, truth, present)
@@ -55,13 +55,13 @@ def test_pairwise_transforms_come_nearer_than_the_guess_and_than_what_is_shown(
 
 def test_what_is_shown_clean_stays(model: Denoiser):
     truth, guess, _, levels, present = shown(model, 0)
-    better = PairwisePosterior(model.layout)(guess, truth, levels, present, model.statistics)
+    better = PairwisePosterior(model.layout)(guess, truth, levels, present, model.normalizer)
     assert error(model, better, truth, present) < 2e-3
 
 
 def test_nothing_but_pairs_of_people_changes(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100, people=2)
-    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.statistics)
+    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
     pairs = model.layout.group_present(present)[:, None, :, :].expand(-1, guess.shape[1], -1, -1).clone()
     pairs[..., 0] = False
     touched = model.layout.spread(pairs)
@@ -72,9 +72,9 @@ def test_nothing_but_pairs_of_people_changes(model: Denoiser):
 def test_what_is_at_pure_noise_tells_nothing(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, LEVELS)
     posterior = PairwisePosterior(model.layout)
-    one = posterior(guess, noisy, levels, present, model.statistics)
+    one = posterior(guess, noisy, levels, present, model.normalizer)
     other = posterior(
-        guess, torch.randn(noisy.shape, generator=torch.Generator().manual_seed(9)), levels, present, model.statistics
+        guess, torch.randn(noisy.shape, generator=torch.Generator().manual_seed(9)), levels, present, model.normalizer
     )
     assert torch.allclose(one, other, atol=1e-3)
 
@@ -82,19 +82,19 @@ def test_what_is_at_pure_noise_tells_nothing(model: Denoiser):
 def test_absent_people_change_nothing(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100, people=2)
     posterior = PairwisePosterior(model.layout)
-    one = posterior(guess, noisy, levels, present, model.statistics)
+    one = posterior(guess, noisy, levels, present, model.normalizer)
     other = torch.randn(noisy.shape, generator=torch.Generator().manual_seed(9))
     groups = model.layout.spread(model.layout.group_present(present)[:, None].expand(-1, guess.shape[1], -1, -1))
     two = posterior(
-        torch.where(groups, guess, other), torch.where(groups, noisy, other), levels, present, model.statistics
+        torch.where(groups, guess, other), torch.where(groups, noisy, other), levels, present, model.normalizer
     )
     assert torch.allclose(one[groups], two[groups], atol=1e-4)
 
 
 def test_both_ends_say_the_same_of_a_pair(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100)
-    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.statistics)
-    yaw, ground = planar_of(model.layout.unpack(model.statistics.restore(better))[2])  # (B, N, P, 2, 4)
+    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
+    yaw, ground = planar_of(model.layout.unpack(model.normalizer.denormalize(better))[2])  # (B, N, P, 2, 4)
     assert torch.allclose(torch.cos(yaw[:, :, 0, 0] + yaw[:, :, 1, 0]), torch.ones(()), atol=1e-4)
     assert torch.allclose(ground[:, :, 0, 0].norm(dim=-1), ground[:, :, 1, 0].norm(dim=-1), atol=1e-4)
 
@@ -102,13 +102,13 @@ def test_both_ends_say_the_same_of_a_pair(model: Denoiser):
 def test_slots_are_exchangeable(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100)
     posterior, order = PairwisePosterior(model.layout), torch.tensor([2, 0, 1])
-    plain = posterior(guess, noisy, levels, present, model.statistics)
+    plain = posterior(guess, noisy, levels, present, model.normalizer)
     moved = posterior(
         reordered(guess, order, model.layout),
         reordered(noisy, order, model.layout),
         levels[:, :, order],
         present[:, order],
-        model.statistics,
+        model.normalizer,
     )
     assert torch.allclose(reordered(plain, order, model.layout), moved, atol=1e-3)
 
@@ -117,9 +117,9 @@ def test_people_are_alike_in_whichever_slots_they_are(model: Denoiser):
     """Two people in the first two slots, or in the last two with a free slot before them."""
     _, guess, noisy, levels, present = shown(model, 100, people=2)
     posterior, order = PairwisePosterior(model.layout), torch.tensor([2, 0, 1])
-    plain = posterior(guess, noisy, levels, present, model.statistics)
+    plain = posterior(guess, noisy, levels, present, model.normalizer)
     tokens = [reordered(each, order, model.layout) for each in (guess, noisy)]
-    moved = posterior(*tokens, levels[:, :, order], present[:, order], model.statistics)
+    moved = posterior(*tokens, levels[:, :, order], present[:, order], model.normalizer)
     assert torch.allclose(reordered(plain, order, model.layout), moved, atol=1e-3)
 
 
@@ -127,7 +127,7 @@ def test_deviations_can_be_learnt(model: Denoiser):
     truth, guess, noisy, levels, present = shown(model, 100)
     posterior = PairwisePosterior(model.layout)
     guess.requires_grad_()
-    (posterior(guess, noisy, levels, present, model.statistics) - truth).square().mean().backward()
+    (posterior(guess, noisy, levels, present, model.normalizer) - truth).square().mean().backward()
     assert all(
         p.grad is not None and p.grad.isfinite().all() and p.grad.abs().sum() > 0 for p in posterior.parameters()
     )

@@ -34,18 +34,18 @@ def test_without_a_tokenizer_that_of_the_start_is_kept_and_how_tokens_are_normal
     path = saved(first, tmp_path / "first.ckpt")
     sizes = {name: first.hparams[name] for name in ("max_agents", "window", "width", "layers", "heads", "mlp_ratio")}
     second = Denoiser(start_from=str(path), **sizes)
-    assert equal(second.tokenizer, first.tokenizer) and not second.statistics.ready
+    assert equal(second.tokenizer, first.tokenizer) and not second.normalizer.ready
     assert not any(weight.requires_grad for weight in second.tokenizer.parameters())
     start_from(second, path)
-    assert equal(second.transformer, first.transformer) and equal(second.statistics, first.statistics)
+    assert equal(second.transformer, first.transformer) and equal(second.normalizer, first.normalizer)
 
 
 def test_with_another_tokenizer_tokens_are_normalised_anew(tmp_path: Path) -> None:
     path = saved(tiny_denoiser(seed=1), tmp_path / "first.ckpt")
     second = tiny_denoiser(seed=2)
-    before = second.statistics.mean.clone()
+    before = second.normalizer.mean.clone()
     start_from(second, path)
-    assert torch.equal(second.statistics.mean, before)
+    assert torch.equal(second.normalizer.mean, before)
 
 
 def test_a_denoiser_of_raw_poses_is_started_from_as_well(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_training_goes_on_from_the_start_with_its_tokenizer_untouched(tmp_path, 
     )
     assert cli.main(["fit", "--model.start_from", "first.ckpt", *data, *few, *rest]) == 0
     second = Denoiser.load("run/checkpoints/last.ckpt")
-    for part in ("tokenizer", "statistics", "transformer"):
+    for part in ("tokenizer", "normalizer", "transformer"):
         assert equal(getattr(second, part), getattr(first, part)), part
     (tmp_path / "first.ckpt").unlink()  # a checkpoint is all that is needed later
     assert equal(Denoiser.load("run/checkpoints/last.ckpt").tokenizer, first.tokenizer)

@@ -86,7 +86,7 @@ def test_leaving_absent_agents_out_equals_masking_them(generator):
 @pytest.mark.parametrize("field", ["rope", "agent_embedding"])
 def test_without_an_embedding_the_model_is_blind_to_it(generator, field):
     """Ablations of paper Table A.5: no time means shuffled time gives shuffled output; likewise agents."""
-    layout = TokenLayout(latent=8, agents=4, relations=False)
+    layout = TokenLayout(latent=8, agents=4, pairwise=False)
     present = torch.ones(2, 4, dtype=torch.bool)
     noisy, levels = batch(generator, layout)
     axis, order = (1, torch.tensor([3, 1, 0, 5, 4, 2])) if field == "rope" else (2, torch.tensor([2, 0, 3, 1]))

@@ -77,8 +77,8 @@ def test_no_task_leaks(model, scene, generator, name):
 
 
 def test_the_literal_reading_leaks_where_the_unknown_partner_is(scene, generator):
-    """relation_noise="token": the same replacement changes the sample, which is why it is not the default."""
-    leaking = tiny_denoiser(max_agents=3, window=8, relation_noise="token")
+    """pairwise_noise="token": the same replacement changes the sample, which is why it is not the default."""
+    leaking = tiny_denoiser(max_agents=3, window=8, pairwise_noise="token")
     task = registry.get("partner_inpainting")()
     known = task.schedule(Grid(12, 3, 4, 3, 8, 2)).known
     other = unknown_replaced(scene, known, generator)
@@ -117,7 +117,7 @@ def test_holding_the_last_pose_keeps_the_last_known_token_nearer_to_what_it_woul
     away = [(embedded(scene, hold)[:, 7] - embedded(scene.slice(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]
     assert away[1] < 0.8 * away[0]
     held = embedded(scene.slice(0, 32), 1).unflatten(0, (8, 2)).transpose(1, 2)
-    assert torch.equal(model.encode(scene.slice(0, 32)), model.tokenizer.requantise(held))
+    assert torch.equal(model.encode(scene.slice(0, 32)), model.tokenizer.requantize(held))
 
 
 def test_generation_reads_nothing_at_all(model, scene, generator):
@@ -190,10 +190,10 @@ def test_moving_the_world_moves_the_sample_before_a_keyframe_of_somebody_lying_o
 
 
 def test_tokens_fed_back_agree_with_the_world(model, scene):
-    """After a stage, relations are what the placed agents imply."""
+    """After a stage, pairs are what the placed agents imply."""
     from magnet.generation.world import Canvas
     from magnet.motion.frames import from_9d
-    from magnet.motion.tokens import by_frame, relations_by_frame
+    from magnet.motion.tokens import by_frame, pairwise_by_frame
     from magnet.sampling.sampler import sample
 
     grid = Grid(12, 3, 4, 3, 8, 2)
@@ -209,11 +209,11 @@ def test_tokens_fed_back_agree_with_the_world(model, scene):
         torch.Generator().manual_seed(0),
         canvas.make_consistent,
     )
-    _, _, relations = model.layout.unpack(model.statistics.restore(tokens))
-    T_self_partner = from_9d(relations_by_frame(relations))
+    _, _, pairs = model.layout.unpack(model.normalizer.denormalize(tokens))
+    T_self_partner = from_9d(pairwise_by_frame(pairs))
     assert torch.allclose(T_self_partner, pairwise(canvas.T_world_can), atol=1e-3)
     assert torch.allclose(canvas.T_world_can[:, :16], canonical_frame(scene.T_world_root)[:, :16])
-    steps = from_9d(by_frame(model.layout.unpack(model.statistics.restore(tokens))[1]))
+    steps = from_9d(by_frame(model.layout.unpack(model.normalizer.denormalize(tokens))[1]))
     placed = canvas.T_world_can[:, :-1] @ steps[:, 1:]
     assert torch.allclose(placed, canvas.T_world_can[:, 1:], atol=1e-3)
 
@@ -252,7 +252,7 @@ def test_the_step_into_a_keyframe_is_shown_as_the_keyframes_own_next_step(model,
     known = torch.zeros(16, 3, dtype=torch.bool)
     known[:2], known[6:8, 1], known[9, 2] = True, True, True
     tokens = known_tokens(model, scrub(scene, known), known)
-    steps = model.layout.unpack(model.statistics.restore(tokens))[1]
+    steps = model.layout.unpack(model.normalizer.denormalize(tokens))[1]
     true = scene_transforms(scene)[0]
     for token, agent in ((6, 1), (9, 2)):
         assert torch.allclose(steps[:, token, agent, 0], true[:, token, agent, 1], atol=1e-5)

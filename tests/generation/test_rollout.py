@@ -135,7 +135,7 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
         SamplerOptions(steps=2, stride=2, placement="integrate"),
         SamplerOptions(steps=2, stride=3, placement="anchor", keep_given=False),
         SamplerOptions(steps=2, stride=2, blend=17),
-        SamplerOptions(steps=2, stride=2, requantise=False),
+        SamplerOptions(steps=2, stride=2, requantize=False),
         SamplerOptions(steps=4, pyramid_offset=2),
         SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
         SamplerOptions(steps=4, pyramid_offset=2, eta=0.5),
@@ -172,13 +172,13 @@ def test_long_given_stretches_are_encoded_in_pieces_as_they_are_whole(causal, de
     before, after = reach(model)
 
     def embedded(scene: Scene) -> torch.Tensor:
-        model.tokenizer.requantise, kept = (lambda latent: latent), model.tokenizer.requantise
-        model.tokenizer.codebook.nearest = lambda vectors: vectors
+        model.tokenizer.requantize, kept = (lambda latent: latent), model.tokenizer.requantize
+        model.tokenizer.quantizer.nearest = lambda vectors: vectors
         try:
             with torch.no_grad():
                 return model.encode(scene)
         finally:
-            model.tokenizer.requantise = kept
+            model.tokenizer.requantize = kept
 
     whole = embedded(scene)
     part = embedded(scene.slice(4 * (40 - before), 4 * (50 + after)))[:, before : before + 10]

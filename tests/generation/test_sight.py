@@ -24,7 +24,7 @@ def denoiser(causal: bool = False):
         torch.manual_seed(1)
         model.tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=causal)
     generator = torch.Generator().manual_seed(1)
-    model.tokenizer.prepare([random_scene(4, 32, 3, generator)])
+    model.tokenizer.init_codebook([random_scene(4, 32, 3, generator)])
     return model.eval()
 
 
@@ -106,7 +106,7 @@ def test_codes_are_those_of_a_recording_that_ends_where_they_look_to(model, reco
     known = task.schedule(grid()).known
     cuts = task_sight(task, grid())
     tokens = known_tokens(model, scrub(recording, known), known, cuts=cuts)
-    latent = model.layout.unpack(model.statistics.restore(tokens))[0]
+    latent = model.layout.unpack(model.normalizer.denormalize(tokens))[0]
     for row in range(TOKENS):
         live = model.encode(recording.slice(0, 4 * int(cuts[row, 1])))
         assert torch.allclose(latent[:, row, 1:], live[:, row, 1:], atol=1e-5)

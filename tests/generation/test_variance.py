@@ -14,7 +14,7 @@ from magnet.sampling.noise import NoiseStream, alpha_bar
 from magnet.sampling.sampler import sample
 from magnet.tasks.joint import JointFuture
 
-LAYOUT = TokenLayout(latent=400, agents=2, relations=False)
+LAYOUT = TokenLayout(latent=400, agents=2, pairwise=False)
 
 
 def share_left(options: SamplerOptions, variance: float, scenes: int = 16) -> float:

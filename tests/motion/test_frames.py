@@ -21,7 +21,7 @@ from magnet.motion.frames import (
     to_planar,
 )
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import by_frame, relations_by_frame, scene_transforms
+from magnet.motion.tokens import by_frame, pairwise_by_frame, scene_transforms
 from magnet.testing import random_scene
 
 PLACEMENTS = ["integrate", "anchor", "fuse"]
@@ -79,8 +79,8 @@ def test_eq_11_holds_on_a_recorded_duet(cmu_root):
 def test_a_thousand_frames_come_back_within_a_tenth_of_a_millimetre(placement, generator):
     scene = random_scene(2, 1000, 3, generator)
     T_world_can = canonical_frame(scene.T_world_root)
-    steps, relations = scene_transforms(scene)
-    T_prev_can, T_self_partner = from_9d(by_frame(steps)), from_9d(relations_by_frame(relations))
+    steps, pairs = scene_transforms(scene)
+    T_prev_can, T_self_partner = from_9d(by_frame(steps)), from_9d(pairwise_by_frame(pairs))
     placed = place(T_prev_can[:, 1:], T_self_partner[:, 1:], T_world_can[:, 0], placement)
     assert (placed - T_world_can[:, 1:])[..., :3, 3].norm(dim=-1).max() < 1e-4
 
@@ -93,15 +93,15 @@ def test_pose_features_and_canonical_frames_give_the_scene_back(scene: Scene):
 
 def test_permuting_agents_permutes_everything(scene: Scene):
     order = torch.tensor([2, 0, 1])
-    steps, relations = scene_transforms(scene)
-    steps_ordered, relations_ordered = scene_transforms(scene.permute_agents(order))
+    steps, pairs = scene_transforms(scene)
+    steps_ordered, pairs_ordered = scene_transforms(scene.permute_agents(order))
     assert torch.equal(steps[:, :, order], steps_ordered)
     table = partners(3)
     for agent in range(3):
         for slot, partner in enumerate(table[agent].tolist()):
             old, old_partner = order[agent], order[partner]
             old_slot = table[old].tolist().index(int(old_partner))
-            assert torch.equal(relations_ordered[:, :, agent, slot], relations[:, :, old, old_slot])
+            assert torch.equal(pairs_ordered[:, :, agent, slot], pairs[:, :, old, old_slot])
 
 
 @pytest.mark.parametrize("placement", ["integrate", "fuse"])

@@ -20,9 +20,9 @@ def test_pack_and_unpack_are_inverse(scene: Scene, generator):
 
 def test_groups_lie_where_unpack_finds_them():
     layout = TokenLayout(8, 3)
-    latent, steps, relations = layout.unpack(layout.groups().float())
+    latent, steps, pairs = layout.unpack(layout.groups().float())
     assert latent.unique().tolist() == steps.unique().tolist() == [0]
-    assert [relations[slot].unique().tolist() for slot in range(2)] == [[1], [2]]
+    assert [pairs[slot].unique().tolist() for slot in range(2)] == [[1], [2]]
 
 
 def test_frames_and_tokens_are_two_views_of_the_same():
@@ -46,7 +46,7 @@ def test_a_relation_is_as_noisy_as_its_noisier_end():
 
 
 def test_the_literal_reading_gives_one_level_a_token():
-    layout = TokenLayout(8, 3, relation_noise="token")
+    layout = TokenLayout(8, 3, pairwise_noise="token")
     assert layout.group_levels(torch.tensor([[0, 500, 1000]]))[0].tolist() == [[0] * 3, [500] * 3, [1000] * 3]
 
 

@@ -234,7 +234,7 @@ def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
 @pytest.mark.parametrize("kind", ["history", "self", "partner"])
 def test_free_slots_change_nothing_in_guidance(kind, paper_average, generator):
     """Two people in two slots, and the same two in four: a model that looks at those present alone."""
-    layout = TokenLayout(latent=4, agents=4, relations=False)
+    layout = TokenLayout(latent=4, agents=4, pairwise=False)
 
     def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         there = present[:, None, :, None]
@@ -245,7 +245,7 @@ def test_free_slots_change_nothing_in_guidance(kind, paper_average, generator):
     levels = torch.zeros(3, 6, 4, dtype=torch.long)
     levels[:, 4:] = 600
     there = torch.tensor([True, True, False, False]).expand(3, 4)
-    few = TokenLayout(latent=4, agents=2, relations=False)
+    few = TokenLayout(latent=4, agents=2, pairwise=False)
     guidance = Guidance(kind, paper_average=paper_average)
     wide = guidance.predict(blind, tokens, levels, there, mask_noise, layout)
     narrow = guidance.predict(blind, tokens[:, :, :2], levels[:, :, :2], there[:, :2], mask_noise[:, :, :2], few)

@@ -84,7 +84,7 @@ def test_the_denoiser_runs_as_often_as_the_schedule_says(generator):
 def test_agents_have_no_names_in_the_loop(generator):
     """A denoiser blind to the agents' order gives permuted samples for permuted agents and noise."""
     order = torch.tensor([2, 0, 1])
-    layout = TokenLayout(latent=6, agents=3, relations=False)
+    layout = TokenLayout(latent=6, agents=3, pairwise=False)
     tokens = torch.randn(2, 30, 3, layout.width, generator=generator)
 
     noise = torch.randn(2, *tokens.shape, generator=generator)
@@ -202,4 +202,4 @@ def test_a_relation_is_denoised_in_the_view_of_whoever_sees_both(generator):
         return truth[:, stage.start : stage.stop].repeat_interleave(len(noisy) // 2, dim=0)
 
     out = sample(oracle, plan, truth, torch.ones(2, 2, dtype=torch.bool), layout, generator)
-    assert torch.equal(out, truth), "both relations too, without anybody putting them right afterwards"
+    assert torch.equal(out, truth), "both pairs too, without anybody putting them right afterwards"

@@ -10,7 +10,7 @@ from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub
 from magnet.generation.world import Canvas
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, inverse, pairwise, to_planar
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import by_frame, relations_by_frame
+from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks.inbetweening import Inbetweening
@@ -152,11 +152,11 @@ def test_tokens_agree_with_the_world_everywhere(model, options, generator, task,
     """Gaps shorter and longer than the window of 8; steps into keyframes too."""
     scene = random_scene(2, tokens * 4, 3, generator)
     canvas, out, _, _ = settled(model, scene, task, options, tokens)
-    _, steps, relations = model.layout.unpack(model.statistics.restore(out))
+    _, steps, pairs = model.layout.unpack(model.normalizer.denormalize(out))
     T_world_can = canvas.T_world_can
     assert canvas.placed[:, :3].all()
     assert torch.allclose(T_world_can[:, :-1] @ from_9d(by_frame(steps))[:, 1:], T_world_can[:, 1:], atol=2e-3)
-    assert torch.allclose(from_9d(relations_by_frame(relations)), pairwise(T_world_can), atol=2e-3)
+    assert torch.allclose(from_9d(pairwise_by_frame(pairs)), pairwise(T_world_can), atol=2e-3)
 
 
 def test_of_known_tokens_only_the_step_into_them_changes(model, options, scene):
@@ -210,7 +210,7 @@ def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene
     true = canonical_frame(scene.T_world_root)
     yaw, ground = to_planar(inverse(true) @ canvas.T_world_can)
     assert yaw[:, :, :3].abs().max() < 0.02 and ground[:, :, :3].abs().max() < 0.02
-    steps, true_steps = (model.layout.unpack(model.statistics.restore(x))[1] for x in (out, truth))
+    steps, true_steps = (model.layout.unpack(model.normalizer.denormalize(x))[1] for x in (out, truth))
     assert torch.allclose(steps[:, 1:, :3], true_steps[:, 1:, :3], atol=0.02)
 
 

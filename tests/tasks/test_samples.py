@@ -170,7 +170,7 @@ def distribution(
 ) -> tuple[Tensor, Tensor]:
     """Exact mean and covariance of the generated tokens, over their flat indices in order."""
     N, P = gaussian.shape
-    layout = TokenLayout(latent=1, agents=P, relations=False)
+    layout = TokenLayout(latent=1, agents=P, pairwise=False)
     size = N * P
     levels = sorted({int(x) for stage in schedule.stages for x in stage.levels[:-1].unique()} - {0}) if eta else []
     # Row 0 without noise; then each token's own noise alone; then its mask noise alone; then each step noise alone.

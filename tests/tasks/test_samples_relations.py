@@ -84,7 +84,7 @@ def covariance(world: Related, task: Task, steps: int) -> Tensor:
 
 
 def off(world: Related, task: Task) -> float:
-    """How far the covariance is from that of the future given the past, relations included."""
+    """How far the covariance is from that of the future given the past, pairs included."""
     coarse, fine = (covariance(world, task, steps) for steps in STEPS)
     known = PAST * world.agents
     gain = world.own[known:, :known] @ torch.linalg.inv(world.own[:known, :known])

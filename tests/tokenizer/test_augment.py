@@ -4,7 +4,7 @@ import torch
 from magnet.motion.frames import canonical_frame, pose_features
 from magnet.motion.rotations import geodesic
 from magnet.testing import random_scene
-from magnet.tokenizer.augment import LIMBS, drift, exchange_limbs, turn_joints
+from magnet.tokenizer.augment import LIMBS, joint_noise, root_noise, swap_limbs
 from magnet.tokenizer.module import Tokenizer
 
 
@@ -19,7 +19,7 @@ def test_every_joint_but_the_pelvis_belongs_to_one_limb():
 
 
 def test_limbs_come_whole_from_somebody_who_is_there(people, generator):
-    mixed = exchange_limbs(people, 1.0, generator)
+    mixed = swap_limbs(people, 1.0, generator)
     own = people.people().body_rot[:, :, 0]  # (M, T, 21, 3, 3)
     for b, p in people.present.nonzero().tolist():
         for limb in LIMBS.values():
@@ -30,20 +30,20 @@ def test_limbs_come_whole_from_somebody_who_is_there(people, generator):
 
 
 def test_absent_agents_and_the_pelvis_stay_as_they_are(people, generator):
-    for changed in (exchange_limbs(people, 1.0, generator), turn_joints(people, 0.3, generator)):
+    for changed in (swap_limbs(people, 1.0, generator), joint_noise(people, 0.3, generator)):
         assert torch.equal(changed.body_rot[1, :, 1], people.body_rot[1, :, 1])
         assert torch.equal(changed.T_world_root[1, :, 1], people.T_world_root[1, :, 1])
-    assert torch.equal(exchange_limbs(people, 1.0, generator).T_world_root, people.T_world_root)
+    assert torch.equal(swap_limbs(people, 1.0, generator).T_world_root, people.T_world_root)
 
 
 def test_nobody_to_exchange_with_leaves_a_person_alone(people, generator):
     alone = people.select([1])
-    assert torch.equal(exchange_limbs(alone, 1.0, generator).body_rot, alone.body_rot)
+    assert torch.equal(swap_limbs(alone, 1.0, generator).body_rot, alone.body_rot)
 
 
 def test_joints_turn_by_the_same_in_all_frames_and_by_as_much_as_asked(people, generator):
     many = people.repeat(40)
-    turned = turn_joints(many, 0.1, generator)
+    turned = joint_noise(many, 0.1, generator)
     angle = geodesic(many.body_rot, turned.body_rot)[many.present[:, None].expand(-1, 16, -1)]
     assert angle.square().mean().sqrt() == pytest.approx(0.1 * 3**0.5, rel=0.1)
     relative = many.body_rot.transpose(-1, -2) @ turned.body_rot
@@ -52,8 +52,8 @@ def test_joints_turn_by_the_same_in_all_frames_and_by_as_much_as_asked(people, g
 
 def test_drift_is_slow_and_smooth_and_over_the_ground_alone(generator):
     steps = torch.randn(400, 64, 1, 9, generator=generator)
-    assert torch.equal(drift(steps, 0.0, generator), steps)
-    away = 30 * (drift(steps, 0.3, generator) - steps)
+    assert torch.equal(root_noise(steps, 0.0, generator), steps)
+    away = 30 * (root_noise(steps, 0.3, generator) - steps)
     assert not away[..., [0, 1, 2, 3, 4, 5, 7]].any()
     speed = away[:, :, 0, [6, 8]]
     assert speed.std(dim=1).mean() < 0.3 and speed.std() == pytest.approx(0.3 / 3**0.5, rel=0.15)
@@ -62,7 +62,7 @@ def test_drift_is_slow_and_smooth_and_over_the_ground_alone(generator):
 
 def test_augmented_people_are_still_lawful(people, generator):
     """Their features are finite and their canonical frames upright, whatever has been turned."""
-    changed = turn_joints(exchange_limbs(people, 0.5, generator), 0.2, generator)
+    changed = joint_noise(swap_limbs(people, 0.5, generator), 0.2, generator)
     assert pose_features(changed).isfinite().all()
     assert torch.allclose(canonical_frame(changed.T_world_root)[..., 1, 1], torch.ones(()), atol=1e-6)
 
@@ -73,7 +73,7 @@ def tiny(**options) -> Tokenizer:
 
 def test_training_augments_and_evaluation_does_not(people):
     tokenizer = tiny(exchange_limbs=1.0, turn_joints=0.2)
-    tokenizer.prepare([people])
+    tokenizer.init_codebook([people])
     assert torch.equal(tokenizer._augmented(people, 0).body_rot, tokenizer._augmented(people, 0).body_rot)
     assert not torch.equal(tokenizer._augmented(people, 0).body_rot, tokenizer._augmented(people, 1).body_rot)
     assert torch.equal(tiny()._augmented(people, 0).body_rot, people.body_rot)
@@ -81,13 +81,13 @@ def test_training_augments_and_evaluation_does_not(people):
 
 def test_a_tokenizer_starts_from_anothers_networks(people, tmp_path):
     first = tiny()
-    first.prepare([people])
+    first.init_codebook([people])
     path = tmp_path / "first.ckpt"
     torch.save({"hyper_parameters": dict(first.hparams), "state_dict": first.state_dict()}, path)
     second = tiny(levels=2)
     second._start_from(path)
     for name, value in second.vqvae.state_dict().items():
         assert torch.equal(value, first.vqvae.state_dict()[name])
-    assert not second.codebook.started, "another number of codebooks starts anew"
+    assert not second.quantizer.initialized, "another number of codebooks starts anew"
     with pytest.raises(ValueError, match=r"start_from: .* does not fit"):
         Tokenizer(latent=16, hidden=24, codes=32, depth=1)._start_from(path)

@@ -8,7 +8,7 @@ from magnet.motion.frames import canonical_frame, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_steps
 from magnet.testing import random_scene
-from magnet.tokenizer.losses import TOES, matrices, moved, over_ground, reconstruction_losses, standing
+from magnet.tokenizer.losses import TOES, matrices, moved, reconstruction_losses, standing, world_velocity
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def in_frames(body, scene: Scene) -> torch.Tensor:
 
 def test_ways_over_the_ground_are_those_of_joints_in_the_world(body, generator):
     scene = random_scene(2, 12, 3, generator)
-    ways = over_ground(in_frames(body, scene), scene_steps(scene))
+    ways = world_velocity(in_frames(body, scene), scene_steps(scene))
     world = body.joints(scene).diff(dim=1)
     turn = canonical_frame(scene.T_world_root)[:, :-1, :, :3, :3]
     assert torch.allclose(ways, world @ turn, atol=1e-5)

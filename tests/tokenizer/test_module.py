@@ -29,7 +29,7 @@ def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
     torch.manual_seed(0)
     tokenizer = Tokenizer(**{"latent": 16, "hidden": 24, "codes": 32, "depth": 2, **fields})
     if scene is not None:
-        tokenizer.prepare([scene])
+        tokenizer.init_codebook([scene])
     return tokenizer
 
 
@@ -71,14 +71,14 @@ def test_encode_and_decode_keep_the_shapes(scene: Scene) -> None:
     assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene)))
     pose = tokenizer.decode(latent, *conditions(scene))
     assert pose.shape == (2, 64, 3, 135)
-    assert torch.equal(tokenizer.requantise(latent), latent)
+    assert torch.equal(tokenizer.requantize(latent), latent)
     assert tokenizer.reconstruct(scene.slice(0, 63)).frames == 60
 
 
 def test_every_latent_is_a_code(scene: Scene) -> None:
     tokenizer = tiny(scene).eval()
     latent = tokenizer.encode_scene(scene).flatten(0, -2)
-    assert (latent[:, None] == tokenizer.codebook.codes[0]).all(-1).any(-1).all()
+    assert (latent[:, None] == tokenizer.quantizer.codes[0]).all(-1).any(-1).all()
 
 
 def test_a_part_of_a_token_is_refused(scene: Scene) -> None:
@@ -167,15 +167,15 @@ def test_absent_agents_and_bad_frames_change_nothing(scene: Scene, generator: to
 
 def test_statistics_are_those_of_the_people_present(scene: Scene) -> None:
     tokenizer = tiny()
-    tokenizer.set_statistics([scene.select([0]), scene.select([1])])
+    tokenizer.fit_normalizers([scene.select([0]), scene.select([1])])
     pose = pose_features(scene).flatten(0, -2).double()
     torch.testing.assert_close(tokenizer.vqvae.pose.mean, pose.mean(0).float(), rtol=1e-4, atol=1e-5)
     std = pose.std(0, unbiased=False).clamp(min=1e-2).float()
     torch.testing.assert_close(tokenizer.vqvae.pose.std, std, rtol=1e-3, atol=1e-5)
     nobody = without_absent(scene.replace(present=torch.zeros(2, 3, dtype=torch.bool)))
     with pytest.raises(ValueError, match="nobody is present"):
-        tokenizer.set_statistics([nobody])
-    tokenizer.set_statistics([concatenate([scene, nobody])])
+        tokenizer.fit_normalizers([nobody])
+    tokenizer.fit_normalizers([concatenate([scene, nobody])])
     torch.testing.assert_close(tokenizer.vqvae.pose.mean, pose.mean(0).float(), rtol=1e-4, atol=1e-5)
 
 
@@ -226,10 +226,10 @@ def test_mixed_precision_trains_and_its_rotations_stay_exact(scene: Scene) -> No
 
 def test_freezing_the_model_freezes_the_codes(scene: Scene) -> None:
     tokenizer = tiny(scene).requires_grad_(False)
-    before = tokenizer.codebook.codes.clone()
+    before = tokenizer.quantizer.codes.clone()
     tokenizer.train()
     tokenizer.training_step(scene, 0)
-    assert torch.equal(tokenizer.codebook.codes, before)
+    assert torch.equal(tokenizer.quantizer.codes, before)
 
 
 def test_training_reports_what_it_should(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_resumed_training_ends_bit_identical(
 ) -> None:
     tokenizer, folder = run
     again = tiny(warmup_steps=2)
-    monkeypatch.setattr(again.codebook, "start", None)  # must not start a second time
+    monkeypatch.setattr(again.quantizer, "kmeans_init", None)  # must not start a second time
     resume = {"ckpt_path": folder / "epoch=1.ckpt", "weights_only": True}
     trainer(tmp_path, max_epochs=4, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
     state = tokenizer.state_dict()
@@ -331,7 +331,7 @@ def test_what_is_no_tokenizer_is_refused(run: tuple[Tokenizer, Path], tmp_path: 
     checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
     checkpoint["hyper_parameters"]["codes"] = 64
     torch.save(checkpoint, tmp_path / "shape.ckpt")
-    with pytest.raises(ValueError, match=r"codebook.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'codes': 64"):
+    with pytest.raises(ValueError, match=r"quantizer.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'codes': 64"):
         Tokenizer.load(tmp_path / "shape.ckpt")
 
 
@@ -362,9 +362,9 @@ def test_raw_poses_return_exactly(scene: Scene) -> None:
     for _ in range(2):
         latent = raw.encode_scene(scene)
         assert latent.shape == (2, 16, 3, 540) and raw.latent == 540
-        assert torch.equal(raw.requantise(latent), latent)
+        assert torch.equal(raw.requantize(latent), latent)
         torch.testing.assert_close(raw.decode(latent, *conditions(scene)), pose_features(scene), rtol=0, atol=1e-5)
-        raw.set_statistics([scene])
+        raw.fit_normalizers([scene])
     torch.testing.assert_close(latent.mean(), torch.tensor(0.0), atol=0.2, rtol=0)
     assert not list(raw.parameters())
 

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene
-from magnet.tokenizer.losses import matrices, proper, reconstruction_losses
-from magnet.tokenizer.vqvae import Decoder, Encoder, Standard
+from magnet.tokenizer.losses import matrices, orthonormalize, reconstruction_losses
+from magnet.tokenizer.normalizer import Normalizer
+from magnet.tokenizer.vqvae import Decoder, Encoder
 
 
 def frames_that_matter(module: torch.nn.Module, x: Tensor, step: int) -> Tensor:
@@ -63,13 +64,13 @@ def test_embeddings_have_unit_spread() -> None:
 
 
 def test_z_scores_come_back_and_respect_the_floor() -> None:
-    standard = Standard(3, floor=1e-2)
+    standard = Normalizer(3, floor=1e-2)
     x = torch.tensor([[1.0, 5.0, 3.0], [3.0, 5.0, 3.0]])
-    assert torch.equal(standard(x), x)
+    assert torch.equal(standard.normalize(x), x)
     standard.set(x.mean(0), x.std(0, unbiased=False))
-    torch.testing.assert_close(standard(x), torch.tensor([[-1.0, 0, 0], [1, 0, 0]]))
+    torch.testing.assert_close(standard.normalize(x), torch.tensor([[-1.0, 0, 0], [1, 0, 0]]))
     assert standard.std[1] == torch.tensor(1e-2)
-    torch.testing.assert_close(standard.restore(standard(x)), x)
+    torch.testing.assert_close(standard.denormalize(standard.normalize(x)), x)
 
 
 # -- losses ------------------------------------------------------------------------------------
@@ -118,14 +119,14 @@ def test_masked_frames_cost_nothing_even_when_broken(scene: Scene, generator: to
 
 
 def test_proper_poses_are_rotations_above_the_canonical_frame(scene: Scene, generator: torch.Generator) -> None:
-    pose = proper(torch.randn(pose_features(scene).shape, generator=generator))
+    pose = orthonormalize(torch.randn(pose_features(scene).shape, generator=generator))
     for rotation in (matrices(pose)[0], matrices(pose)[1][..., :3, :3]):
         eye = torch.eye(3).expand_as(rotation)
         torch.testing.assert_close(rotation.transpose(-1, -2) @ rotation, eye, rtol=0, atol=1e-5)
     assert (pose[..., [-3, -1]] == 0).all()
-    torch.testing.assert_close(proper(pose), pose)
+    torch.testing.assert_close(orthonormalize(pose), pose)
     truth = pose_features(scene)
-    torch.testing.assert_close(proper(truth), truth, rtol=0, atol=1e-5)
+    torch.testing.assert_close(orthonormalize(truth), truth, rtol=0, atol=1e-5)
 
 
 def test_the_velocity_term_is_the_error_of_the_joints_velocities_in_metres_a_second() -> None:

@@ -16,7 +16,7 @@ class Watch(WeightEMA):
         self.seen: list[torch.Tensor] = []
 
     def on_train_batch_end(self, trainer, pl_module, *args, **kwargs) -> None:
-        self.seen.append(pl_module.transformer.leave.weight.detach().clone())
+        self.seen.append(pl_module.transformer.out_proj.weight.detach().clone())
         super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
 
 
@@ -33,10 +33,10 @@ def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_
         decay = min(0.5, (1 + n) / (10 + n))
         expected = decay * expected + (1 - decay) * current
     loaded = Denoiser.load(tmp_path / "ema.ckpt")
-    assert torch.allclose(loaded.transformer.leave.weight, expected, atol=1e-6)
-    assert not torch.allclose(loaded.transformer.leave.weight, watch.seen[-1], atol=1e-6)
+    assert torch.allclose(loaded.transformer.out_proj.weight, expected, atol=1e-6)
+    assert not torch.allclose(loaded.transformer.out_proj.weight, watch.seen[-1], atol=1e-6)
     assert all(torch.equal(value, before[name]) for name, value in loaded.tokenizer.state_dict().items())
-    assert loaded.statistics.ready
+    assert loaded.normalizer.ready
 
 
 def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):
@@ -58,7 +58,7 @@ def test_a_denoiser_never_runs_with_another_tokenizer_than_its_own(tmp_path):
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(1))
     expected = model.eval().encode(scene)
     other = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=True)
-    other.prepare([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
+    other.init_codebook([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
     save(other, tmp_path / "tokenizer.ckpt")
     loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True).eval()
     assert not loaded.tokenizer.hparams["causal"]

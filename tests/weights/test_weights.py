@@ -14,11 +14,11 @@ def checkpoint():
         "state_dict": {
             "big": torch.randn(300, 40),
             "bias": torch.randn(5),
-            "statistics.mean": torch.randn(3, 3),
+            "normalizer.mean": torch.randn(3, 3),
             "count": torch.tensor(3),
         },
         "hyper_parameters": {"width": 8},
-        "tokenizer_hyper_parameters": {"codes": 4},
+        "tokenizer_hyper_parameters": {"causal": True},
         "magnet_config": {"model": {"class_path": "Denoiser"}},
         "global_step": 12,
     }
@@ -27,7 +27,7 @@ def checkpoint():
 def test_a_released_model_comes_back(checkpoint, tmp_path):
     back = weights.read(weights.write(checkpoint, tmp_path / "m"))
     assert back["state_dict"].keys() == checkpoint["state_dict"].keys()
-    for name in ("bias", "statistics.mean", "count"):
+    for name in ("bias", "normalizer.mean", "count"):
         assert torch.equal(back["state_dict"][name], checkpoint["state_dict"][name])
     assert torch.allclose(back["state_dict"]["big"], checkpoint["state_dict"]["big"], atol=2e-3)
     assert all(back[key] == checkpoint[key] for key in (*weights.KEPT, "global_step"))
@@ -83,15 +83,15 @@ def test_an_unknown_name_says_which_there_are():
 
 
 def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoint):
-    names = ("vqvae.encoder.a", "vqvae.decoder.b", "vqvae.pose.mean", "codebook.codes", "codebook.ema_count")
+    names = ("vqvae.encoder.a", "vqvae.decoder.b", "vqvae.pose.mean", "quantizer.codes", "quantizer.ema_count")
     old = {name: torch.randn(3) for name in names}
     checkpoint["state_dict"] |= {f"tokenizer.{name}": value for name, value in old.items()}
-    new = {"vqvae.decoder.b": torch.randn(3), "codebook.ema_count": torch.randn(3)}
+    new = {"vqvae.decoder.b": torch.randn(3), "quantizer.ema_count": torch.randn(3)}
     tokenizer = {"state_dict": old | new, "hyper_parameters": {"decoder_only": True}}
     state = weights.with_decoder(checkpoint, tokenizer)["state_dict"]
     changed = [name for name, value in state.items() if not torch.equal(checkpoint["state_dict"][name], value)]
     assert changed == ["tokenizer.vqvae.decoder.b"]
-    for name in ("vqvae.encoder.a", "vqvae.pose.mean", "codebook.codes"):
+    for name in ("vqvae.encoder.a", "vqvae.pose.mean", "quantizer.codes"):
         other = tokenizer["state_dict"] | {name: torch.randn(3)}
         with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
             weights.with_decoder(checkpoint, tokenizer | {"state_dict": other})

@@ -255,12 +255,12 @@ class Picture {
     return { program, uniforms };
   }
 
-  attribute(location, array, size, type = this.gl.FLOAT, normalised = false) {
+  attribute(location, array, size, type = this.gl.FLOAT, normalized = false) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, array, gl.STATIC_DRAW);
     gl.enableVertexAttribArray(location);
-    gl.vertexAttribPointer(location, size, type, normalised, 0, 0);
+    gl.vertexAttribPointer(location, size, type, normalized, 0, 0);
   }
 
   // One vertex array a shape: vertices and normals are its own, the rest is everybody's.

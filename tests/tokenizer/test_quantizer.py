@@ -11,7 +11,7 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor
 
-from magnet.tokenizer.codebook import Codebook
+from magnet.tokenizer.quantizer import ResidualVQ
 from magnet.tokenizer.usage import CodeUse, perplexity, usage
 
 
@@ -22,7 +22,7 @@ def clusters(n: int, generator: torch.Generator, dim: int = 8, groups: int = 16)
 
 
 def test_latent_is_the_nearest_code(generator: torch.Generator) -> None:
-    book = Codebook(16, 8).eval()
+    book = ResidualVQ(16, 8).eval()
     book.codes.normal_(generator=generator)
     vectors = torch.randn(3, 5, 8, generator=generator)
     out = book(vectors)
@@ -33,15 +33,15 @@ def test_latent_is_the_nearest_code(generator: torch.Generator) -> None:
 
 
 def test_quantising_a_code_returns_it_bit_identical(generator: torch.Generator) -> None:
-    book = Codebook(64, 8)
-    book.start(clusters(500, generator), generator)
+    book = ResidualVQ(64, 8)
+    book.kmeans_init(clusters(500, generator), generator)
     latent = book.nearest(clusters(50, generator))
     assert torch.equal(book.nearest(latent), latent)
 
 
 def test_codes_follow_the_moving_average_of_their_vectors(generator: torch.Generator) -> None:
-    book = Codebook(4, 8, decay=0.9, revive_below=0.0)
-    book.start(clusters(100, generator), generator)
+    book = ResidualVQ(4, 8, decay=0.9, revive_below=0.0)
+    book.kmeans_init(clusters(100, generator), generator)
     count, total = book.ema_count[0].double(), book.ema_sum[0].double()
     for _ in range(5):
         vectors = clusters(60, generator)
@@ -55,24 +55,24 @@ def test_codes_follow_the_moving_average_of_their_vectors(generator: torch.Gener
 
 
 def test_kmeans_start_finds_the_clusters_whatever_the_first_codes(generator: torch.Generator) -> None:
-    book = Codebook(64, 8)
+    book = ResidualVQ(64, 8)
     vectors = clusters(2000, generator)
     book(vectors, generator=generator)
     error = (book.nearest(vectors) - vectors).norm(dim=-1).mean()
-    assert bool(book.started)
+    assert bool(book.initialized)
     assert error < 0.5  # within-cluster spread is 0.1 * sqrt(8) = 0.28, clusters are about 20 apart
 
 
 def test_same_seed_starts_the_same_codes() -> None:
-    books = [Codebook(16, 8) for _ in range(2)]
+    books = [ResidualVQ(16, 8) for _ in range(2)]
     for book in books:
-        book.start(clusters(300, torch.Generator().manual_seed(0)), torch.Generator().manual_seed(5))
+        book.kmeans_init(clusters(300, torch.Generator().manual_seed(0)), torch.Generator().manual_seed(5))
     assert torch.equal(books[0].codes, books[1].codes)
 
 
 def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator) -> None:
-    book = Codebook(16, 8, revive_below=1.0)
-    book.start(clusters(300, generator), generator)
+    book = ResidualVQ(16, 8, revive_below=1.0)
+    book.kmeans_init(clusters(300, generator), generator)
     book.codes[0, 3] = 1e3
     book.ema_sum[0, 3] = 1e3
     book.ema_count[0, 3] = 0.0
@@ -82,8 +82,8 @@ def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator
 
 
 def test_without_revival_an_unused_code_does_not_move(generator: torch.Generator) -> None:
-    book = Codebook(16, 8, revive_below=0.0)
-    book.start(clusters(300, generator), generator)
+    book = ResidualVQ(16, 8, revive_below=0.0)
+    book.kmeans_init(clusters(300, generator), generator)
     book.codes[0, 3] = 1e3
     book.ema_sum[0, 3] = 1e3
     for _ in range(3):
@@ -97,7 +97,7 @@ def test_masked_vectors_never_touch_the_codebook(levels: int, generator: torch.G
     mask = torch.rand(10, 20, generator=generator) < 0.7
     states, commitments, counts = [], [], []
     for junk in (0.0, 1e6, float("nan")):
-        book = Codebook(16, 8, levels)
+        book = ResidualVQ(16, 8, levels)
         for step in range(3):
             garbled = torch.where(mask[..., None], vectors, junk)
             out = book(garbled, mask, torch.Generator().manual_seed(step))
@@ -112,11 +112,11 @@ def test_masked_vectors_never_touch_the_codebook(levels: int, generator: torch.G
 
 
 def test_a_batch_with_nobody_changes_nothing(generator: torch.Generator) -> None:
-    book = Codebook(16, 8)
+    book = ResidualVQ(16, 8)
     nobody = torch.zeros(40, dtype=torch.bool)
     book(clusters(40, generator), nobody, generator)
-    assert not bool(book.started)
-    book.start(clusters(300, generator), generator)
+    assert not bool(book.initialized)
+    book.kmeans_init(clusters(300, generator), generator)
     before = {name: value.clone() for name, value in book.state_dict().items()}
     out = book(clusters(40, generator), nobody, generator)
     assert out.commitment == 0
@@ -125,8 +125,8 @@ def test_a_batch_with_nobody_changes_nothing(generator: torch.Generator) -> None
 
 @pytest.mark.parametrize("how", ["eval", "frozen"])
 def test_frozen_codebook_never_moves(how: str, generator: torch.Generator) -> None:
-    book = Codebook(16, 8)
-    book.start(clusters(300, generator), generator)
+    book = ResidualVQ(16, 8)
+    book.kmeans_init(clusters(300, generator), generator)
     before = {name: value.clone() for name, value in book.state_dict().items()}
     if how == "eval":
         book.eval()
@@ -137,7 +137,7 @@ def test_frozen_codebook_never_moves(how: str, generator: torch.Generator) -> No
 
 
 def test_each_residual_level_lowers_the_error(generator: torch.Generator) -> None:
-    book = Codebook(8, 8, levels=4)
+    book = ResidualVQ(8, 8, levels=4)
     vectors = clusters(1000, generator)
     for _ in range(20):
         book(vectors, generator=generator)
@@ -152,7 +152,7 @@ def test_each_residual_level_lowers_the_error(generator: torch.Generator) -> Non
 
 
 def test_gradient_passes_straight_through(generator: torch.Generator) -> None:
-    book = Codebook(16, 8, levels=2)
+    book = ResidualVQ(16, 8, levels=2)
     vectors = clusters(50, generator).requires_grad_()
     out = book(vectors, generator=generator)
     slope = torch.randn(50, 8, generator=generator)
@@ -163,10 +163,10 @@ def test_gradient_passes_straight_through(generator: torch.Generator) -> None:
 
 
 def test_loading_neither_moves_nor_restarts_the_codebook(generator: torch.Generator) -> None:
-    book = Codebook(16, 8, levels=2)
+    book = ResidualVQ(16, 8, levels=2)
     for _ in range(3):
         book(clusters(200, generator), generator=generator)
-    loaded = Codebook(16, 8, levels=2)
+    loaded = ResidualVQ(16, 8, levels=2)
     loaded.load_state_dict(book.state_dict())
     vectors = clusters(200, generator) + 1
     looked_up = book.eval()(vectors)
@@ -202,8 +202,8 @@ def test_code_use_adds_up_over_updates() -> None:
 
 
 def test_half_precision_autocast_looks_up_in_float32(generator: torch.Generator) -> None:
-    book = Codebook(64, 8)
-    book.start(clusters(500, generator), generator)
+    book = ResidualVQ(64, 8)
+    book.kmeans_init(clusters(500, generator), generator)
     book.eval()
     vectors = clusters(100, generator)
     with torch.autocast("cpu", torch.bfloat16):
@@ -216,8 +216,8 @@ def test_half_precision_autocast_looks_up_in_float32(generator: torch.Generator)
 
 def _rank(rank: int, world: int, folder: str) -> None:
     torch.set_num_threads(1)
-    book = Codebook(16, 8, levels=2)  # made before the process group, as Lightning does
-    given = Codebook(16, 8, revive_below=0.0)
+    book = ResidualVQ(16, 8, levels=2)  # made before the process group, as Lightning does
+    given = ResidualVQ(16, 8, revive_below=0.0)
     given.load_state_dict(torch.load(f"{folder}/given.pt"))
     meet = f"file://{folder}/meet"
     patience = datetime.timedelta(seconds=60)
@@ -234,15 +234,15 @@ def _rank(rank: int, world: int, folder: str) -> None:
 
 
 def test_codebooks_of_two_processes_stay_bit_identical(tmp_path: Path, generator: torch.Generator) -> None:
-    alone = Codebook(16, 8, revive_below=0.0)
-    alone.start(clusters(300, generator), generator)
+    alone = ResidualVQ(16, 8, revive_below=0.0)
+    alone.kmeans_init(clusters(300, generator), generator)
     torch.save(alone.state_dict(), tmp_path / "given.pt")
     # Forked and not spawned: importing torch anew takes half a minute on a busy machine.
     mp.start_processes(_rank, args=(2, str(tmp_path)), nprocs=2, start_method="fork")
     (mine, given, vectors, counts), (other, other_given, more, _) = (
         torch.load(tmp_path / f"{rank}.pt") for rank in range(2)
     )
-    assert bool(mine["started"])
+    assert bool(mine["initialized"])
     assert all(torch.equal(mine[name], other[name]) for name in mine)
     assert all(torch.equal(given[name], other_given[name]) for name in given)
     assert counts[0].sum() == len(vectors) + len(more)

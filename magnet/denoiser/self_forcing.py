@@ -21,7 +21,7 @@ FAINTEST, CLEAREST = 0.75, 0.1
 
 
 @torch.no_grad()
-def with_own_past(
+def with_self_forcing(
     model: Denoiser, truth: Tensor, levels: Tensor, scene: Scene, share: float, generator: torch.Generator
 ) -> Tensor:
     """Normalised tokens in which some scenes' clean pasts are the model's own work, and all else is the truth.
@@ -32,7 +32,7 @@ def with_own_past(
 
     Args:
         model: the denoiser.
-        truth: (B, N, P, D) normalised.
+        truth: (B, N, P, D) normalized.
         levels: (B, N, P) int; the past of an agent is what is clean before something that is not.
         scene: the same scenes, of P agents.
         share: of the scenes that have a past.
@@ -54,7 +54,7 @@ def with_own_past(
     noisy = add_noise(truth[few], noise, layout.spread(layout.group_levels(drowned)))
     restored = model.denoise(noisy, drowned, scene.present[few]).float()
     with torch.autocast(truth.device.type, enabled=False):
-        latent, steps, _ = layout.unpack(model.statistics.restore(restored))
+        latent, steps, _ = layout.unpack(model.normalizer.denormalize(restored))
         own = by_frame(past[..., None, None].expand(*past.shape, steps.shape[-2], 1))[..., 0]  # (b, T, P)
         T_prev_can = project_se2(from_9d(by_frame(steps)))
         T_prev_can[:, 0] = torch.eye(4, device=truth.device)
@@ -67,8 +67,8 @@ def with_own_past(
             present=scene.present[few],
         )
         T_world_can = torch.where(own[..., None, None], placed, T_world_can)
-        latent = model.tokenizer.requantise(latent) if model.quantised else latent
-        made = model.statistics.normalise(layout.pack(latent, *transforms(T_world_can)))
+        latent = model.tokenizer.requantize(latent) if model.quantized else latent
+        made = model.normalizer.normalize(layout.pack(latent, *transforms(T_world_can)))
     moved = past[..., None]
     if layout.slots:  # a pairwise transform moves with either of its ends, where it is shown at all
         either = past[..., None] | past[..., partners(layout.agents, past.device)]

@@ -20,7 +20,7 @@ CROWD = 4.0
 
 
 @dataclass(frozen=True)
-class Quantised:
+class Quantized:
     """What a codebook makes of vectors (..., D)."""
 
     latent: Tensor  # (..., D) sum of the chosen codes; gradients pass straight to the vectors
@@ -29,8 +29,8 @@ class Quantised:
     counts: Tensor  # (levels, codes) how often each code was chosen, over all processes in training
 
 
-class Codebook(Float32):
-    """Residual vector quantiser: each level holds codes for what the levels before it left over.
+class ResidualVQ(Float32):
+    """Residual vector quantizer: each level holds codes for what the levels before it left over.
 
     Codes are buffers: no gradient moves them. In training mode they follow the vectors that chose them, by an
     exponential moving average; in evaluation, or when `frozen`, nothing moves. Whether to sum over processes
@@ -50,7 +50,7 @@ class Codebook(Float32):
     codes: Tensor  # (levels, codes, D)
     ema_count: Tensor  # (levels, codes)
     ema_sum: Tensor  # (levels, codes, D)
-    started: Tensor  # () bool
+    initialized: Tensor  # () bool
 
     def __init__(
         self, codes: int = 1024, dim: int = 512, levels: int = 1, decay: float = 0.99, revive_below: float = 1.0
@@ -62,13 +62,13 @@ class Codebook(Float32):
         self.register_buffer("codes", torch.zeros(levels, codes, dim))
         self.register_buffer("ema_count", torch.ones(levels, codes))
         self.register_buffer("ema_sum", torch.zeros(levels, codes, dim))
-        self.register_buffer("started", torch.tensor(False))
+        self.register_buffer("initialized", torch.tensor(False))
 
     # -- looking up ----------------------------------------------------------------------------
 
     def forward(
         self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> Quantised:
+    ) -> Quantized:
         """Nearest codes; in training the codes then move.
 
         Args:
@@ -80,8 +80,8 @@ class Codebook(Float32):
             flat = vectors.float().flatten(0, -2)
             keep = torch.ones_like(flat[:, 0], dtype=torch.bool) if mask is None else mask.flatten()
             update = self.training and not self.frozen
-            if update and not bool(self.started):
-                self.start(flat.detach()[keep], generator)
+            if update and not bool(self.initialized):
+                self.kmeans_init(flat.detach()[keep], generator)
             residual, latent = flat, torch.zeros_like(flat)
             index, commitment, counts = [], flat.new_zeros(()), []
             for level in range(self.levels):
@@ -89,12 +89,12 @@ class Codebook(Float32):
                 code = self.codes[level][chosen]
                 distance = (residual - code).square().mean(-1)
                 commitment = commitment + torch.where(keep, distance, 0.0).sum() / keep.sum().clamp(min=1)
-                counts.append(self._follow(residual.detach(), chosen, keep, level, generator, update))
+                counts.append(self.ema_update(residual.detach(), chosen, keep, level, generator, update))
                 index.append(torch.where(keep, chosen, -1))
                 latent, residual = latent + code, residual - code
             if flat.requires_grad:
                 latent = flat + (latent - flat).detach()
-            return Quantised(
+            return Quantized(
                 latent=latent.view(vectors.shape),
                 index=torch.stack(index, dim=-1).view(*vectors.shape[:-1], self.levels),
                 commitment=commitment / self.levels,
@@ -118,7 +118,7 @@ class Codebook(Float32):
     # -- following -----------------------------------------------------------------------------
 
     @torch.no_grad()
-    def _follow(
+    def ema_update(
         self,
         vectors: Tensor,
         chosen: Tensor,
@@ -168,7 +168,7 @@ class Codebook(Float32):
     # -- starting ------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def start(self, vectors: Tensor, generator: torch.Generator | None = None) -> None:
+    def kmeans_init(self, vectors: Tensor, generator: torch.Generator | None = None) -> None:
         """Set the codes by k-means over the vectors (M, D) of all processes; called once, by training.
 
         With fewer vectors than codes, codes start equal and are told apart by revival. No vectors: no start.
@@ -183,7 +183,7 @@ class Codebook(Float32):
             pool = pool - codes[_nearest(pool, codes)]
         self.ema_count.fill_(1.0)
         self.ema_sum.copy_(self.codes)
-        self.started.fill_(True)
+        self.initialized.fill_(True)
 
 
 def _nearest(vectors: Tensor, codes: Tensor) -> Tensor:

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from magnet.denoiser.own_past import with_own_past
+from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.motion.frames import from_9d, propagated
-from magnet.motion.tokens import by_frame, relations_by_frame
+from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.testing import random_scene, tiny_denoiser
 
 PAST = 4
@@ -23,9 +23,9 @@ def scene():
 
 
 def shown(model, scene, levels, share=1.0, seed=1):
-    truth = model.statistics.normalise(model.tokenize(scene)[0])
+    truth = model.normalizer.normalize(model.tokenize(scene)[0])
     generator = torch.Generator().manual_seed(seed)
-    return truth, with_own_past(model, truth, levels, scene, share, generator)
+    return truth, with_self_forcing(model, truth, levels, scene, share, generator)
 
 
 def rolled_out() -> torch.Tensor:
@@ -47,15 +47,15 @@ def test_only_the_past_of_those_who_are_generated_is_made_anew(model, scene):
 def test_steps_and_pairwise_transforms_of_a_made_past_agree(model, scene):
     """As those of finished tokens do: each frame's relation follows from the frame before and the steps (Eq. 11)."""
     _, made = shown(model, scene, rolled_out())
-    _, steps, relations = model.layout.unpack(model.statistics.restore(made[:, :PAST]))
-    T_self_partner, T_prev_can = from_9d(relations_by_frame(relations)), from_9d(by_frame(steps))
+    _, steps, pairs = model.layout.unpack(model.normalizer.denormalize(made[:, :PAST]))
+    T_self_partner, T_prev_can = from_9d(pairwise_by_frame(pairs)), from_9d(by_frame(steps))
     torch.testing.assert_close(propagated(T_self_partner, T_prev_can), T_self_partner[:, 1:], atol=1e-4, rtol=0)
 
 
 def test_latents_of_a_made_past_are_codes(model, scene):
     _, made = shown(model, scene, rolled_out())
-    latent = model.layout.unpack(model.statistics.restore(made))[0][:, :PAST, :2]
-    torch.testing.assert_close(model.tokenizer.requantise(latent), latent, atol=1e-5, rtol=0)
+    latent = model.layout.unpack(model.normalizer.denormalize(made))[0][:, :PAST, :2]
+    torch.testing.assert_close(model.tokenizer.requantize(latent), latent, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("level", [0, 700])

@@ -1,0 +1,78 @@
+"""Checkpoints and configurations of earlier versions are read as this version would have written them."""
+
+import json
+
+import pytest
+import torch
+import yaml
+
+from magnet import weights
+from magnet.cli.config_files import read_layers
+from magnet.denoiser.module import Denoiser
+from magnet.old_names import OPTIONS, STATE, renamed_checkpoint, renamed_config, renamed_options, renamed_state
+
+OLD = """
+model:
+  class_path: Denoiser
+  init_args:
+    target: quantised
+    relation_noise: token
+    relation_weight: 2.0
+trainer:
+  callbacks:
+    - class_path: magnet.denoiser.averaging.WeightEMA
+      init_args:
+        decay: 0.9
+"""
+
+
+def test_the_shipped_weights_load_whole_although_they_have_the_old_names():
+    stored = json.loads((weights.FOLDER / "duet" / "config.json").read_text())
+    assert "relation_noise" in stored["hyper_parameters"], "written before names changed"
+    checkpoint = weights.read(weights.resolve("duet"))
+    model = Denoiser.load("duet")
+    assert checkpoint["state_dict"].keys() == model.state_dict().keys()
+    assert bool(model.normalizer.ready) and bool(model.tokenizer.quantizer.initialized)
+
+
+def test_a_checkpoint_is_renamed_once_and_not_changed_in_place():
+    old = {
+        "state_dict": {"statistics.count": torch.tensor(7), "transformer.leave.bias": torch.ones(2)},
+        "current_model_state": {"tokenizer.codebook.started": torch.tensor(True)},
+        "hyper_parameters": {"relations": False, "width": 8},
+        "tokenizer_hyper_parameters": {"std_floor": 0.01},
+    }
+    new = renamed_checkpoint(old)
+    assert new["state_dict"].keys() == {"normalizer.ready", "transformer.out_proj.bias"}
+    assert new["state_dict"]["normalizer.ready"].dtype == torch.bool and bool(new["state_dict"]["normalizer.ready"])
+    assert new["current_model_state"].keys() == {"tokenizer.quantizer.initialized"}
+    assert "statistics.count" in old["state_dict"] and "relations" in old["hyper_parameters"]
+    again = renamed_checkpoint(new)
+    assert again["state_dict"].keys() == new["state_dict"].keys()
+    assert again["hyper_parameters"] == new["hyper_parameters"]
+
+
+def test_an_old_file_is_read_and_told_about_in_one_line(tmp_path, capsys):
+    (tmp_path / "old.yaml").write_text(OLD)
+    (layer,) = read_layers(str(tmp_path / "old.yaml"))
+    assert layer.options == renamed_config(yaml.safe_load(OLD))[0] != yaml.safe_load(OLD)
+    assert layer.options["trainer"]["callbacks"][0]["class_path"] == "magnet.training.ema.WeightEMA"
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and "old.yaml" in said[0] and "model.relation_noise is now" in said[0]
+
+
+@pytest.mark.parametrize("kind", sorted(OPTIONS))
+def test_no_new_name_is_an_old_one(kind):
+    for old, new in OPTIONS[kind].items():
+        assert new is None or new not in OPTIONS[kind], f"{old} would be renamed twice"
+        once, _ = renamed_options(kind, {old: 1})
+        assert renamed_options(kind, once) == (once, {})
+
+
+def test_what_is_said_under_the_new_name_beats_the_old_one():
+    assert renamed_options("Denoiser", {"relations": True, "pairwise": False})[0] == {"pairwise": False}
+
+
+def test_weights_of_no_old_name_stay():
+    state = {"transformer.blocks.0.qkv.weight": torch.ones(1), "step": torch.ones(1)}
+    assert renamed_state(state) == state and STATE
