@@ -29,7 +29,12 @@ UPRIGHT = 1e-3
 
 
 def inverse(T_a_b: Tensor) -> Tensor:
-    """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)"""
+    """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)
+
+    >>> T_world_ann = rigid(about_y(torch.tensor(1.0)), torch.tensor([2.0, 0.0, 3.0]))
+    >>> torch.allclose(inverse(T_world_ann) @ T_world_ann, torch.eye(4), atol=1e-6)
+    True
+    """
     R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
     return rigid(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
 
@@ -43,7 +48,11 @@ def rigid(R_a_b: Tensor, t_a_b: Tensor) -> Tensor:
 
 
 def to_9d(T_a_b: Tensor) -> Tensor:
-    """Rotation in 6-D, then translation in metres. (..., 4, 4) -> (..., 9)"""
+    """Rotation in 6-D, then translation in metres. (..., 4, 4) -> (..., 9)
+
+    >>> to_9d(rigid(torch.eye(3), torch.tensor([0.5, 0.0, 2.0])))
+    tensor([1.0000, 0.0000, 0.0000, 0.0000, 1.0000, 0.0000, 0.5000, 0.0000, 2.0000])
+    """
     return torch.cat([to_6d(T_a_b[..., :3, :3]), T_a_b[..., :3, 3]], dim=-1)
 
 
@@ -53,7 +62,12 @@ def from_9d(nine: Tensor) -> Tensor:
 
 
 def to_planar(T_a_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped."""
+    """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped.
+
+    >>> yaw, ground = to_planar(rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0])))
+    >>> yaw, ground
+    (tensor(0.3000), tensor([1., 2.]))
+    """
     return yaw_of(T_a_b[..., :3, :3]), T_a_b[..., [0, 2], 3]
 
 
@@ -84,6 +98,10 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
     The yaw comes from the pelvis's left axis, which stays horizontal in bows and dips where a forward
     axis would flip. Of a person lying exactly on the side the forward axis, then horizontal, decides. Each frame
     is judged by itself, so that it does not matter which others are known.
+
+    >>> T_world_root = rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0]))  # a pelvis 0.9 m up
+    >>> canonical_frame(T_world_root)[:3, 3]
+    tensor([1., 0., 2.])
     """
     left, forward = T_world_root[..., :3, 0], T_world_root[..., :3, 2]
     upright = left[..., [0, 2]].norm(dim=-1) >= UPRIGHT
@@ -95,7 +113,13 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
 
 
 def canonical_steps(T_world_can: Tensor) -> Tensor:
-    """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same"""
+    """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same
+
+    >>> T_world_can = torch.eye(4).repeat(3, 1, 1, 1)  # three frames of one person
+    >>> T_world_can[:, 0, 2, 3] = torch.tensor([0.0, 0.1, 0.3])  # who walks forward, along z
+    >>> canonical_steps(T_world_can)[:, 0, 2, 3]
+    tensor([0.0000, 0.1000, 0.2000])
+    """
     before = torch.cat([T_world_can[..., :1, :, :, :], T_world_can[..., :-1, :, :, :]], dim=-4)
     steps = inverse(before) @ T_world_can
     steps[..., :1, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
@@ -103,13 +127,25 @@ def canonical_steps(T_world_can: Tensor) -> Tensor:
 
 
 def partners(agents: int, device: torch.device | None = None) -> Tensor:
-    """Which agent each partner slot of an agent points at: everybody else, in order. (P, P - 1) int"""
+    """Which agent each partner slot of an agent points at: everybody else, in order. (P, P - 1) int
+
+    >>> partners(3)
+    tensor([[1, 2],
+            [0, 2],
+            [0, 1]])
+    """
     everyone = torch.arange(agents, device=device).expand(agents, agents)
     return everyone[~torch.eye(agents, dtype=torch.bool, device=device)].view(agents, agents - 1)
 
 
 def pairwise(T_world_can: Tensor) -> Tensor:
-    """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)"""
+    """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)
+
+    >>> yaws, ground = torch.tensor([0.0, torch.pi]), torch.tensor([[0.0, 0.0], [0.0, 2.0]])
+    >>> T_self_partner = pairwise(from_planar(yaws, ground))  # two people face each other, 2 m apart
+    >>> T_self_partner[:, 0, 2, 3]  # so each has the other 2 m in front
+    tensor([2., 2.])
+    """
     T_world_partner = T_world_can[..., partners(T_world_can.shape[-3], T_world_can.device), :, :]
     return inverse(T_world_can)[..., None, :, :] @ T_world_partner
 

@@ -24,6 +24,9 @@ def alpha_bar(levels: Tensor, K: int = LEVELS) -> Tensor:
 
     The paper's formula is 0.99984 at level 0; divided by that, level 0 is clean bit for bit. Level K is
     exactly 0, so nothing of the truth survives in a token at level K.
+
+    >>> alpha_bar(torch.tensor([0, 500, 1000]))  # all of the signal, about half of its variance, none
+    tensor([1.0000, 0.4938, 0.0000])
     """
     return _shares(K, levels.device)[levels]
 
@@ -62,6 +65,11 @@ def ddim_step(
         eta: how much of the noise that is left is new: 0 none, the deterministic step; 1 as in ancestral sampling.
         step_noise: (..., D) new standard normal noise; needed where eta is not 0.
         K: number of levels.
+
+    >>> clean, noise = torch.tensor([2.0]), torch.tensor([1.0])
+    >>> noisy = add_noise(clean, noise, torch.tensor([800]))
+    >>> ddim_step(noisy, clean, now=torch.tensor([800]), after=torch.tensor([0]))  # at level 0: what was predicted
+    tensor([2.])
     """
     a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
     # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
@@ -94,6 +102,11 @@ def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
 
     Raises:
         ValueError: fewer than one step, or so many that two would be at one level; says how many can be.
+
+    >>> ddim_levels(5)
+    tensor([1000,  800,  600,  400,  200,    0])
+    >>> ddim_levels(5, shift=3.0)  # more of the steps where there is much noise
+    tensor([1000,  923,  818,  667,  429,    0])
     """
     require_whole("denoising steps", steps, 1, K)
     require_number("shift", shift, over=0)
@@ -134,6 +147,9 @@ def log_snr_levels(steps: int, K: int = LEVELS) -> Tensor:
 
     Raises:
         ValueError: fewer than one step, or more than there are levels.
+
+    >>> log_snr_levels(5)
+    tensor([1000,  790,  255,   34,    2,    0])
     """
     require_whole("denoising steps", steps, 1, K)
     length = min((LOWEST_NOISE - HIGHEST_NOISE) / max(steps - 1, 1), LONGEST_STEP)

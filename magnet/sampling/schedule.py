@@ -86,6 +86,14 @@ class MaskSchedule:
 
     Raises:
         ValueError: a law is broken; names the stage, step, token and agent.
+
+    >>> grid = Grid(tokens=4, agents=2, context=2, steps=2)
+    >>> plan = MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)  # go on from two known tokens
+    >>> for row in plan.rows():
+    ...     print(row[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step
+    [0, 0, 1000, 1000]
+    [0, 0, 500, 500]
+    [0, 0, 0, 0]
     """
 
     tokens: int
