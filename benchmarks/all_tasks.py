@@ -64,11 +64,11 @@ def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
         "joint_future, HG w = 1": guided(kind="history"),
         "joint_future, SHG w = 1": guided(kind="self"),
         "joint_future, PHG w = 1": guided(kind="partner"),
-        "joint_future, SHG as printed": guided(kind="self", literal=True),
+        "joint_future, SHG as printed": guided(kind="self", paper_average=True),
         "joint_future, HG w = 0.2": guided(kind="history", weight=0.2),
         "joint_future, smoothing 0.01": guided(smooth=0.01),
-        "joint_future, context level 30": guided(context_level=30),
-        "joint_future, in strides": replace(options, rolling=0),
+        "joint_future, context level 30": guided(stabilization_level=30),
+        "joint_future, in strides": replace(options, pyramid_offset=0),
         "joint_future, sampled as in the paper": SamplerOptions.preset("paper", steps=options.steps),
     }
     return {name: (task, options) for name, task in plain.items()} | {
@@ -167,8 +167,8 @@ def main() -> None:
     print(found.to_markdown(shown))
     for name in found.rows:
         meta = found.meta.get(name, {})
-        if "health" in meta:
-            print(f"{name}: {meta['seconds']['magnet']:.0f} s, {meta['health']}")
+        if "sampling" in meta:
+            print(f"{name}: {meta['seconds']['magnet']:.0f} s, {meta['sampling']}")
 
 
 if __name__ == "__main__":

@@ -248,9 +248,9 @@ def make(store: Path, frames: int, clip_frames: int = 300, persons: int = 2) -> 
     """A store of so many frames, written as `prepare` does, of few different clips in turn."""
     from magnet.datamodules.fakes.body import write_body
     from magnet.datamodules.fakes.motion import made_up_body, people
-    from magnet.datamodules.preparing.canonicalize import to_clips
-    from magnet.datamodules.preparing.convert import Part
-    from magnet.datamodules.preparing.pack import Source, pack
+    from magnet.datamodules.preparing.canonicalize import canonicalize
+    from magnet.datamodules.preparing.convert import ConvertedTake
+    from magnet.datamodules.preparing.pack import PackSource, pack
     from magnet.datamodules.preparing.prepare import SHARD_ROWS
     from magnet.datamodules.reading.recording import Recording, Take
     from magnet.datamodules.store.reader import body_hash, encode
@@ -259,18 +259,18 @@ def make(store: Path, frames: int, clip_frames: int = 300, persons: int = 2) -> 
     for seed in range(16):
         m = people(clip_frames, persons, seed=seed)
         recording = Recording(m.fps, m.up, poses=m.poses, transl=m.transl, betas=m.betas)
-        (clip,) = to_clips(recording, body, "walk", "walks", "train").clips
+        (clip,) = canonicalize(recording, body, "walk", "walks", "train").clips
         betas = clip.scene.betas[0].numpy()
-        parts.append(Part(None, (), ("walk",), (clip_frames,), (persons,), betas, encode(clip.scene)))
+        parts.append(ConvertedTake(None, (), ("walk",), (clip_frames,), (persons,), betas, encode(clip.scene)))
 
     @dataclass(frozen=True)
-    class Walk(Source):
+    class Walk(PackSource):
         number: int = 0
 
-        def head(self, old: Any) -> Part:
+        def head(self, old: Any) -> ConvertedTake:
             return replace(self.whole(old), rows=parts[0].rows[:0])
 
-        def whole(self, old: Any) -> Part:
+        def whole(self, old: Any) -> ConvertedTake:
             return replace(parts[self.number % len(parts)], names=(self.take.name,))
 
     begin = time.perf_counter()

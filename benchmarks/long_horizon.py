@@ -114,9 +114,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1800)
     parser.add_argument("--scenes", type=int, default=6, help="starts, evenly spaced over the test takes")
     parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--rolling", type=int, default=None, help="0: in strides; default: as tasks do by themselves")
+    parser.add_argument(
+        "--pyramid_offset", type=int, default=None, help="0: in strides; default: as tasks do by themselves"
+    )
     parser.add_argument("--guidance", type=float, default=0.0, help="weight of history guidance")
-    parser.add_argument("--context_level", type=int, default=100, help="noise level at which finished tokens are shown")
+    parser.add_argument(
+        "--stabilization_level", type=int, default=100, help="noise level at which finished tokens are shown"
+    )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
     given = parser.parse_args()
     body, model = load_body(), Denoiser.load(given.ckpt_path)
@@ -127,8 +131,10 @@ def main() -> None:
         for k in range(clip.frames // WINDOW)
     ]
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
-    guidance = Guidance("history" if given.guidance else "none", given.guidance, context_level=given.context_level)
-    options = SamplerOptions(steps=given.steps, rolling=given.rolling, guidance=guidance)
+    guidance = Guidance(
+        "history" if given.guidance else "none", given.guidance, stabilization_level=given.stabilization_level
+    )
+    options = SamplerOptions(steps=given.steps, pyramid_offset=given.pyramid_offset, guidance=guidance)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):

@@ -22,7 +22,7 @@ from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import cat_time
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.world import Health
+from magnet.generation.world import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[1800, 20_000], help="lengths to measure")
     parser.add_argument("--task", default="joint_future", help="name of a task, as `magnet tasks` lists them")
     parser.add_argument("--steps", type=int, help="denoising steps; the toy's default is 2, a model's 30")
-    parser.add_argument("--rolling", type=int, default=None, help="denoising steps between a token and the next")
+    parser.add_argument("--pyramid_offset", type=int, default=None, help="denoising steps between a token and the next")
     parser.add_argument("--coupling", default="circle", help="what the synthetic people in the context do")
     parser.add_argument("--people", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -66,8 +66,10 @@ def measure(options: argparse.Namespace) -> None:
     task = registry.get(options.task)()
     model = tiny_denoiser(max_agents=2, window=16) if options.model == TOY else Denoiser.load(options.model)
     context = 0 if options.task == "generation" else CONTEXT
-    sampler = SamplerOptions(steps=options.steps or (2 if options.model == TOY else 30), rolling=options.rolling)
-    health = Health()
+    sampler = SamplerOptions(
+        steps=options.steps or (2 if options.model == TOY else 30), pyramid_offset=options.pyramid_offset
+    )
+    stats = SamplingStats()
     scene = recorded(options, frames if given_later(task, context) else context)
     empty = resident()
     began = time.perf_counter()
@@ -78,7 +80,7 @@ def measure(options: argparse.Namespace) -> None:
         frames - context,
         options=sampler,
         generator=torch.Generator().manual_seed(options.seed),
-        health=health,
+        stats=stats,
     )
     first = last = next(pieces)
     kept: list[Scene] = [first]
@@ -94,7 +96,7 @@ def measure(options: argparse.Namespace) -> None:
     print(
         f"{options.model} {options.task}: {frames} frames, {frames / seconds:.1f} frames/s, "
         f"plan {(planned - empty) / MIB:.0f} MiB, grown {(most - planned) / MIB:.0f} MiB, "
-        f"peak {peak() / MIB:.0f} MiB, finite {finite}, {health.means()}"
+        f"peak {peak() / MIB:.0f} MiB, finite {finite}, {stats.means()}"
     )
     for name, piece in (("first", first.slice(context)), ("last", last)):
         print(f"  {name} piece: {looks(piece)}")

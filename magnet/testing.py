@@ -92,9 +92,9 @@ TASK_GRIDS = (
     Grid(24, 1, 1, steps=2),
     Grid(12, 2, 0, steps=3, window=8, stride=2),
     Grid(9, 3, 0, steps=1),
-    Grid(20, 2, 4, steps=6, window=8, rolling=2),
-    Grid(20, 2, 4, steps=6, window=8, rolling=None),
-    Grid(20, 2, 4, steps=9, window=8, rolling=1),
+    Grid(20, 2, 4, steps=6, window=8, pyramid_offset=2),
+    Grid(20, 2, 4, steps=6, window=8, pyramid_offset=None),
+    Grid(20, 2, 4, steps=9, window=8, pyramid_offset=1),
 )
 """Long and short scenes of one to four agents, with a past and without, in strides, rolling and in pyramids."""
 
@@ -254,14 +254,14 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
-    tokens, noise, veil, other = (torch.randn(shape, generator=generator) for _ in range(4))
+    tokens, noise, mask_noise, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     canvas = begin(tokens, noise, schedule.known, layout)
     history = History.empty(canvas)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
         before, past = canvas, history.copy()
-        canvas = run_stages(mixing, [stage], before, veil, present, layout, guidance=guidance, history=history)
+        canvas = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
         if stage.hidden is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -278,7 +278,9 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
 
             # Smoothing follows what is said of everybody, in each agent's own view: not told by what is hidden.
             model = mixing if guidance is not None and guidance.smooth else lying
-            after = run_stages(model, [stage], changed, veil, present, layout, guidance=guidance, history=remembered)
+            after = run_stages(
+                model, [stage], changed, mask_noise, present, layout, guidance=guidance, history=remembered
+            )
             same = ((after == canvas)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
@@ -317,9 +319,9 @@ def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
 def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, drawn: Sequence[Tensor]) -> Tensor:
     """A sample of a model that knows no slots, of people in the first ones.
 
-    drawn: what is given, noise and veil (B, N, P, D) -> (B, N, P, D)
+    drawn: what is given, noise and mask_noise (B, N, P, D) -> (B, N, P, D)
     """
-    tokens, noise, veil = drawn
+    tokens, noise, mask_noise = drawn
     P = layout.agents
     there = torch.arange(P) < people
     both = there[:, None] & there[partners(P)] if layout.slots else there[:, None]
@@ -335,7 +337,7 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
         return layout.pack(latent, steps, torch.tanh(pairs + steps.mean(dim=(-1, -2))[..., None, None, None]))
 
     canvas = begin(tokens, noise, schedule.known, layout)
-    return run_stages(blind, schedule.stages, canvas, veil, there.expand(len(tokens), P), layout)
+    return run_stages(blind, schedule.stages, canvas, mask_noise, there.expand(len(tokens), P), layout)
 
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:

@@ -154,13 +154,13 @@ class OtherNoise(NoiseStream):
         super().__init__(plain.shape, torch.Generator().manual_seed(5), plain.device, plain.dtype, plain.eta)
         self.plain, self.tokens, self.row = plain, tokens, 0
 
-    def rows(self, count: int) -> tuple[Tensor, Tensor]:
-        fresh, veil = self.plain.rows(count)
-        mine, _ = super().rows(count)
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        init_noise, mask_noise = self.plain.draw(count)
+        mine, _ = super().draw(count)
         there = self.tokens[self.row : self.row + count, :, None]
         self.row += count
-        return torch.where(there, mine, fresh), veil
+        return torch.where(there, mine, init_noise), mask_noise
 
-    def at(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
+    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
         there = self.tokens[first : first + len(levels), :, None]
-        return torch.where(there, super().at(first, levels, moves), self.plain.at(first, levels, moves))
+        return torch.where(there, super().step_noise(first, levels, moves), self.plain.step_noise(first, levels, moves))

@@ -117,5 +117,5 @@ def test_denoising_steps_are_one_to_a_thousand(steps):
 
 def test_the_grid_takes_whatever_the_sampler_does():
     """Options that are accepted plan: no number passes one check and fails another without a word."""
-    options = SamplerOptions(steps=335, stride=8, rolling=None)
+    options = SamplerOptions(steps=335, stride=8, pyramid_offset=None)
     assert planning_grid(24, 2, 4, 8, options).steps == 335

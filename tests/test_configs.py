@@ -13,7 +13,7 @@ import yaml
 
 from magnet import cli
 from magnet.cli.config_files import read_layers
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 from magnet.sampling.presets import PRESETS
 
 ROOT = Path(__file__).parents[1] / "configs"
@@ -182,7 +182,7 @@ def prepared(name: str, folder: Path) -> tuple[str, ...]:
     download, store = folder / f"{name}_download", folder / name
     words = FAKES.get(name, ("--frames", "80", "--takes", "4"))
     assert cli.main(["data", "fake", name, str(download), *words]) == 0
-    fitted = catalogue.find(name).load_reader().family == "positions"
+    fitted = registry.reader(name).family == "positions"
     body = ("--min_frames", "8") if fitted else ("--body", str(download / "body.npz"))
     prepare = ("--root", str(download), "--out", str(store), "--workers", "1", *body)
     assert cli.main(["data", "prepare", name, *prepare]) == 0

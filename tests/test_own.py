@@ -111,8 +111,8 @@ def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path, monkeypatch, capsy
 
 def test_every_option_that_the_page_names_is_there() -> None:
     from magnet.cli.data_options import reader_parser
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
 
-    known = {flag for name in catalogue.OWN for action in reader_parser(catalogue.find(name).load_reader())._actions
+    known = {flag for kind in registry.readers().values() if kind.own for action in reader_parser(kind)._actions
              for flag in action.option_strings}  # fmt: skip
     assert set(re.findall(r"--reader\.\w+", PAGE)) <= known

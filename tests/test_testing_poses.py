@@ -41,11 +41,11 @@ def test_among_three_each_knows_what_it_may():
 @pytest.mark.parametrize(
     "options",
     [
-        SamplerOptions(paste=False),
+        SamplerOptions(keep_given=False),
         SamplerOptions(requantize=False, placement="anchor", blend=0, eta=0.0),
         SamplerOptions(guidance=Guidance("partner")),
         SamplerOptions(guidance=Guidance(smooth=0.01)),
-        SamplerOptions(guidance=Guidance("history", context_level=50)),
+        SamplerOptions(guidance=Guidance("history", stabilization_level=50)),
     ],
     ids=["bare", "anchor", "partner", "smooth", "history"],
 )
@@ -90,7 +90,7 @@ class Peeking:
     def schedule(self, grid: Grid) -> MaskSchedule:
         known = grid.past()
         known[:, 1:] = True
-        return dataclasses.replace(MaskSchedule.blocks(known, ~known, grid), lookahead=False)
+        return dataclasses.replace(MaskSchedule.autoregressive(known, ~known, grid), lookahead=False)
 
 
 def test_a_plan_that_shows_what_comes_next_is_found():

@@ -120,7 +120,7 @@ def import_named(given: Arguments) -> None:
     Raises:
         CommandError: such a module is there and cannot be imported.
     """
-    from magnet.datamodules.plugins import import_local
+    from magnet.datamodules.registry import import_local
 
     named = [(f"--{key}", given.class_of(key)) for key in ("model", "data")]
     named += [(layer.path or "a file", path) for layer in given.layers for path in class_paths(layer.options)]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli.data_list import add_list, run_list
-from magnet.cli.data_options import all_reader_options, order_of, reader_parser
+from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
     bar,
     clips_by_people,
@@ -25,7 +25,7 @@ from magnet.cli.errors import CommandError, no_such
 
 if TYPE_CHECKING:
     from magnet.body import Body
-    from magnet.datamodules.preparing.check import Checked
+    from magnet.datamodules.preparing.check import CheckReport
 
 DESCRIPTION = """\
 Prepare, check, describe, fake and download data sets.
@@ -90,11 +90,10 @@ def command_parser(command: str) -> argparse.ArgumentParser:
 
 def show_help(given: argparse.Namespace) -> int:
     """Help of a command, with a data set's own options where one is named."""
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
 
     given.parser.print_help()
-    if given.run in (run_prepare, run_check) and given.name in catalogue.NAMES:
-        kind = catalogue.find(given.name).load_reader()
+    if given.run in (run_prepare, run_check) and (kind := registry.readers().get(given.name)) is not None:
         print(f"\noptions of {kind.title}:\n")
         reader_parser(kind).print_help()
     return 0
@@ -183,10 +182,10 @@ def run_info(given: argparse.Namespace) -> int:
 
     from magnet.datamodules.preparing.check import noted
     from magnet.datamodules.preparing.prepare import absent_note
-    from magnet.datamodules.store.reader import Folder
+    from magnet.datamodules.store.reader import StoreReader
 
     (path,) = needed(given, "path")
-    folder = Folder(path)
+    folder = StoreReader(path)
     m = folder.manifest
     out = Console(highlight=False)
     out.print(f"[bold]{m['title']}[/bold]  {m['licence']}\n{m['source']}", soft_wrap=True)
@@ -248,19 +247,19 @@ def run_check(given: argparse.Namespace) -> int:
     return FAILED if found.problems else 0
 
 
-def checked_store(given: argparse.Namespace, path: Path) -> tuple[Checked, Body | None]:
+def checked_store(given: argparse.Namespace, path: Path) -> tuple[CheckReport, Body | None]:
     """What was found, and the body to draw."""
     from magnet.body import load_body
     from magnet.datamodules.preparing import check
-    from magnet.datamodules.store.reader import Folder
+    from magnet.datamodules.store.reader import StoreReader
 
     refuse_unused(given, "a store, which is checked whole, as it was prepared,")
     body = load_body(given.body) if given.body != "open" else None
     with bar() as tell:
-        return check.check_store(Folder(path), body, tell), body
+        return check.check_store(StoreReader(path), body, tell), body
 
 
-def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
+def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[CheckReport, Body]:
     """What was found, and the body to draw."""
     from magnet.datamodules.cmu import CMU
     from magnet.datamodules.preparing import check
@@ -270,15 +269,15 @@ def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[Checked, Body]:
     return check.check_cmu(data), data.body
 
 
-def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[Checked, Body]:
+def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[CheckReport, Body]:
     """What was found, and the body to draw."""
     from magnet.datamodules.preparing import check
     from magnet.datamodules.preparing.prepare import read_splits
 
-    order = order_of(given, name, str(path))
-    body, splits = order.body(), read_splits(given.splits) if given.splits else None
+    job = job_of(given, name, str(path))
+    body, splits = job.body(), read_splits(given.splits) if given.splits else None
     with bar() as tell:
-        return check.check_download(order, given.workers, splits, given.limit, tell), body
+        return check.check_download(job, given.workers, splits, given.limit, tell), body
 
 
 def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
@@ -294,19 +293,19 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 
 
 def run_prepare(given: argparse.Namespace) -> int:
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
     from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
 
     if given.place and given.out and given.place != given.out:
         raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
     given.out = given.out or given.place
     name, root, out = needed(given, "name", "root", "out")
-    order = order_of(given, name, root)
+    job = job_of(given, name, root)
     splits = read_splits(given.splits) if given.splits else None
     with bar() as tell:
-        report = prepare(order, out, workers=given.workers, splits=splits, limit=given.limit, tell=tell)
+        report = prepare(job, out, workers=given.workers, splits=splits, limit=given.limit, progress=tell)
     m = report.folder.manifest
-    for line in order.reader().summary():
+    for line in job.reader().summary():
         print(f"note: {line}")
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))
@@ -314,19 +313,19 @@ def run_prepare(given: argparse.Namespace) -> int:
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     show_gaps(clips_by_people(m))
     takes = sum(split["takes"] for split in m["splits"].values())
-    data = catalogue.find(name).data.partition(":")[2]
+    kind = registry.reader(name)
     body = "" if given.body == "open" else f" --data.body_model {given.body}"
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
-    if name in catalogue.OWN:
+    if kind.own:
         print(
             f"  magnet fit --config configs/finetune.yaml --data.path {out}{body}   # the shipped model goes on with it"
         )
-    print(f"  magnet fit --model Tokenizer --data {data} --data.path {out}{body}")
+    print(f"  {registry.fit_command(registry.data_of(kind))} --data.path {out}{body}")
     return 0
 
 
 def run_fake(given: argparse.Namespace) -> int:
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
     from magnet.datamodules.clip import at_least
     from magnet.files import writing
 
@@ -337,7 +336,7 @@ def run_fake(given: argparse.Namespace) -> int:
 
         then = f"train on it:\n  magnet fit --model Tokenizer --data CMU --data.root {folder}"
     else:
-        write = catalogue.find(name).load_fake()
+        write = registry.reader(name).write_fake
         body = "" if name == "bvh" else f" --body {folder / 'body.npz'}"
         then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE{body}"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -351,11 +350,11 @@ def run_fake(given: argparse.Namespace) -> int:
 
 
 def run_download(given: argparse.Namespace) -> int:
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
 
     (name,) = needed(given, "name")
     if name != "cmu":
-        kind = catalogue.find(name).load_reader()
+        kind = registry.reader(name)
         raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
     (out,) = needed(given, "out")
     from magnet.datamodules.reading.download import download_cmu

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from magnet.datamodules.reading.recording import Reader
+    from magnet.datamodules.registry import RegisteredData
 
 BODIES = {
     "smplx": "--body SMPLX_NEUTRAL.npz",
@@ -28,25 +29,28 @@ def add_list(one: argparse.ArgumentParser) -> None:
 def run_list(given: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from magnet.datamodules import catalogue
+    from magnet.datamodules import registry
 
     console = Console(highlight=False)
-    for name in [given.name] if given.name else [*catalogue.NAMES, *catalogue.UNPREPARED]:
-        if name in catalogue.UNPREPARED:
-            console.print(f"[bold cyan]{name}[/]", soft_wrap=True)
-            show(console, "what to do", catalogue.UNPREPARED[name])
-        else:
-            show_reader(console, name, catalogue.find(name).load_reader(), catalogue.find(name).data.partition(":")[2])
-    if not given.name:
-        show_plugins(console)
+    if given.name:
+        show_reader(console, registry.reader(given.name))
+        return 0
+    for kind in registry.readers().values():
+        show_reader(console, kind)
+    for entry in registry.entries():
+        if entry.reader is None and not entry.combines:
+            show_data(console, entry)
+    for name, error in registry.failures().items():
+        console.print(f"[bold red]{name}[/]", soft_wrap=True)
+        show(console, "failed to load", f"{type(error).__name__}: {error}")
     return 0
 
 
-def show_reader(console: Console, name: str, kind: type[Reader], data: str) -> None:
-    """One data set."""
-    from magnet.datamodules import catalogue
+def show_reader(console: Console, kind: type[Reader]) -> None:
+    """A data set whose download is prepared."""
+    from magnet.datamodules import registry
 
-    console.print(f"[bold cyan]{name}[/]  {kind.title}", soft_wrap=True)
+    console.print(f"[bold cyan]{kind.name}[/]  {kind.title}", soft_wrap=True)
     show(console, "who may use it", kind.licence)
     show(console, "where to ask", kind.source)
     wide = max((len(pattern) for pattern, _ in kind.layout), default=0)
@@ -54,27 +58,23 @@ def show_reader(console: Console, name: str, kind: type[Reader], data: str) -> N
         show(console, "" if number else "under --root", f"{pattern:<{wide}}  {what}")
     body = BODIES.get(kind.family, "")
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
-    show(console, "then", f"magnet data prepare {name} --root DOWNLOAD --out STORE {body}".rstrip())
-    if name in catalogue.OWN:
+    show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
+    if kind.own:
         show(console, "", "magnet fit --config configs/finetune.yaml --data.path STORE")
-    show(console, "", f"magnet fit --model Tokenizer --data {data} --data.path STORE{model}")
+    show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
     if body:
         show(console, "", WHERE[kind.family])
-    show(console, "to try it out", f"magnet data fake {name} FAKE")
+    if kind.fake:
+        show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
 
 
-def show_plugins(console: Console) -> None:
-    """Data sets that installed packages bring, and those that failed to load."""
-    from magnet.datamodules import plugins
+def show_data(console: Console, entry: RegisteredData) -> None:
+    """A data set that trains without being prepared."""
+    from magnet.datamodules import registry
 
-    found = plugins.discover()
-    for plugin in found.plugins:
-        console.print(f"[bold cyan]{plugin.name}[/]  of {plugin.origin}", soft_wrap=True)
-        show(console, "what it is", (plugin.data.__doc__ or "").strip().partition("\n")[0])
-        show(console, "then", f"magnet fit --model Tokenizer --data {plugin.name}")
-    for name, error in found.failures.items():
-        console.print(f"[bold red]{name}[/]", soft_wrap=True)
-        show(console, "failed to load", f"{type(error).__name__}: {error}")
+    console.print(f"[bold cyan]{entry.name}[/]  of {entry.origin}", soft_wrap=True)
+    show(console, "what it is", (entry.data.__doc__ or "").strip().partition("\n")[0])
+    show(console, "then", registry.fit_command(entry.name))
 
 
 def show(console: Console, what: str, text: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magnet.datamodules.preparing.convert import Order
+    from magnet.datamodules.preparing.convert import PrepareJob
     from magnet.datamodules.reading.recording import Reader
 
 
@@ -52,16 +52,16 @@ def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
     return {name: value for name, value in config.items() if name in flags}
 
 
-def order_of(given: argparse.Namespace, name: str, root: str) -> Order:
+def job_of(given: argparse.Namespace, name: str, root: str) -> PrepareJob:
     """What is to be prepared or checked, and how. Without --body, the body is the neutral one of --bodies."""
-    from magnet.datamodules import catalogue
-    from magnet.datamodules.preparing.canonicalize import Steps
-    from magnet.datamodules.preparing.convert import Order, families_of
+    from magnet.datamodules import registry
+    from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+    from magnet.datamodules.preparing.convert import PrepareJob, families_of
     from magnet.datamodules.preparing.genders import find_bodies
 
-    options = reader_options(catalogue.find(name).load_reader(), given.reader_options)
+    options = reader_options(registry.reader(name), given.reader_options)
     if given.body == "open" and given.bodies:
-        families = families_of(catalogue.find(name).load_reader())
+        families = families_of(registry.reader(name))
         given.body = str(find_bodies(given.bodies, families).get("neutral", "open"))
-    steps = Steps(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)
-    return Order(name, root, options, given.body, steps, tuple(given.bodies))
+    steps = CanonicalizeOptions(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)
+    return PrepareJob(name, root, options, given.body, steps, tuple(given.bodies))

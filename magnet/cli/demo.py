@@ -53,7 +53,7 @@ class Show:
         scene: coupling and number of people of the test scene it starts from; or a scene that comes with the model.
         context: frames of it that are given.
         frames: generated after them.
-        context_level: noise level at which finished tokens are shown to the model.
+        stabilization_level: noise level at which finished tokens are shown to the model.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Show:
     scene: tuple[str, int]
     context: int = CONTEXT
     frames: int = HORIZON
-    context_level: int = 0
+    stabilization_level: int = 0
 
 
 SHOWS = (
@@ -71,7 +71,7 @@ SHOWS = (
     Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
     Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
     Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
-    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, context_level=STEADY),
+    Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, stabilization_level=STEADY),
 )
 
 
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     outputs.show_results(evaluation, out, facts)
     for show in SHOWS:
         if options.sampler == "paper":  # what the shows themselves ask for suits our own way of sampling
-            show = replace(show, context_level=sampler.guidance.context_level)
+            show = replace(show, stabilization_level=sampler.guidance.stabilization_level)
         console.rule(show.name)
         for line in perform(show, model, data, sampler, out, options.minute):
             console.print(line)
@@ -142,7 +142,7 @@ def perform(
     truth = test_scene(data, *show.scene)
     generator = torch.Generator().manual_seed(data.seed)
     began = time.perf_counter()
-    sampler = replace(sampler, guidance=replace(sampler.guidance, context_level=show.context_level))
+    sampler = replace(sampler, guidance=replace(sampler.guidance, stabilization_level=show.stabilization_level))
     sampled = model.generate(truth, show.task, show.context, frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
     sampled.save(out / f"{show.name}.npz")

@@ -46,16 +46,16 @@ def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any], fu
         results if full else replace(results, rows={m: row for m, row in results.rows.items() if m not in UNALIGNED})
     )
     print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
-    print(cost(results.meta["health"]))
+    print(cost(results.meta["sampling"]))
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
     more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"
     print(f"written: {folder / 'results.json'} and .csv{more}")
 
 
-def cost(health: dict[str, float]) -> str:
+def cost(stats: dict[str, float]) -> str:
     """What sampling cost, in a line."""
-    calls, evaluations = health["calls"], health["evaluations"]
+    calls, evaluations = stats["calls"], stats["evaluations"]
     return f"sampling: {calls:.0f} network calls a batch, {evaluations:.0f} denoiser evaluations a scene"
 
 
@@ -105,7 +105,7 @@ def write_scenes(
             number += 1
     facts = evaluation.facts(model) | run_folder.provenance() | {"machine": machine()}
     (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
-    print(cost(facts["health"]))
+    print(cost(facts["sampling"]))
     print(f"written: {number} scenes of {evaluation.samples} samples to {folder / 'scenes'}")
 
 

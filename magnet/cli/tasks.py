@@ -138,7 +138,7 @@ class Shown:
         steps: denoising steps of a token; the sampler's default is 16.
         window: token steps that the model sees at once.
         stride: token steps finished before the window moves on.
-        rolling: denoising steps between a token and the next; 0: the tokens of a stride go together. By default
+        pyramid_offset: denoising steps between a token and the next; 0: the tokens of a stride go together. By default
             tasks that can roll do, as in sampling.
         noise_sampling: `joint`: agents at a time step share their level; `independent`: each token has its own.
         moments: rows of the picture at most; denoising steps between them are left out.
@@ -151,7 +151,7 @@ class Shown:
     steps: int = 6
     window: int = 8
     stride: int = 4
-    rolling: int | None = None
+    pyramid_offset: int | None = None
     noise_sampling: Literal["joint", "independent"] = "joint"
     moments: int = 16
 
@@ -181,7 +181,7 @@ def show_task(arguments: list[str]) -> int:
     except ValueError as error:
         raise CommandError(str(error)) from error
     task, shown = parse_shown(name, kind, rest)
-    sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.rolling)
+    sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
     grid = Grid(*sizes, noise_sampling=shown.noise_sampling)
     schedule = task.schedule(grid)
     formula = str(getattr(task, "formula", ""))

@@ -24,7 +24,7 @@ from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
 from magnet.cli.parser import Parser
 from magnet.cli.tasks import NamedTask, alias_path, aliases, task_of
-from magnet.datamodules.plugins import discover
+from magnet.datamodules import registry
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import Evaluation
 from magnet.files import writing
@@ -33,22 +33,7 @@ from magnet.motion.scene import Scene
 from magnet.sampling.presets import PRESETS
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
-DATA = {
-    "Synthetic": "magnet.datamodules.synthetic",
-    "CMU": "magnet.datamodules.cmu",
-    "Mixed": "magnet.datamodules.mixed",
-    "Prepared": "magnet.datamodules.prepared",
-    "DuoBox": "magnet.datamodules.duobox",
-    "DD100": "magnet.datamodules.dd100",
-    "ReMoCap": "magnet.datamodules.remocap",
-    "InterX": "magnet.datamodules.interx",
-    "Embody3D": "magnet.datamodules.embody3d",
-    "InterHuman": "magnet.datamodules.interhuman",
-    "AIOZ": "magnet.datamodules.aioz",
-    "Hi4D": "magnet.datamodules.hi4d",
-    "CHI3D": "magnet.datamodules.chi3d",
-}
-"""Classes with short names, and where they are; the first ones are the default."""
+"""Models with short names, and where they are; the first one is the default."""
 
 DEFAULT_TASK = "joint_future"
 SAMPLING = ("test", "predict")
@@ -88,9 +73,9 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     if checkpoint is not None:
         stored = checkpoint_config.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
-        layer = checkpoint_config.defaults(stored, given, command == "fit", path_of(DATA), keep_data)
+        layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
     elif command == "fit" and (start := given.option("model", "start_from")):
-        layer = checkpoint_config.started(start, given, MODELS, path_of(DATA))
+        layer = checkpoint_config.started(start, given, MODELS, registry.default_path())
     folder = run_folder.run_folder(RUNS / name, out)
     preset, words = sampler_words(command, words)
     settled = class_options.settle([Layer("", layer), *given.layers, Layer("", preset)], words)
@@ -105,11 +90,8 @@ def run_trainer(command: str, arguments: list[str]) -> int:
 
 def named_classes() -> tuple[dict[str, type], dict[str, type]]:
     """Models and data sets with short names; importing them is what makes the short names work."""
-
-    def load(classes: dict[str, str]) -> dict[str, type]:
-        return {name: getattr(importlib.import_module(module), name) for name, module in classes.items()}
-
-    return load(MODELS), load(DATA) | {one.name: one.data for one in discover().plugins}
+    models = {name: getattr(importlib.import_module(module), name) for name, module in MODELS.items()}
+    return models, dict(registry.classes())
 
 
 def path_of(classes: dict[str, str]) -> str:
@@ -223,7 +205,7 @@ class MagnetCLI(LightningCLI):
         assert isinstance(parser, Parser)
         Parser.root, parser.command, parser.arguments = parser, self.command, self.arguments
         parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.classes
-        self._default_class(parser, "data", path_of(DATA))
+        self._default_class(parser, "data", registry.default_path())
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
         parser.add_argument(
             "--wandb",

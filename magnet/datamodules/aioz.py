@@ -12,8 +12,9 @@ import numpy as np
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_split, listed_splits, open_names, require
-from magnet.datamodules.reading.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.reading.fields import PersonMotion, listing, mapping, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_pickle
 
 LARGEST = 7
@@ -40,6 +41,7 @@ class AIOZReader(Reader):
     title: ClassVar[str] = "AIOZ-GDANCE"
     source: ClassVar[str] = "https://github.com/aioz-ai/AIOZ-GDANCE"
     licence: ClassVar[str] = "non-commercial scientific research only"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.aioz:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions_smpl/NAME.pkl", "one file a sequence"),
@@ -84,7 +86,7 @@ class AIOZReader(Reader):
                 f"{path}: people and frames are {poses.shape[:2]} of smpl_poses, but {trans.shape[:2]} of root_trans: "
                 f"a partner is missing or the lengths are unequal; {AGAIN}"
             )
-        people = [Person(poses[p], trans[p], np.zeros(10), f"dancer {p + 1}") for p in range(len(trans))]
+        people = [PersonMotion(poses[p], trans[p], np.zeros(10), f"dancer {p + 1}") for p in range(len(trans))]
         return side_by_side(path, people, 30.0, "+y", notes=[SHAPELESS])
 
     def _poses(self, path: Path, said: Mapping[str, Any]) -> Doubles:
@@ -111,6 +113,7 @@ def _video(name: str) -> str:
     return re.sub(r"_\d+_\d+$", "", name)
 
 
+@register_data()
 class AIOZ(Prepared):
     """AIOZ-GDANCE from a prepared store: scenes of up to seven people.
 

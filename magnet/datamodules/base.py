@@ -14,10 +14,11 @@ from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.datamodules.clip import Clip, Split, at_least
-from magnet.datamodules.store.draws import Augmentation, RandomDraws, composed_draws, fixed_draws
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
-from magnet.datamodules.store.mapped import MappedStore, Piece
-from magnet.datamodules.store.memory import Draw, Store
+from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.window_index import WindowIndex
+from magnet.datamodules.store.windows import Augmentation, RandomWindows, composed_windows, fixed_windows
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 
@@ -128,7 +129,7 @@ class MotionDataModule(LightningDataModule):
         self.body_model = body_model
         self.device_resident = device_resident
         self.read_ahead = read_ahead
-        self._stores: dict[tuple[str, torch.device], Store] = {}
+        self._stores: dict[tuple[str, torch.device], MemoryStore] = {}
         self._train_loader: TrainLoader | None = None
         self._trained_by: Trainer | None = None
         self._resume: dict[str, int] | None = None
@@ -146,7 +147,7 @@ class MotionDataModule(LightningDataModule):
 
     # -- clips in memory -----------------------------------------------------------------------
 
-    def store(self, split: Split, device: torch.device | str = "cpu") -> Store:
+    def store(self, split: Split, device: torch.device | str = "cpu") -> MemoryStore:
         """All clips of a split as flat tensors; read once, kept on each device asked for.
 
         Raises:
@@ -160,7 +161,7 @@ class MotionDataModule(LightningDataModule):
                 self._stores[split, device] = self.store(split).to(device)
         return self._stores[split, device]
 
-    def open_store(self, split: Split) -> Store:
+    def open_store(self, split: Split) -> MemoryStore:
         """The clips of a split as a store on the CPU; all in memory, unless a data set knows better.
 
         Raises:
@@ -171,22 +172,22 @@ class MotionDataModule(LightningDataModule):
             raise EmptySplitError(
                 f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
             )
-        return Store(clips, self.max_agents)
+        return MemoryStore(clips, self.max_agents)
 
-    def piece(self, split: Split) -> Piece | None:
+    def split_data(self, split: Split) -> SplitData | None:
         """The clips of a split as rows to be read by memory map; None: there are none."""
         clips = self.clips(split)
-        return Piece.encoded(clips) if clips else None
+        return SplitData.encoded(clips) if clips else None
 
-    def _placed(self, split: Split) -> Store:
+    def _placed(self, split: Split) -> MemoryStore:
         """The split's store where the trainer computes."""
         device = torch.device("cpu")
         if self.trainer is not None and (self.device_resident or self.maps_files):
             device = self.trainer.strategy.root_device
         return self.store(split, device)
 
-    def _gather(self, split: Split, frames: int, draw: Draw) -> Scene:
-        return self._placed(split).gather(draw, frames, self.compose_clearance)
+    def _gather(self, split: Split, frames: int, windows: WindowIndex) -> Scene:
+        return self._placed(split).gather(windows, frames, self.compose_clearance)
 
     def _shard(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
@@ -204,7 +205,7 @@ class MotionDataModule(LightningDataModule):
         self._close()
         store = self.store("train")
         place = self._shard()
-        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
+        draws = RandomWindows(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
         size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
         placed, frames, clearance = self._placed("train"), self.window_frames, self.compose_clearance
         if isinstance(placed, MappedStore):
@@ -215,7 +216,7 @@ class MotionDataModule(LightningDataModule):
                 size,
                 *place,
                 shared=draws.shared,
-                fetch=lambda draw: placed.fetch(draw, frames, clearance),
+                fetch=lambda windows: placed.fetch(windows, frames, clearance),
                 ahead=self.read_ahead,
             )
         else:
@@ -229,7 +230,9 @@ class MotionDataModule(LightningDataModule):
     def statistics_batches(self, batches: int = 8) -> Iterator[Scene]:
         """Training batches to take statistics from: the same on every rank, and no part of the training stream."""
         store = self.store("train")
-        draws = RandomDraws(store, self.window_frames, self.weights, self.augmentation, derive(self.seed, "statistics"))
+        draws = RandomWindows(
+            store, self.window_frames, self.weights, self.augmentation, derive(self.seed, "statistics")
+        )
         for number in range(batches):
             yield self._gather("train", self.window_frames, draws(0, number * self.batch_size, self.batch_size))
 
@@ -243,38 +246,38 @@ class MotionDataModule(LightningDataModule):
         except EmptySplitError as error:
             rank_zero_warn(f"training goes without validation, and no best checkpoint is chosen: {error}")
             return []
-        draw = fixed_draws(store, self.window_frames, self.window_frames, pad=True)
-        return self._fixed("val", draw, self.window_frames, self.val_batch_size)
+        windows = fixed_windows(store, self.window_frames, self.window_frames, pad=True)
+        return self._fixed("val", windows, self.window_frames, self.val_batch_size)
 
     def test_dataloader(self) -> FixedLoader:
         """Context and horizon of scenes of the test split (test_batch_size, context + horizon, max_agents)."""
         frames = self.context_frames + self.horizon_frames
-        return self._fixed("test", self.test_draw(), frames, self.test_batch_size)
+        return self._fixed("test", self.test_windows(), frames, self.test_batch_size)
 
     def predict_dataloader(self) -> FixedLoader:
         """The same scenes as `test_dataloader`."""
         return self.test_dataloader()
 
-    def _fixed(self, split: Split, draw: Draw, frames: int, batch_size: int) -> FixedLoader:
-        if not len(draw):
+    def _fixed(self, split: Split, windows: WindowIndex, frames: int, batch_size: int) -> FixedLoader:
+        if not len(windows):
             longest = int(self.store(split).length.max())
             raise ValueError(
                 f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"
                 f" {longest}; ask for fewer frames"
             )
-        return FixedLoader(draw, lambda part: self._gather(split, frames, part), batch_size, *self._shard())
+        return FixedLoader(windows, lambda part: self._gather(split, frames, part), batch_size, *self._shard())
 
-    def test_draw(self) -> Draw:
+    def test_windows(self) -> WindowIndex:
         """Which windows the test scenes are; composed ones come last."""
         store, frames = self.store("test"), self.context_frames + self.horizon_frames
-        plain = draw = fixed_draws(store, frames, self.test_stride or frames)
+        plain = windows = fixed_windows(store, frames, self.test_stride or frames)
         if self.test_limit is not None and len(plain) > self.test_limit:
             kept = np.arange(self.test_limit) * len(plain) // self.test_limit
-            draw = Draw.concatenate([plain[slice(k, k + 1)] for k in kept])
+            windows = WindowIndex.concatenate([plain[slice(k, k + 1)] for k in kept])
         if self.composed_test and len(plain):
-            composed = composed_draws(store, plain, self.composed_test, self.augmentation.apart, self.seed)
-            draw = Draw.concatenate([draw, composed])
-        return draw
+            composed = composed_windows(store, plain, self.composed_test, self.augmentation.apart, self.seed)
+            windows = WindowIndex.concatenate([windows, composed])
+        return windows
 
     def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
         """Clean training stretches of `frames` frames, `stride` apart, as recorded, and so many composed ones. -> Scene
@@ -282,7 +285,7 @@ class MotionDataModule(LightningDataModule):
         Raises:
             ValueError: no clip is long enough.
         """
-        return self.store("train").gather(self._train_draw(frames, stride, composed), frames, self.compose_clearance)
+        return self.store("train").gather(self._train_index(frames, stride, composed), frames, self.compose_clearance)
 
     def train_windows(self, frames: int, stride: int = 30, composed: int = 0, chunk: int = 64) -> Iterator[Scene]:
         """The same as `train_scenes`, in batches of at most `chunk` scenes.
@@ -290,21 +293,23 @@ class MotionDataModule(LightningDataModule):
         Raises:
             ValueError: no clip is long enough.
         """
-        store, draw = self.store("train"), self._train_draw(frames, stride, composed)
-        for first in range(0, len(draw), chunk):
-            yield store.gather(draw[first : first + chunk], frames, self.compose_clearance)
+        store, windows = self.store("train"), self._train_index(frames, stride, composed)
+        for first in range(0, len(windows), chunk):
+            yield store.gather(windows[first : first + chunk], frames, self.compose_clearance)
 
-    def _train_draw(self, frames: int, stride: int, composed: int) -> Draw:
+    def _train_index(self, frames: int, stride: int, composed: int) -> WindowIndex:
         store = self.store("train")
-        draw = fixed_draws(store, frames, stride)
-        if not len(draw):
+        windows = fixed_windows(store, frames, stride)
+        if not len(windows):
             raise ValueError(
                 f"{type(self).__name__}: split train has no clean stretch of {frames} frames; its longest clip has"
                 f" {int(store.length.max())}; ask for fewer frames"
             )
         if composed:
-            draw = Draw.concatenate([draw, composed_draws(store, draw, composed, self.augmentation.apart, self.seed)])
-        return draw
+            windows = WindowIndex.concatenate(
+                [windows, composed_windows(store, windows, composed, self.augmentation.apart, self.seed)]
+            )
+        return windows
 
     # -- Lightning -----------------------------------------------------------------------------
 

@@ -16,8 +16,9 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.base import JOINT_NAMES
 from magnet.datamodules.reading.own import OwnReader
-from magnet.datamodules.reading.own_files import Seat
+from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.registry import register_reader
 from magnet.datamodules.resample import resample_points, resample_rotations
 from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto
@@ -90,6 +91,7 @@ def _limbs(skeleton: Skeleton) -> tuple[list[int], list[int]]:
     return there, [ours[joint] for joint in there]
 
 
+@register_reader
 class BVHReader(OwnReader[BvhTrack]):
     """A folder of BVH files, one person each; who belongs together is told by names, a pattern or a table.
 
@@ -109,6 +111,7 @@ class BVHReader(OwnReader[BvhTrack]):
 
     name: ClassVar[str] = "bvh"
     title: ClassVar[str] = "BVH files"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.bvh:write"
     family: ClassVar[Family] = "positions"
     suffixes: ClassVar[tuple[str, ...]] = (".bvh",)
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -129,10 +132,10 @@ class BVHReader(OwnReader[BvhTrack]):
         self.unit, self.worst_fit = unit, worst_fit
         self.joints = {} if joints is None else read_joints(Path(joints))
 
-    def open(self, seat: Seat, alone: bool) -> tuple[list[BvhTrack], list[str]]:
+    def open(self, person_file: PersonFile, alone: bool) -> tuple[list[BvhTrack], list[str]]:
         """The person of a file."""
         try:
-            file = read_bvh(seat.file)
+            file = read_bvh(person_file.file)
         except (ValueError, OSError) as error:
             raise DataError(str(error)) from error
         return [BvhTrack(file, self.unit, self.joints, self.worst_fit, file.fps)], []
@@ -158,7 +161,7 @@ class BVHReader(OwnReader[BvhTrack]):
             joints=tuple(joints),
             persons=tuple(name or track.file.path.stem for name, track in zip(names, tracks, strict=True)),
             notes=(*notes, *said),
-            rigs=tuple(tracks),
+            skeletons=tuple(tracks),
             said_fps=tracks[0].said_fps,
         )
 

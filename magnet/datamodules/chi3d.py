@@ -15,6 +15,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_split, open_json, require
 from magnet.datamodules.reading.fields import listing, mapping, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 
 SHAPES = {"transl": (3,), "global_orient": (1, 3, 3), "body_pose": (21, 3, 3), "betas": (10,)}
 """Of each key, after (2, T)."""
@@ -41,6 +42,7 @@ class CHI3DReader(Reader):
     title: ClassVar[str] = "CHI3D"
     source: ClassVar[str] = "http://vision.imar.ro/ci3d"
     licence: ClassVar[str] = "non-commercial research only, by form; no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.chi3d:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("chi3d/train/sXX/smplx/ACTION.json", "both people; train may lie in --root itself"),
@@ -99,6 +101,7 @@ def axis_angle(where: object, matrices: Doubles) -> Doubles:
     return roma.rotmat_to_rotvec(torch.from_numpy(matrices)).numpy()
 
 
+@register_data()
 class CHI3D(Prepared):
     """CHI3D from a store that `magnet data prepare chi3d` made: scenes of two people."""
 

@@ -21,6 +21,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_fit import Fitted, check_rate, fit_recordings
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
+from magnet.datamodules.registry import register_data
 from magnet.datamodules.speeds import at_speed
 from magnet.files import writing
 from magnet.motion.scene import Scene
@@ -50,6 +51,7 @@ class Take:
         return len(self.amc) > 1
 
 
+@register_data()
 class CMU(MotionDataModule):
     """Couples of CMU (60 and 61, who dance salsa, and four others) and single people, as bodies at 30 fps.
 

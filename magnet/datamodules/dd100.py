@@ -12,7 +12,7 @@ from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import one_length
 from magnet.datamodules.reading.fields import (
-    Person,
+    PersonMotion,
     first_folder,
     gender_of,
     listing,
@@ -22,6 +22,7 @@ from magnet.datamodules.reading.fields import (
     side_by_side,
 )
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy
 
 FPS = 30.0
@@ -52,6 +53,7 @@ class DD100Reader(Reader):
     title: ClassVar[str] = "DD100"
     source: ClassVar[str] = "https://github.com/lisiyao21/Duolando"
     licence: ClassVar[str] = "NTU S-Lab License 1.0: non-commercial"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.dd100:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         (
@@ -106,7 +108,7 @@ class DD100Reader(Reader):
         people = [self._person(path, role) for path, role in zip(take.files, ROLES, strict=True)]
         return side_by_side(self.folder / take.name, people, FPS, "+z", cut=True)
 
-    def _person(self, path: Path, role: str) -> Person:
+    def _person(self, path: Path, role: str) -> PersonMotion:
         held = mapping(path, load_object_npy(path))
         poses, transl = rows(path, held, "poses", 165), rows(path, held, "transl", 3)
         lengths = {"poses": len(poses), "transl": len(transl)}
@@ -124,9 +126,10 @@ class DD100Reader(Reader):
         shape, notes = shape_numbers(path, held)
         meta = held.get("meta")
         gender = gender_of(meta.get("gender")) if isinstance(meta, dict) else None
-        return Person(poses[:, :66].reshape(frames, 22, 3), transl, shape, role, notes, gender)
+        return PersonMotion(poses[:, :66].reshape(frames, 22, 3), transl, shape, role, notes, gender)
 
 
+@register_data()
 class DD100(Prepared):
     """Couples of DD100, from a store that `magnet data prepare dd100` made."""
 

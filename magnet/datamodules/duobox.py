@@ -12,6 +12,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import one_length
 from magnet.datamodules.reading.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy, load_pickle
 
 FPS = 120.0
@@ -60,6 +61,7 @@ class DuoBoxReader(Reader):
     title: ClassVar[str] = "DuoBox"
     source: ClassVar[str] = "https://github.com/zju3dv/ready_to_react"
     licence: ClassVar[str] = "by request form, no licence published: research only, no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.duobox:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("fbx_fit_smpl/TAKE.npy", "SMPL-X fits of both people"),
@@ -165,6 +167,7 @@ class DuoBoxReader(Reader):
         return slice(start, start + THINNING * (last - first - 1) + 1)
 
 
+@register_data()
 class DuoBox(Prepared):
     """Boxing couples of DuoBox, from a store that `magnet data prepare duobox` made."""
 

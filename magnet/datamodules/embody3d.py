@@ -23,9 +23,10 @@ from magnet.datamodules.reading.arrays import (
     open_npy,
     require,
 )
-from magnet.datamodules.reading.fields import Person, listing, mapping, side_by_side
+from magnet.datamodules.reading.fields import PersonMotion, listing, mapping, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.reading.session_split import split_sessions
+from magnet.datamodules.registry import register_data
 
 WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
 FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")
@@ -76,6 +77,7 @@ class Embody3DReader(Reader):
     title: ClassVar[str] = "Embody 3D"
     source: ClassVar[str] = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
     licence: ClassVar[str] = "Meta's XRCIA research licence, by form; no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.embody3d:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("datasets/SECTION/CAPTURE/SUBJECT/FEATURE/CAPTURE.npy", "features smplx_mesh_* and missing"),
@@ -187,7 +189,7 @@ class Embody3DReader(Reader):
     def _file(self, scene: _Scene, person: str, feature: str) -> Path:
         return self.folder / scene.section / scene.capture / person / feature / f"{scene.capture}.npy"
 
-    def _person(self, files: dict[str, Path]) -> tuple[Person, NDArray[np.bool_]]:
+    def _person(self, files: dict[str, Path]) -> tuple[PersonMotion, NDArray[np.bool_]]:
         folder = files["missing"].parents[1]
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder: a partner's files are missing; {AGAIN}")
@@ -203,7 +205,7 @@ class Embody3DReader(Reader):
         arrays = {key: _held(files[key], array, valid) for key, array in arrays.items()}
         shape, notes = one_shape(files["smplx_mesh_betas"], arrays["smplx_mesh_betas"])
         poses = np.concatenate([arrays["smplx_mesh_global_orient"], arrays["smplx_mesh_body_pose"]], axis=1)
-        person = Person(poses.reshape(-1, 22, 3), arrays["smplx_mesh_transl"], shape, folder.name, notes)
+        person = PersonMotion(poses.reshape(-1, 22, 3), arrays["smplx_mesh_transl"], shape, folder.name, notes)
         return person, valid
 
     def _valid(self, path: Path) -> NDArray[np.bool_]:
@@ -231,6 +233,7 @@ def _held(path: Path, array: Doubles, valid: NDArray[np.bool_]) -> Doubles:
     return array[good[np.searchsorted(good[1:], np.arange(len(array)), side="right")]]
 
 
+@register_data()
 class Embody3D(Prepared):
     """Embody 3D from a prepared store: scenes of two to four people.
 

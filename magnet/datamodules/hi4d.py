@@ -15,6 +15,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, open_npz
 from magnet.datamodules.reading.fields import listing, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 
 SHAPES = {"global_orient": (2, 3), "body_pose": (2, 69), "transl": (2, 3), "betas": (2, 10)}
 
@@ -38,6 +39,7 @@ class Hi4DReader(Reader):
     title: ClassVar[str] = "Hi4D"
     source: ClassVar[str] = "https://yifeiyin04.github.io/Hi4D"
     licence: ClassVar[str] = "non-commercial scientific research only, by form; no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.hi4d:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("pairXX/ACTION/meta.npz", "first and last frame, genders"),
@@ -122,6 +124,7 @@ class Hi4DReader(Reader):
         return {key: floats(f"{path}: {key}", said[key], shape) for key, shape in SHAPES.items()}
 
 
+@register_data()
 class Hi4D(Prepared):
     """Hi4D from a store that `magnet data prepare hi4d` made: scenes of two people."""
 

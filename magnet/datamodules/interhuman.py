@@ -13,6 +13,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
 from magnet.datamodules.reading.fields import listing, mapping, natural, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_pickle
 
 FPS = 59.94
@@ -38,6 +39,7 @@ class InterHumanReader(Reader):
     title: ClassVar[str] = "InterHuman"
     source: ClassVar[str] = "https://github.com/tr3e/InterGen"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.interhuman:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions/ID.pkl", "the raw motions, not motions_processed"),
@@ -102,6 +104,7 @@ class InterHumanReader(Reader):
         return []
 
 
+@register_data()
 class InterHuman(Prepared):
     """InterHuman from a store that `magnet data prepare interhuman` made: scenes of two people."""
 

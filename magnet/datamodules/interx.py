@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Literal, get_args
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import OR_YOURS, open_names, open_npz
-from magnet.datamodules.reading.fields import Person, first_folder, listing, person, side_by_side
+from magnet.datamodules.reading.fields import PersonMotion, first_folder, listing, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_pickle
 
 FPS = 120.0
@@ -44,6 +45,7 @@ class InterXReader(Reader):
     title: ClassVar[str] = "Inter-X"
     source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.interx:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions/CLIP/{P1,P2}.npz", "such as G001T000A000R000/P1.npz"),
@@ -146,13 +148,14 @@ class InterXReader(Reader):
             notes.append(f"roles are unknown: {self._order}")
         elif self._order is not None and (actor := self._order.get(take.name[:16])) in (0, 1):
             names = ("P1, actor", "P2, reactor") if actor == 0 else ("P1, reactor", "P2, actor")
-        people: list[Person] = [
+        people: list[PersonMotion] = [
             person(path, one, name, gender=one.get("gender"), orient="root_orient", body="pose_body", transl="trans")
             for path, one, name in zip(take.files, held, names, strict=True)
         ]
         return side_by_side(take.files[0].parent, people, FPS, "+y", notes=notes)
 
 
+@register_data()
 class InterX(Prepared):
     """Pairs of Inter-X, from a store that `magnet data prepare interx` made."""
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
-from magnet.datamodules.store.mapped import MappedStore, Piece
-from magnet.datamodules.store.memory import Store
+from magnet.datamodules.registry import register_data
+from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.memory import MemoryStore
 
 
+@register_data(combines=True)
 class Mixed(MotionDataModule):
     """Trains on several data sets at once; tests on one of them, or on all.
 
@@ -65,14 +67,14 @@ class Mixed(MotionDataModule):
         """Clips of all data sets, or of the one chosen for the split."""
         return [clip for part in self._used(split) for clip in part.clips(split)]
 
-    def piece(self, split: Split) -> Piece | None:
+    def split_data(self, split: Split) -> SplitData | None:
         """Rows of all data sets, or of the one chosen for the split."""
-        pieces = [piece for part in self._used(split) if (piece := part.piece(split)) is not None]
-        return Piece.joined(pieces) if pieces else None
+        pieces = [piece for part in self._used(split) if (piece := part.split_data(split)) is not None]
+        return SplitData.concatenate(pieces) if pieces else None
 
-    def open_store(self, split: Split) -> Store:
+    def open_store(self, split: Split) -> MemoryStore:
         """By memory map where a data set is; else all clips in memory."""
-        if self.maps_files and (piece := self.piece(split)) is not None:
+        if self.maps_files and (piece := self.split_data(split)) is not None:
             return MappedStore(piece, self.max_agents, self.spread)
         return super().open_store(split)
 

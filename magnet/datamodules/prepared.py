@@ -8,11 +8,13 @@ from typing import Any, ClassVar
 
 from magnet.datamodules.base import Clip, EmptySplitError, MotionDataModule, Split
 from magnet.datamodules.reading.recording import Reader
-from magnet.datamodules.store.mapped import MappedStore, Piece
-from magnet.datamodules.store.memory import Store
-from magnet.datamodules.store.reader import Folder, StoreError, body_hash
+from magnet.datamodules.registry import register_data
+from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.reader import StoreError, StoreReader, body_hash
 
 
+@register_data(combines=True)
 class Prepared(MotionDataModule):
     """Random windows of a prepared store of any size; memory stays flat.
 
@@ -60,7 +62,7 @@ class Prepared(MotionDataModule):
         return not self.device_resident
 
     @cached_property
-    def folder(self) -> Folder:
+    def folder(self) -> StoreReader:
         """The opened store.
 
         Raises:
@@ -71,7 +73,7 @@ class Prepared(MotionDataModule):
         if not self.path:
             raise ValueError(f"{type(self).__name__}: no store was given; {command}")
         try:
-            folder = Folder(self.path)
+            folder = StoreReader(self.path)
         except StoreError as error:
             raise StoreError(f"{error} ({type(self).__name__}: {command})") from error
         if self.reader and folder.manifest["name"] != self.reader.name:
@@ -97,14 +99,14 @@ class Prepared(MotionDataModule):
         """All clips of a split in memory, of `self.body`."""
         return self.folder.clips(split, self.roles)
 
-    def piece(self, split: Split) -> Piece | None:
+    def split_data(self, split: Split) -> SplitData | None:
         """The split's rows on disk."""
-        piece = Piece.stored(self.folder, split, self.roles)
+        piece = SplitData.stored(self.folder, split, self.roles)
         return piece if piece.sources else None
 
-    def open_store(self, split: Split) -> Store:
+    def open_store(self, split: Split) -> MemoryStore:
         """The split by memory map; in memory if `device_resident`."""
-        piece = self.piece(split)
+        piece = self.split_data(split)
         if piece is None:
             has = [name for name, facts in self.folder.manifest["splits"].items() if facts["clips"]]
             raise EmptySplitError(

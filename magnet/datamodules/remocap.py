@@ -14,6 +14,7 @@ from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, open_npz, require
 from magnet.datamodules.reading.fields import first_folder, listing, mapping, person, shortest, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.reading.remocap_track import FPS, MAP, file_like, track
+from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy, load_pickle
 
 PLACES = ("", "LindyHop", "ReMoCap/LindyHop", "data/LindyHop")
@@ -30,7 +31,7 @@ class ReMoCapReader(Reader):
 
     README and code of its authors spell the files differently; motion_worldpos*.csv, motion_rotation*.csv and any
     sequence folder with a number in its name are taken. Joints are found by the csv's own headings (Hips.X), or else
-    in the order of the BVH file. Positions are fitted by the common steps; rotations only prove that joints and units
+    in the order of the BVH file. Positions are fitted by `canonicalize`; rotations only prove that joints and units
     are what they are taken for: some Euler order must lead from motion_offsets.pkl to the positions within 1 cm. Two
     people's files of unequal length are cut to the shorter, as the authors' process_LindyHop.py does, with a note.
 
@@ -50,6 +51,7 @@ class ReMoCapReader(Reader):
     title: ClassVar[str] = "ReMoCap"
     source: ClassVar[str] = "https://github.com/anindita127/ReMoS"
     licence: ClassVar[str] = "research only, no redistribution"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.remocap:write"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "positions"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion.bvh", "the skeleton"),
@@ -165,6 +167,7 @@ class ReMoCapReader(Reader):
         return side_by_side(path, people, FPS, "+y")
 
 
+@register_data()
 class ReMoCap(Prepared):
     """LindyHop couples of ReMoCap, from a store that `magnet data prepare remocap` made."""
 

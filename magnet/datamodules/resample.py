@@ -35,7 +35,12 @@ def resample_rotations(quat: Tensor, fps: float, target: float = FPS) -> Tensor:
 
 
 def resample_points(points: Tensor, fps: float, target: float = FPS) -> Tensor:
-    """Points at exact times, linearly. (T, ..., 3) -> (T', ..., 3)"""
+    """Points at exact times, linearly. (T, ..., 3) -> (T', ..., 3)
+
+    >>> height = torch.arange(5.0, dtype=torch.float64)[:, None].expand(5, 3)  # one metre more each frame, at 60 fps
+    >>> resample_points(height, fps=60.0)[:, 0]
+    tensor([0., 2., 4.], dtype=torch.float64)
+    """
     before, after, share = times(len(points), fps, target)
     return torch.lerp(points[before], points[after], share.view(-1, *[1] * (points.dim() - 1)))
 

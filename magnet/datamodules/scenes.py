@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
 from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.reading.own import OwnReader
-from magnet.datamodules.reading.own_files import Group, Seat
+from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
+from magnet.datamodules.registry import register_reader
 from magnet.datamodules.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
@@ -74,6 +75,7 @@ class PosedTrack:
         )
 
 
+@register_reader
 class ScenesReader(OwnReader[PosedTrack]):
     """A folder of npz and pkl files of SMPL's family, one person or several each, or of scenes that magnet wrote.
 
@@ -93,6 +95,7 @@ class ScenesReader(OwnReader[PosedTrack]):
 
     name: ClassVar[str] = "scenes"
     title: ClassVar[str] = "Scenes of SMPL's family"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.scenes:write"
     family: ClassVar[Family] = "any"
     suffixes: ClassVar[tuple[str, ...]] = (".npz", ".pkl")
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
@@ -115,13 +118,13 @@ class ScenesReader(OwnReader[PosedTrack]):
             raise ValueError(f"fps: got {fps:g}, expected more than 0")
         self.fps = fps
 
-    def scenes(self) -> dict[str, Group]:
+    def scenes(self) -> dict[str, SceneFiles]:
         """All but body files, which may lie beside them."""
-        return {scene: group for scene, group in self.groups.items() if not _is_body(group.seats[0].file)}
+        return {scene: group for scene, group in self.groups.items() if not _is_body(group.people[0].file)}
 
-    def open(self, seat: Seat, alone: bool) -> tuple[list[PosedTrack], list[str]]:
+    def open(self, person_file: PersonFile, alone: bool) -> tuple[list[PosedTrack], list[str]]:
         """The people in a file."""
-        path = seat.file
+        path = person_file.file
         if path.suffix.lower() == ".pkl":
             held: Any = load_pickle(path)
         else:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.registry import register_data
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
@@ -64,6 +65,7 @@ PAIRINGS: dict[str, tuple[Place, float, float]] = {
 """How a solo's copy is placed, and between which distances in metres."""
 
 
+@register_data(combines=True)
 class SoloPairs(MotionDataModule):
     """Pairs made of the single people of other data sets: a copy mirrors, circles, passes, walks beside or follows.
 

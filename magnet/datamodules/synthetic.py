@@ -9,12 +9,14 @@ import torch
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.clip import SPLITS
+from magnet.datamodules.registry import register_data
 from magnet.synthesis import COUPLINGS, CoupledScene, synthesize
 
 SEEDS = 1_000_000
 """Seeds a split owns: clips of different splits never share one."""
 
 
+@register_data()
 class Synthetic(MotionDataModule):
     """Scenes of people mirroring, following, shaking hands, dancing in a circle and playing patty-cake.
 

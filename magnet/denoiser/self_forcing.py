@@ -63,7 +63,7 @@ def with_self_forcing(
             pairwise(T_world_can) if layout.slots else None,
             T_world_can[:, 0],
             SamplerOptions.placement,
-            SamplerOptions.trust,
+            SamplerOptions.pairwise_weight,
             present=scene.present[few],
         )
         T_world_can = torch.where(own[..., None, None], placed, T_world_can)

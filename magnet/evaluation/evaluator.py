@@ -19,7 +19,7 @@ from magnet.body import Body
 from magnet.checks import require_whole
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import SamplerOptions, occupied, planning_grid
-from magnet.generation.world import Health
+from magnet.generation.world import SamplingStats
 from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
 from magnet.metrics.interval import Unit, independent_units
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
@@ -83,7 +83,7 @@ class Evaluation:
     interval: Unit = "auto"
     results: Results | None = field(default=None, init=False)
     progress: Callable[[int], None] | None = field(default=None, init=False)
-    health: Health = field(default_factory=Health, init=False)
+    stats: SamplingStats = field(default_factory=SamplingStats, init=False)
     scenes: int = field(default=0, init=False)
     unit_of: dict[str, int] = field(default_factory=dict, init=False)
 
@@ -121,12 +121,12 @@ class Evaluation:
                 nearest = NearestTraining(self.windows, "truth" if name == TRUTH else "generated", None, CONFIDENCE)
                 self.metrics[name].add_metrics({"memorisation": nearest})
         self.metrics = {name: metrics.to(model.device) for name, metrics in self.metrics.items()}
-        self.health, self.scenes = Health(), 0
+        self.stats, self.scenes = SamplingStats(), 0
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
 
     def _read_test_scenes(self, datamodule: MotionDataModule) -> None:
         """How many test scenes there are, the slots they need, and which of them are not independent."""
-        store, draw = datamodule.store("test"), datamodule.test_draw()
+        store, draw = datamodule.store("test"), datamodule.test_windows()
         frames = self.context + self.horizon
         self.total = max(len(draw), 1)
         self.slots = 1 + int(np.flatnonzero((draw.members >= 0).any(axis=0)).max(initial=0))
@@ -174,7 +174,7 @@ class Evaluation:
         context, horizon, options = self.context, self.horizon, self.options
         scene = in_slots(scene, min(scene.agents, max(occupied(scene), model.layout.agents)))
         whole = model.generate(
-            scene, self.task, context, horizon, samples, options, generators, self.progress, self.health
+            scene, self.task, context, horizon, samples, options, generators, self.progress, self.stats
         )
         if not self.nothing_is_given:
             return whole
@@ -287,14 +287,14 @@ class Evaluation:
             "horizon frames": self.horizon,
             "device": str(model.device),
             "intervals": {"level": CONFIDENCE, "by": self.interval, "units": len(set(self.unit_of.values()))},
-            "health": {name: round(value, 4) for name, value in self.health.means().items()},
+            "sampling": {name: round(value, 4) for name, value in self.stats.means().items()},
         }
 
     def predict(self, model: Denoiser, batch: Scene, batch_idx: int, datamodule: MotionDataModule) -> Scene:
         """Context and samples of one batch of scenes, for writing."""
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
         if batch_idx == 0:
-            self.health, self.scenes = Health(), 0
+            self.stats, self.scenes = SamplingStats(), 0
         generators = self._generators(model, batch.scenes)
         self.scenes += batch.scenes
         return model.generate(
@@ -306,7 +306,7 @@ class Evaluation:
             self.options,
             generators,
             self.progress,
-            self.health,
+            self.stats,
         )
 
     def _numbers(self, model: Denoiser, scenes: int) -> list[int]:

@@ -47,6 +47,15 @@ def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m")
 
     Raises:
         ValueError: more than one scene, nobody present, another body's, or no such unit.
+
+    >>> import tempfile
+    >>> from magnet.body import load_body
+    >>> from magnet.motion.scene import empty_scene
+    >>> scene = empty_scene(1, 30, 2, like=torch.zeros(()))
+    >>> scene = scene.replace(present=~scene.present)  # two people, in the rest pose
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_bvh(scene, Path(folder) / "rest.bvh", load_body())]
+    ['rest_0.bvh', 'rest_1.bvh']
     """
     if scene.scenes != 1:
         raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")

@@ -23,7 +23,17 @@ COLUMNS = ("scene", "frame", "time_s", "person", *(f"{name}_{axis}_m" for name i
 
 
 def save_csv(scene: Scene, path: str | Path, body: Posed) -> Path:
-    """Write one row a frame and person present, all B scenes in one table; see `COLUMNS`. Returns the path written."""
+    """Write one row a frame and person present, all B scenes in one table; see `COLUMNS`. Returns the path written.
+
+    >>> import tempfile
+    >>> import magnet
+    >>> from magnet.body import load_body
+    >>> scene = magnet.load("duet", steps=1).generate(people=2, frames=8, seed=0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     table = save_csv(scene, Path(folder) / "scene.csv", load_body()).read_text().splitlines()
+    >>> len(table), table[1].split(",")[:4]  # a line of names, then 8 frames of 2 people
+    (17, ['0', '0', '0.000000', '0'])
+    """
     path = Path(path).with_suffix(".csv")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:

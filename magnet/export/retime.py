@@ -21,6 +21,10 @@ def resampled(scene: Scene, fps: float) -> Scene:
 
     Raises:
         ValueError: the rate is not positive.
+
+    >>> from magnet.motion.scene import empty_scene
+    >>> resampled(empty_scene(1, 61, 2, like=torch.zeros(())), 15.0).frames
+    31
     """
     if not 0 < fps < math.inf:
         raise ValueError(f"fps: got {fps:g}, expected more than 0")

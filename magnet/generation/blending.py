@@ -84,7 +84,7 @@ def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tens
     return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation
 
 
-def paste(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
+def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Put given frames back; what they differ by at a seam fades out over the frames on its other side.
 
     Args:
@@ -136,7 +136,7 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
 def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Put given frames back, and go on from them smoothly into what is decoded; nothing in front of a seam changes.
 
-    Unlike with `paste`, poses go on as fast as they were moving: seams come with each block of a causal plan, where
+    Unlike with `crossfade_given`, poses go on as fast as they were moving: each block of a causal plan has a seam, and
     faded differences alone would jerk.
 
     Args:

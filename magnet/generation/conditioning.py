@@ -37,17 +37,17 @@ class SamplerOptions:
         steps: denoising steps S; the paper takes 30 (A.3). No more than pass levels that differ, which is a matter of
             `spacing` and `shift`.
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
-        rolling: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
+        pyramid_offset: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
             8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
             that can roll do, with half of the window half denoised; those whose agents take turns or that look
             ahead to keyframes go in strides.
         placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        trust: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
+        pairwise_weight: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
             (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
         requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
             does. None: if codes are what the model was trained to generate (`target` of the denoiser).
-        paste: put the given frames back in place of their lossy reconstruction, with the seams blended.
+        keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
         blend: frames over which a seam fades out behind given frames, and in before them.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
@@ -63,11 +63,11 @@ class SamplerOptions:
 
     steps: int = 16
     stride: int = 4
-    rolling: int | None = None
+    pyramid_offset: int | None = None
     placement: Placement = "fuse"
-    trust: float = 0.02
+    pairwise_weight: float = 0.02
     requantize: bool | None = None
-    paste: bool = True
+    keep_given: bool = True
     blend: int = 10
     eta: float = 1.0
     shift: float = 1.0
@@ -84,9 +84,9 @@ class SamplerOptions:
         require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)
-        if self.rolling is not None:
-            require_whole("rolling", self.rolling, 0)
-        require_number("trust", self.trust, least=0)
+        if self.pyramid_offset is not None:
+            require_whole("pyramid_offset", self.pyramid_offset, 0)
+        require_number("pairwise_weight", self.pairwise_weight, least=0)
         require_whole("blend", self.blend, 0)
         require_number("eta", self.eta, 0, 1)
         require_spacing(self.spacing, self.shift)
@@ -107,7 +107,7 @@ class SamplerOptions:
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o = options
-    return Grid(tokens, agents, past, o.steps, window, o.stride, o.rolling, o.shift, o.noise_sampling, o.spacing)
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)
 
 
 def occupied(scene: Scene) -> int:
@@ -208,7 +208,7 @@ def task_sight(task: Task, grid: Grid) -> Tensor:
 
     A window that ends where a block does has nothing to hide, so the task is asked where the window goes on.
     """
-    roomy = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, rolling=0)
+    roomy = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, pyramid_offset=0)
     return torch.minimum(sight(task.schedule(grid)), sight(task.schedule(roomy)))
 
 

@@ -265,7 +265,12 @@ class Live:
         # A piece fits into the window, so denoising it all at once costs the fewest steps.
         # What it has made itself is not asked where its floor is.
         settings = self.settings
-        own: dict[str, Any] = {"steps": settings.steps, "guidance": settings.guidance, "rolling": 0, "any_floor": True}
+        own: dict[str, Any] = {
+            "steps": settings.steps,
+            "guidance": settings.guidance,
+            "pyramid_offset": 0,
+            "any_floor": True,
+        }
         options = dataclasses.replace(settings.sampler, **own)
         longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
         return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())

@@ -204,22 +204,26 @@ class RecordedStream(Stream):
         self.levels.append(self.level.to("cpu", torch.int16))
         self.starts.append(stage.start * STRIDE)
         wanted = stage.levels[-1] < LEVELS  # the others stay unknown
-        self.windows.append(preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted, stage.apart))
+        self.windows.append(
+            preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted, stage.decentralized)
+        )
 
 
-def preview(canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, apart: bool = False) -> Scene:
+def preview(
+    canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, decentralized: bool = False
+) -> Scene:
     """A window as the model expects it to end, placed in the world; the canvas stays as it is.
 
-    tokens (1, N, P, D), estimate (1, W, P, D) normalized, wanted (W, P) bool: ever to be generated; apart as for
-    `Canvas.settle`. -> W frames
+    tokens (1, N, P, D), estimate (1, W, P, D) normalized, wanted (W, P) bool: ever to be generated; decentralized as
+    for `Canvas.make_consistent`. -> W frames
     """
     shown = copy.copy(canvas)
     shown.T_world_can, shown.placed = canvas.T_world_can.clone(), canvas.placed.clone()
-    shown.health = type(canvas.health)()
+    shown.stats = type(canvas.stats)()
     stop = first + estimate.shape[1]
     finished = torch.zeros_like(shown.placed)
     finished[first:stop] = ~shown.placed[first:stop] & wanted
     whole = tokens.clone()
     fresh = finished[first:stop, :, None].to(whole.device)
     whole[:, first:stop] = torch.where(fresh, estimate, whole[:, first:stop])
-    return shown.scene(shown.settle(whole, finished, apart), first, stop).to("cpu")
+    return shown.scene(shown.make_consistent(whole, finished, decentralized), first, stop).to("cpu")

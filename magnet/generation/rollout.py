@@ -23,7 +23,7 @@ from magnet.generation.conditioning import (
 from magnet.generation.inputs import check_given, check_request
 from magnet.generation.plan import endless, planned
 from magnet.generation.showing import Expected, own_view, show
-from magnet.generation.world import Canvas, Health
+from magnet.generation.world import Canvas, SamplingStats
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS, NoiseStream
@@ -51,7 +51,7 @@ def generate(
     options: SamplerOptions | None = None,
     generator: Generators = None,
     progress: Callable[[int], None] | None = None,
-    health: Health | None = None,
+    stats: SamplingStats | None = None,
 ) -> Scene:
     """Sample a task.
 
@@ -66,7 +66,7 @@ def generate(
         generator: source of randomness, on the model's device; or one for each of the B * samples scenes, which
             are then the same whatever else is in the batch.
         progress: told 1 after each denoising step.
-        health: filled with how well the sampled tokens hang together, and how often the network ran.
+        stats: filled with how well the sampled tokens hang together, and how often the network ran.
 
     Returns:
         Scene of B * samples, context + frames frames, the given frames included.
@@ -75,7 +75,7 @@ def generate(
         ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
-    return cat_time(list(stream(model, scene, task, context, frames, samples, options, generator, progress, health)))
+    return cat_time(list(stream(model, scene, task, context, frames, samples, options, generator, progress, stats)))
 
 
 def stream(
@@ -88,7 +88,7 @@ def stream(
     options: SamplerOptions | None = None,
     generator: Generators = None,
     progress: Callable[[int], None] | None = None,
-    health: Health | None = None,
+    stats: SamplingStats | None = None,
     piece: int = PIECE,
 ) -> Iterator[Scene]:
     """Sample a task in consecutive pieces of frames, which make up what `generate` returns.
@@ -106,14 +106,14 @@ def stream(
     """
     if piece < 1:
         raise ValueError(f"piece: got {piece}, expected at least 1 token step")
-    return Stream(model, scene, task, context, frames, samples, options, generator, progress, health, piece).pieces()
+    return Stream(model, scene, task, context, frames, samples, options, generator, progress, stats, piece).pieces()
 
 
 class Stream:
     """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
 
-    The rows held are [first, stop): `tokens` and `veil` (B, n, P, D), the `history` of a multistep solver, and the
-    world in `canvas`. `there` is how many rows there are so far of what is given.
+    The rows held are [first, stop): `tokens` and `mask_noise` (B, n, P, D), the `history` of a multistep solver, and
+    the world in `canvas`. `there` is how many rows there are so far of what is given.
     """
 
     fed = False
@@ -129,14 +129,14 @@ class Stream:
         options: SamplerOptions | None,
         generator: Generators,
         progress: Callable[[int], None] | None,
-        health: Health | None,
+        stats: SamplingStats | None,
         piece: int,
     ) -> None:
         check_request(model, scene, context, frames, samples)
         layout = model.layout
         self.model, self.options, self.piece = model, options or SamplerOptions(), piece
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
-        self.samples, self.progress, self.health = samples, progress, health or Health()
+        self.samples, self.progress, self.stats = samples, progress, stats or SamplingStats()
         self.frames = None if frames is None else context + frames
         if self.frames is not None and scene.frames >= self.frames:
             self.scene = whole_tokens(self.scene, self.frames)
@@ -165,13 +165,13 @@ class Stream:
         check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
-        self.health.begin(B)
+        self.stats.begin(B)
         self.first = self.stop = 0
         self.there: float = self.rows
         self.reached = 0  # one past the last row that has been generated
         self.expected = Expected(reach(model)[1])
-        self.canvas = Canvas(model, self._given(0, 0), schedule, o, samples, self.health)
-        self.tokens, self.veil = self.noise.rows(0)
+        self.canvas = Canvas(model, self._given(0, 0), schedule, o, samples, self.stats)
+        self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         kind = model.device.type
         self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
@@ -217,7 +217,7 @@ class Stream:
         before, after = reach(self.model)
         if self.canvas.causal:
             return before + 2, 0
-        seam = -(-self.options.blend // STRIDE) if self.options.paste else 0
+        seam = -(-self.options.blend // STRIDE) if self.options.keep_given else 0
         return before + seam + 1, after + seam
 
     # Contexts are entered anew in each call: while a piece is being looked at they would hold outside too.
@@ -231,10 +231,10 @@ class Stream:
                 self._denoise,
                 [dataclasses.replace(stage, start=stage.start - self.first)],
                 self.tokens,
-                self.veil,
+                self.mask_noise,
                 self.canvas.given.present,
                 self.model.layout,
-                self.canvas.settle,
+                self.canvas.make_consistent,
                 self.progress,
                 self.options.guidance,
                 self.noise,
@@ -246,7 +246,7 @@ class Stream:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        self.health.add_call(len(noisy))
+        self.stats.add_call(len(noisy))
         width = noisy.shape[1]
         # What lies ahead is nobody's: it is shown as the mean of pure noise, which tells nothing of anybody.
         noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
@@ -266,7 +266,7 @@ class Stream:
         surplus = min(stop - behind, needed - 1) - self.first
         if surplus > 0:
             self.canvas.release(surplus)
-            self.tokens, self.veil = self.tokens[:, surplus:].clone(), self.veil[:, surplus:].clone()
+            self.tokens, self.mask_noise = self.tokens[:, surplus:].clone(), self.mask_noise[:, surplus:].clone()
             self.history = None if self.history is None else self.history.release(surplus)
             self.first += surplus
         given = self._known(start, stop).repeat_interleave(STRIDE, dim=0).to(made.device)
@@ -285,11 +285,11 @@ class Stream:
             part = slice(self.stop - low, last - low)
             tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
-            fresh, veil = self.noise.rows(last - self.stop)
-            new = begin(tokens, fresh, known[part], self.model.layout)
+            init_noise, mask_noise = self.noise.draw(last - self.stop)
+            new = begin(tokens, init_noise, known[part], self.model.layout)
             self.tokens = torch.cat([self.tokens, new], dim=1)
             self.history = None if self.history is None else self.history.extend(new)
-            self.veil = torch.cat([self.veil, veil], dim=1)
+            self.mask_noise = torch.cat([self.mask_noise, mask_noise], dim=1)
             self.canvas.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last
 

@@ -120,7 +120,7 @@ def bodies(
     features = model.tokenizer.decode(latent, canvas.given.betas, steps)
     features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
     given, T_world_can = canvas.given.slice(frames.start, frames.stop), canvas.T_world_can[:, frames]
-    keep = canvas.by_frame(canvas.known[first:stop] & options.paste)
+    keep = canvas.by_frame(canvas.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([canvas.by_frame(canvas.placed[first - 1 : first])[:lead], keep])
     made = go_on(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)

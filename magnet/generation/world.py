@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.blending import arrive, hold, paste, step_between
+from magnet.generation.blending import arrive, crossfade_given, hold, step_between
 from magnet.generation.conditioning import reach, sight
 from magnet.generation.showing import seen
 from magnet.motion.frames import (
@@ -36,18 +36,19 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Health:
-    """How well sampled tokens hang together and what they cost; filled while sampling, for whoever asks.
+class SamplingStats:
+    """How consistent sampled tokens are and what they cost; filled while sampling.
 
-    `snap`: distance of a sampled latent to its code, as a share of the code's length. `drift`: metres
-    between a sampled pairwise transform and what the placed agents imply. `calls`: how often the network ran, a
-    batch at a time. `evaluations`: how often it ran for each scene, views and guidance branches counted apart.
+    `quantization_error`: distance of a sampled latent to its code, as a share of the code's length.
+    `pairwise_drift`: metres between a sampled pairwise transform and what the placed agents imply.
+    `calls`: how often the network ran, a batch at a time. `evaluations`: how often it ran for each scene, views and
+    guidance branches counted one by one.
     """
 
-    snap_sum: float = 0.0
-    snaps: int = 0
-    drift_sum: float = 0.0
-    drifts: int = 0
+    quantization_error_sum: float = 0.0
+    quantization_errors: int = 0
+    pairwise_drift_sum: float = 0.0
+    pairwise_drifts: int = 0
     runs: int = 0
     calls: int = 0
     scenes: int = 0
@@ -60,8 +61,8 @@ class Health:
     def means(self) -> dict[str, float]:
         """Means of what was seen; `calls` is that of a run of the sampler."""
         return {
-            "snap": self.snap_sum / max(self.snaps, 1),
-            "drift": self.drift_sum / max(self.drifts, 1),
+            "quantization_error": self.quantization_error_sum / max(self.quantization_errors, 1),
+            "pairwise_drift": self.pairwise_drift_sum / max(self.pairwise_drifts, 1),
             "calls": self.calls / max(self.runs, 1),
             "evaluations": self.evaluations,
         }
@@ -76,17 +77,17 @@ class Health:
         self.calls += 1
         self.rows += rows
 
-    def add_snap(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
+    def add_quantization_error(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
         """latent, code (B, n, P, C), counts (B, n, P) bool"""
         away = ((latent - code).norm(dim=-1) / code.norm(dim=-1).clamp_min(1e-6))[counts]
-        self.snap_sum += float(away.sum())
-        self.snaps += len(away)
+        self.quantization_error_sum += float(away.sum())
+        self.quantization_errors += len(away)
 
-    def add_drift(self, pairs: Tensor, implied: Tensor, counts: Tensor) -> None:
+    def add_pairwise_drift(self, pairs: Tensor, implied: Tensor, counts: Tensor) -> None:
         """pairs, implied (B, n, P, slots, 4, 9), counts (B, n, P, slots) bool"""
         away = (pairs - implied)[..., 6:].norm(dim=-1).mean(dim=-1)[counts]
-        self.drift_sum += float(away.sum())
-        self.drifts += len(away)
+        self.pairwise_drift_sum += float(away.sum())
+        self.pairwise_drifts += len(away)
 
 
 class Canvas:
@@ -102,7 +103,7 @@ class Canvas:
         schedule: the plan of the whole scene; only what it knows is read.
         options: how to sample.
         samples: scenes drawn for each of B.
-        health: filled.
+        stats: filled.
     """
 
     def __init__(
@@ -112,11 +113,11 @@ class Canvas:
         schedule: MaskSchedule,
         options: SamplerOptions,
         samples: int,
-        health: Health | None = None,
+        stats: SamplingStats | None = None,
     ) -> None:
         self.model = model
         self.options = options
-        self.health = health or Health()
+        self.stats = stats or SamplingStats()
         self.samples = samples
         self.known = schedule.known[: given.frames // STRIDE]
         self.given = given.repeat(samples)
@@ -145,10 +146,10 @@ class Canvas:
         kept = self.given.slice(frames)
         self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
-    def settle(self, canvas: Tensor, finished: Tensor, apart: bool = False) -> Tensor:
+    def make_consistent(self, canvas: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
         """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
 
-        Of known tokens nothing changes but the step that leads into them, once it is known where from. `apart`:
+        Of known tokens nothing changes but the step that leads into them, once it is known where from. `decentralized`:
         some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
         would tie together who decided alone, so everybody is placed by the own steps, whatever the options say.
         """
@@ -161,9 +162,9 @@ class Canvas:
         if self.model.quantized if self.options.requantize is None else self.options.requantize:
             new = finished[first:stop].to(canvas.device)
             code = self.model.tokenizer.requantize(latent)
-            self.health.add_snap(latent, code, new & self.given.present[:, None])
+            self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
-        placement = "integrate" if apart else self.options.placement
+        placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(steps, pairs if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
@@ -175,10 +176,10 @@ class Canvas:
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
         if layout.slots:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
-            if apart:
+            if decentralized:
                 new = finished[first:stop].to(canvas.device)
                 together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
-            self.health.add_drift(pairs, implied[:, first - begin :], together)
+            self.stats.add_pairwise_drift(pairs, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
         canvas[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), canvas[:, begin:stop])
         return self._enter(canvas, begin, stop)
@@ -261,7 +262,7 @@ class Canvas:
             T_self_partner,
             self._starts(T_prev_can, T_self_partner, first, new),
             placement,
-            self.options.trust,
+            self.options.pairwise_weight,
             present=there,
             fixed=known,
             anchor=first_of(there),
@@ -356,7 +357,7 @@ class Canvas:
         """
         if self.causal:
             return seen(self, canvas, first, len(self.known) if stop is None else stop)
-        layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.paste else 0
+        layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.keep_given else 0
         stop = len(self.known) if stop is None else stop
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
         behind, ahead = reach(self.model)
@@ -367,8 +368,10 @@ class Canvas:
         given = self.given.slice(low * STRIDE, high * STRIDE)
         T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
         decoded = posed(features[:, frames], T_world_can, given)
-        if self.options.paste:
-            decoded = paste(decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend)
+        if self.options.keep_given:
+            decoded = crossfade_given(
+                decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
+            )
         decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
         return hold(decoded, self.by_frame(self.placed[first:stop]), before)
 

@@ -13,7 +13,14 @@ from magnet.metrics.futures import Futures, without_pelvis
 
 
 def jitter(joints: Tensor, fps: float = 30.0) -> Tensor:
-    """Mean length of the third difference over 21 joints. (..., T, P, 22, 3) -> (..., T - 3, P) in 10 m/s^3"""
+    """Mean length of the third difference over 21 joints. (..., T, P, 22, 3) -> (..., T - 3, P) in 10 m/s^3
+
+    >>> import torch
+    >>> time = torch.arange(30) / 30
+    >>> joints = time.square()[:, None, None, None].expand(30, 1, 22, 3)  # the same acceleration throughout
+    >>> bool(jitter(joints).max() < 0.1)
+    True
+    """
     return without_pelvis(joints).diff(n=3, dim=-4).norm(dim=-1).mean(dim=-1) * fps**3 / 10
 
 

@@ -23,7 +23,12 @@ CHUNK = 8192
 
 
 def point_segment_distance(point: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """(..., 3) x 3 -> (...); the segment from a to b may be a point."""
+    """(..., 3) x 3 -> (...); the segment from a to b may be a point.
+
+    >>> point, a, b = torch.tensor([0.0, 3.0, 0.0]), torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+    >>> point_segment_distance(point, a, b)
+    tensor(3.)
+    """
     along = b - a
     length = (along * along).sum(dim=-1)
     share = ((point - a) * along).sum(dim=-1) / torch.where(length > 0, length, 1.0)

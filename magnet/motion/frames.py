@@ -29,7 +29,12 @@ UPRIGHT = 1e-3
 
 
 def inverse(T_a_b: Tensor) -> Tensor:
-    """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)"""
+    """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)
+
+    >>> T_world_ann = rigid(about_y(torch.tensor(1.0)), torch.tensor([2.0, 0.0, 3.0]))
+    >>> torch.allclose(inverse(T_world_ann) @ T_world_ann, torch.eye(4), atol=1e-6)
+    True
+    """
     R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
     return rigid(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
 
@@ -43,7 +48,11 @@ def rigid(R_a_b: Tensor, t_a_b: Tensor) -> Tensor:
 
 
 def to_9d(T_a_b: Tensor) -> Tensor:
-    """Rotation in 6-D, then translation in metres. (..., 4, 4) -> (..., 9)"""
+    """Rotation in 6-D, then translation in metres. (..., 4, 4) -> (..., 9)
+
+    >>> to_9d(rigid(torch.eye(3), torch.tensor([0.5, 0.0, 2.0])))
+    tensor([1.0000, 0.0000, 0.0000, 0.0000, 1.0000, 0.0000, 0.5000, 0.0000, 2.0000])
+    """
     return torch.cat([to_6d(T_a_b[..., :3, :3]), T_a_b[..., :3, 3]], dim=-1)
 
 
@@ -53,7 +62,12 @@ def from_9d(nine: Tensor) -> Tensor:
 
 
 def to_planar(T_a_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped."""
+    """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped.
+
+    >>> yaw, ground = to_planar(rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0])))
+    >>> yaw, ground
+    (tensor(0.3000), tensor([1., 2.]))
+    """
     return yaw_of(T_a_b[..., :3, :3]), T_a_b[..., [0, 2], 3]
 
 
@@ -84,6 +98,10 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
     The yaw comes from the pelvis's left axis, which stays horizontal in bows and dips where a forward
     axis would flip. Of a person lying exactly on the side the forward axis, then horizontal, decides. Each frame
     is judged by itself, so that it does not matter which others are known.
+
+    >>> T_world_root = rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0]))  # a pelvis 0.9 m up
+    >>> canonical_frame(T_world_root)[:3, 3]
+    tensor([1., 0., 2.])
     """
     left, forward = T_world_root[..., :3, 0], T_world_root[..., :3, 2]
     upright = left[..., [0, 2]].norm(dim=-1) >= UPRIGHT
@@ -95,7 +113,13 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
 
 
 def canonical_steps(T_world_can: Tensor) -> Tensor:
-    """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same"""
+    """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same
+
+    >>> T_world_can = torch.eye(4).repeat(3, 1, 1, 1)  # three frames of one person
+    >>> T_world_can[:, 0, 2, 3] = torch.tensor([0.0, 0.1, 0.3])  # who walks forward, along z
+    >>> canonical_steps(T_world_can)[:, 0, 2, 3]
+    tensor([0.0000, 0.1000, 0.2000])
+    """
     before = torch.cat([T_world_can[..., :1, :, :, :], T_world_can[..., :-1, :, :, :]], dim=-4)
     steps = inverse(before) @ T_world_can
     steps[..., :1, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
@@ -103,13 +127,25 @@ def canonical_steps(T_world_can: Tensor) -> Tensor:
 
 
 def partners(agents: int, device: torch.device | None = None) -> Tensor:
-    """Which agent each partner slot of an agent points at: everybody else, in order. (P, P - 1) int"""
+    """Which agent each partner slot of an agent points at: everybody else, in order. (P, P - 1) int
+
+    >>> partners(3)
+    tensor([[1, 2],
+            [0, 2],
+            [0, 1]])
+    """
     everyone = torch.arange(agents, device=device).expand(agents, agents)
     return everyone[~torch.eye(agents, dtype=torch.bool, device=device)].view(agents, agents - 1)
 
 
 def pairwise(T_world_can: Tensor) -> Tensor:
-    """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)"""
+    """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)
+
+    >>> yaws, ground = torch.tensor([0.0, torch.pi]), torch.tensor([[0.0, 0.0], [0.0, 2.0]])
+    >>> T_self_partner = pairwise(from_planar(yaws, ground))  # two people face each other, 2 m apart
+    >>> T_self_partner[:, 0, 2, 3]  # so each has the other 2 m in front
+    tensor([2., 2.])
+    """
     T_world_partner = T_world_can[..., partners(T_world_can.shape[-3], T_world_can.device), :, :]
     return inverse(T_world_can)[..., None, :, :] @ T_world_partner
 
@@ -174,7 +210,7 @@ def place(
     T_self_partner: Tensor | None,
     T_world_start: Tensor,
     placement: Placement = "integrate",
-    trust: float = 0.003,
+    pairwise_weight: float = 0.003,
     present: Tensor | None = None,
     fixed: Tensor | None = None,
     anchor: Tensor | None = None,
@@ -189,7 +225,7 @@ def place(
             drift apart slowly). `anchor`: one agent integrates, the others hang off it by its pairwise
             transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
             the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
-        trust: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
+        pairwise_weight: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
         present: (B, P) bool; pairs to absent agents are not read. None: all are there.
         fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
         anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
@@ -206,7 +242,9 @@ def place(
         weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(steps.device), FIXED, 1.0)
         pairs = to_planar(T_self_partner.double())
         steps_planar = (step_yaw, step_ground)
-        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, trust, present, weight)).to(steps)
+        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, pairwise_weight, present, weight)).to(
+            steps
+        )
     yaw = start_yaw[:, None] + step_yaw.cumsum(dim=1)
     before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
     ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
@@ -228,17 +266,17 @@ def _fuse(
     pair_ground: Tensor,
     yaw: Tensor,
     ground: Tensor,
-    trust: float,
+    pairwise_weight: float,
     present: Tensor,
     own: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Frame by frame: minimise own * |pose - stepped pose|^2 + trust * sum |pair - predicted pair|^2.
+    """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
 
     Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    diag(own) + 2 trust (graph Laplacian of the people present). own (P,) is each agent's weight.
+    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
     """
     partner = partners(present.shape[1], present.device)
-    together = trust * (present[:, :, None] & present[:, None]).to(step_yaw)
+    together = pairwise_weight * (present[:, :, None] & present[:, None]).to(step_yaw)
     together.diagonal(dim1=1, dim2=2).zero_()
     system = torch.diag(own.to(step_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
     solve = torch.linalg.inv(system)

@@ -9,12 +9,21 @@ def to_6d(rotation: Tensor) -> Tensor:
     """First two *columns* of a rotation matrix, one after the other. (..., 3, 3) -> (..., 6)
 
     Libraries disagree on this: some use rows. Columns follow Zhou et al. 2019 and the paper (3.1).
+
+    >>> to_6d(torch.eye(3))
+    tensor([1., 0., 0., 0., 1., 0.])
     """
     return rotation[..., :2].transpose(-1, -2).flatten(-2)
 
 
 def from_6d(six: Tensor) -> Tensor:
-    """The rotation whose first two columns are nearest in Gram-Schmidt's sense. (..., 6) -> (..., 3, 3)"""
+    """The rotation whose first two columns are nearest in Gram-Schmidt's sense. (..., 6) -> (..., 3, 3)
+
+    >>> from_6d(torch.tensor([2.0, 0, 0, 1, 1, 0]))  # columns neither of length 1 nor square to each other
+    tensor([[1., 0., 0.],
+            [0., 1., 0.],
+            [0., 0., 1.]])
+    """
     first, second = six[..., :3], six[..., 3:]
     x = F.normalize(first, dim=-1)
     y = F.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
@@ -26,6 +35,9 @@ def geodesic(a: Tensor, b: Tensor) -> Tensor:
 
     The arccos of paper Eq. 4 has an infinite slope at 0 and pi. This is the same angle as
     atan2(sin, cos): exactly 0 with gradient 0 where the rotations agree, finite everywhere.
+
+    >>> geodesic(about_y(torch.tensor(0.2)), about_y(torch.tensor(0.5)))
+    tensor(0.3000)
     """
     relative = a.transpose(-1, -2) @ b
     vee = torch.stack(
@@ -60,6 +72,9 @@ def yaw_of(rotation: Tensor) -> Tensor:
     """Angle about the vertical axis of a rotation that is (nearly) about it. (..., 3, 3) -> (...) radians
 
     Averages what the x and the z column say, the least-squares answer for a noisy prediction.
+
+    >>> yaw_of(about_y(torch.tensor([0.5, -3.0])))
+    tensor([ 0.5000, -3.0000])
     """
     sin = rotation[..., 0, 2] - rotation[..., 2, 0]
     cos = rotation[..., 0, 0] + rotation[..., 2, 2]

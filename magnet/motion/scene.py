@@ -39,6 +39,10 @@ class Scene:
 
     Raises:
         ValueError: a tensor's shape does not fit the others.
+
+    >>> scene = empty_scene(2, 60, 3, like=torch.zeros(()))  # 2 scenes of 60 frames with 3 slots, all free
+    >>> scene.select([1]).slice(10, 30).pad_agents(4).T_world_root.shape
+    torch.Size([1, 20, 4, 4, 4])
     """
 
     body_rot: Tensor  # (B, T, P, 21, 3, 3) rotation of each body joint relative to its parent
@@ -273,6 +277,10 @@ def cat_time(pieces: Sequence[Scene]) -> Scene:
 
     Raises:
         ValueError: there are none, or scenes, slots, fps or body differ.
+
+    >>> scene = empty_scene(1, 60, 2, like=torch.zeros(()))
+    >>> cat_time([scene.slice(0, 20), scene.slice(20)]).frames
+    60
     """
     _require_alike(pieces, ("scenes", "agents", "fps", "body"))
     if len(pieces) == 1:

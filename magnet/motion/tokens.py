@@ -21,6 +21,12 @@ class TokenLayout:
 
     The numbers fall into *groups* that share one noise level: group 0 is the agent's own (latent and
     steps), group 1 + s is partner slot s.
+
+    >>> TokenLayout(latent=512, agents=2).width
+    584
+    >>> TokenLayout(latent=4, agents=2).group_levels(torch.tensor([0, 900]))  # own, then the pair's: the noisier end
+    tensor([[  0, 900],
+            [900, 900]])
     """
 
     latent: int = 512
@@ -81,7 +87,11 @@ class TokenLayout:
 
 
 def by_token(frames: Tensor) -> Tensor:
-    """Group the time axis into tokens, the frames inside a token last but one. (B, T, P, D) -> (B, N, P, 4, D)"""
+    """Group the time axis into tokens, the frames inside a token last but one. (B, T, P, D) -> (B, N, P, 4, D)
+
+    >>> by_token(torch.zeros(1, 64, 2, 9)).shape  # 64 frames of two people are 16 tokens each
+    torch.Size([1, 16, 2, 4, 9])
+    """
     B, T, P, D = frames.shape
     if T % STRIDE:
         raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the scene first")

@@ -32,7 +32,9 @@ class Grid:
     steps: int = 30  # denoising steps S, paper A.3
     window: int = 16  # token steps W that the model sees at once
     stride: int = 4  # token steps finished before the window moves on
-    rolling: int | None = 0  # steps between a token and the next; 0: a stride's go together; None: see `slope`
+    pyramid_offset: int | None = (
+        0  # steps between a token and the next; 0: a stride's go together; None: see `token_offset`
+    )
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
     noise_sampling: NoiseSampling = "joint"  # see `magnet.sampling.plans.token_levels`
     spacing: Spacing = "even"  # of the levels that a token passes, or `log_snr`: see `magnet.sampling.noise`
@@ -44,39 +46,39 @@ class Grid:
             raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
         if self.stride > self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
-        if self.rolling is not None:
-            require_whole("rolling", self.rolling, 0)
+        if self.pyramid_offset is not None:
+            require_whole("pyramid_offset", self.pyramid_offset, 0)
         require_choice("noise_sampling", self.noise_sampling, NoiseSampling)
         require_spacing(self.spacing, self.shift)
 
     @property
-    def slope(self) -> int:
+    def token_offset(self) -> int:
         """Denoising steps between a token and the next in plans that can roll; 0: they go in strides.
 
-        By default (`rolling` None) what keeps half of the window in the making, and half in sight behind it.
+        By default (`pyramid_offset` None) what keeps half of the window in the making, and half in sight behind it.
         """
-        if self.rolling is not None:
-            return self.rolling
+        if self.pyramid_offset is not None:
+            return self.pyramid_offset
         return -(-self.steps // (self.window // 2)) if self.window > 1 else 0
 
     @property
-    def rolled(self) -> int:
+    def tokens_in_flight(self) -> int:
         """Token steps that are half denoised at a time when rolling."""
-        return -(-self.steps // self.slope)
+        return -(-self.steps // self.token_offset)
 
     @property
-    def rolls(self) -> bool:
+    def slides(self) -> bool:
         """Whether the window moves on token by token: there is a slope, and it holds all that is half denoised."""
-        return self.slope > 0 and self.rolled < self.window
+        return self.token_offset > 0 and self.tokens_in_flight < self.window
 
     @property
-    def pyramid(self) -> int:
+    def offset_in_window(self) -> int:
         """Denoising steps between a token and the next inside a window that moves in strides; 0: they go together.
 
         A slope too gentle for the window to roll along it. Each place of the window then has a whole pyramid to
         itself: it begins with all of its new tokens at K and ends with all of them clean.
         """
-        return 0 if self.rolls else self.slope
+        return 0 if self.slides else self.token_offset
 
     def mask(self) -> Tensor:
         """An all-False mask over (token time, agent) for a task to fill in. (N, P) bool"""

@@ -26,27 +26,27 @@ class Guidance:
         kind: `none`; `history` (HG): with against without any history; `self` (SHG): one's own history
             against none; `partner` (PHG): the others' history against none.
         weight: w of paper A.7, which uses 1; 0 is no guidance.
-        literal: average `self` and `partner` over all branches as A.7 is printed, which makes the two
+        paper_average: average `self` and `partner` over all branches as A.7 is printed, which makes the two
             the same for two people. By default each agent's output is read from the branch with its own
             (`self`) or the others' (`partner`) history, so that they differ.
         smooth: lambda of smoothing guidance (paper A.8, Eq. 14, which gives no value); each denoising step then
             also runs the model backward. Known tokens are never moved.
-        context_level: noise level at which the model is shown what is finished, for long scenes: small errors
+        stabilization_level: noise level at which the model is shown what is finished, for long scenes: small errors
             then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
     """
 
     kind: Kind = "none"
     weight: float = 1.0
-    literal: bool = False
+    paper_average: bool = False
     smooth: float = 0.0
-    context_level: int = 0
+    stabilization_level: int = 0
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise ValueError(f"kind: got {self.kind!r}, expected {' or '.join(get_args(Kind))}")
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
-        require_whole("context_level", self.context_level, 0, LEVELS - 1)
+        require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
 
     def branches(self, there: Tensor) -> Tensor:
         """Whose history each branch sees, the unguided one first; slots that are free everywhere see and tell nothing.
@@ -74,40 +74,46 @@ class Guidance:
         tokens: Tensor,
         levels: Tensor,
         present: Tensor,
-        veil: Tensor,
+        mask_noise: Tensor,
         layout: TokenLayout,
         moves: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """The noisy tokens that the next step starts from, which smoothing moves, and the guided prediction.
 
-        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P), moves bool, which numbers the step denoises
-        -> (B, W, P, D) twice
+        tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P), moves bool, the numbers that the step
+        denoises -> (B, W, P, D) twice
         """
         if not self.smooth:
-            return tokens, self.predict(denoise, tokens, levels, present, veil, layout)
+            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout)
         # Lightning tests in inference mode, whose tensors no gradient may pass.
         with torch.inference_mode(False), torch.enable_grad():
             noisy = tokens.clone().requires_grad_()
-            still = levels.clone(), present.clone(), veil.clone()
+            still = levels.clone(), present.clone(), mask_noise.clone()
             clean = self.predict(denoise, noisy, *still, layout)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
         return torch.where(moves, tokens - self.smooth * slope, tokens), clean.detach()
 
     def predict(
-        self, denoise: DenoiseFn, tokens: Tensor, levels: Tensor, present: Tensor, veil: Tensor, layout: TokenLayout
+        self,
+        denoise: DenoiseFn,
+        tokens: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        mask_noise: Tensor,
+        layout: TokenLayout,
     ) -> Tensor:
         """Guided prediction; all branches run as one batch.
 
         Clean tokens are history. A branch that must not see someone's history has it at level K, as noise.
-        tokens, veil (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
+        tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
         """
         B, _, P, _ = tokens.shape
         there = present.any(dim=0)
         sees = self.branches(there)  # (K, P)
         clean = levels == 0
-        if self.context_level:
-            told = torch.where(clean, self.context_level, levels)
-            tokens = noisier(tokens, veil, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
+        if self.stabilization_level:
+            told = torch.where(clean, self.stabilization_level, levels)
+            tokens = noisier(tokens, mask_noise, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
             levels = told
         if len(sees) == 1:
             return denoise(tokens, levels, present)
@@ -115,7 +121,7 @@ class Guidance:
         shown = torch.where(forgotten, LEVELS, levels[:, None])
         was = layout.spread(layout.group_levels(levels))[:, None]
         unknown = (layout.spread(layout.group_levels(shown)) == LEVELS) & (was < LEVELS)
-        views = torch.where(unknown, veil[:, None], tokens[:, None])
+        views = torch.where(unknown, mask_noise[:, None], tokens[:, None])
         K = len(sees)
         clean_of = denoise(
             views.flatten(0, 1), shown.flatten(0, 1), present[:, None].expand(B, K, P).flatten(0, 1)
@@ -130,7 +136,7 @@ class Guidance:
         else:
             rows = self.alone(there) if self.kind == "self" else ~self.alone(there) & there
             each = torch.stack([branch(row) if here else cond for row, here in zip(rows, there, strict=True)])
-            if self.literal:
+            if self.paper_average:
                 total = torch.where(present.T[..., None, None, None], each, 0.0).sum(dim=0)
                 special = total / present.sum(dim=1).view(-1, 1, 1, 1)
             else:

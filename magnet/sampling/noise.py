@@ -24,6 +24,9 @@ def alpha_bar(levels: Tensor, K: int = LEVELS) -> Tensor:
 
     The paper's formula is 0.99984 at level 0; divided by that, level 0 is clean bit for bit. Level K is
     exactly 0, so nothing of the truth survives in a token at level K.
+
+    >>> alpha_bar(torch.tensor([0, 500, 1000]))  # all of the signal, about half of its variance, none
+    tensor([1.0000, 0.4938, 0.0000])
     """
     return _shares(K, levels.device)[levels]
 
@@ -49,7 +52,7 @@ def ddim_step(
     now: Tensor,
     after: Tensor,
     eta: float = 0.0,
-    fresh: Tensor | None = None,
+    step_noise: Tensor | None = None,
     K: int = LEVELS,
 ) -> Tensor:
     """One DDIM step from levels `now` down to `after`, given the predicted clean value (Song et al. 2021, Eq. 12, 16).
@@ -60,16 +63,21 @@ def ddim_step(
         noisy, clean: (..., D).
         now, after: (..., D) int or broadcastable.
         eta: how much of the noise that is left is new: 0 none, the deterministic step; 1 as in ancestral sampling.
-        fresh: (..., D) new standard normal noise; needed where eta is not 0.
+        step_noise: (..., D) new standard normal noise; needed where eta is not 0.
         K: number of levels.
+
+    >>> clean, noise = torch.tensor([2.0]), torch.tensor([1.0])
+    >>> noisy = add_noise(clean, noise, torch.tensor([800]))
+    >>> ddim_step(noisy, clean, now=torch.tensor([800]), after=torch.tensor([0]))  # at level 0: what was predicted
+    tensor([2.])
     """
     a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
     # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
     left = (1 - a_now).clamp_min(1e-12)
     noise = (noisy - a_now.sqrt() * clean) / left.sqrt()
-    if eta and fresh is not None:
+    if eta and step_noise is not None:
         renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
-        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * fresh
+        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * step_noise
     else:
         noise = (1 - a_after).sqrt() * noise
     moved = a_after.sqrt() * clean + noise
@@ -94,6 +102,11 @@ def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
 
     Raises:
         ValueError: fewer than one step, or so many that two would be at one level; says how many can be.
+
+    >>> ddim_levels(5)
+    tensor([1000,  800,  600,  400,  200,    0])
+    >>> ddim_levels(5, shift=3.0)  # more of the steps where there is much noise
+    tensor([1000,  923,  818,  667,  429,    0])
     """
     require_whole("denoising steps", steps, 1, K)
     require_number("shift", shift, over=0)
@@ -134,6 +147,9 @@ def log_snr_levels(steps: int, K: int = LEVELS) -> Tensor:
 
     Raises:
         ValueError: fewer than one step, or more than there are levels.
+
+    >>> log_snr_levels(5)
+    tensor([1000,  790,  255,   34,    2,    0])
     """
     require_whole("denoising steps", steps, 1, K)
     length = min((LOWEST_NOISE - HIGHEST_NOISE) / max(steps - 1, 1), LONGEST_STEP)
@@ -180,8 +196,8 @@ class NoiseStream:
         # Drawn once: the noise of a step then hangs on its place alone, in whatever order places are asked for.
         self._seeds = self._draw_seeds() if self.eta else []
 
-    def rows(self, count: int) -> tuple[Tensor, Tensor]:
-        """The noise of the next `count` token steps, and their veil, which stands in where a view hides them.
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """The noise of the next `count` token steps, and their mask_noise, which stands in where a view hides them.
 
         -> (B, count, P, D) each
         """
@@ -199,7 +215,7 @@ class NoiseStream:
             return torch.stack(each, dim=1)
         return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)
 
-    def at(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
+    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
         """New noise of the denoising steps that leave these levels, on token steps `first` and on.
 
         levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)

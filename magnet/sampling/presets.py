@@ -13,16 +13,22 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "steps": 30,  # A.3
         "stride": 4,  # method.md C.5: 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
-        "rolling": 0,  # 3.3: segment by segment
+        "pyramid_offset": 0,  # 3.3: segment by segment
         "placement": "integrate",  # the paper predicts steps and integrates them
-        "trust": 0.02,  # not read by `integrate`
+        "pairwise_weight": 0.02,  # not read by `integrate`
         "requantize": True,  # 3.1: what is decoded are codes
-        "paste": True,  # 3.3: what is given stays as given
+        "keep_given": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM
         "shift": 1.0,  # A.3: even steps
         "any_floor": False,  # recordings stand on the floor
-        "guidance": {"kind": "none", "weight": 1.0, "literal": True, "smooth": 0.0, "context_level": 0},  # A.7: w = 1
+        "guidance": {
+            "kind": "none",
+            "weight": 1.0,
+            "paper_average": True,
+            "smooth": 0.0,
+            "stabilization_level": 0,
+        },  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3

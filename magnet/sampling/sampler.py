@@ -23,7 +23,7 @@ class DenoiseFn(Protocol):
     def __call__(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor: ...
 
 
-Settle = Callable[[Tensor, Tensor, bool], Tensor]
+StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the canvas (B, N, P, D), which tokens it finished (N, P) bool, and whether it hid from
 somebody what it generated of others; returns the canvas with those tokens made self-consistent (codes snapped,
 transforms recomputed from world poses)."""
@@ -37,7 +37,7 @@ def sample(
     present: Tensor,
     layout: TokenLayout,
     generator: torch.Generator | Sequence[torch.Generator] | None = None,
-    settle: Settle | None = None,
+    on_stage_end: StageCallback | None = None,
     progress: Callable[[int], None] | None = None,
     guidance: Guidance | None = None,
     noise: NoiseStream | None = None,
@@ -53,7 +53,7 @@ def sample(
         present: (B, P) bool.
         layout: which numbers of a token share a level.
         generator: source of all noise, on the tokens' device; or one for each scene, see `NoiseStream`.
-        settle: see `Settle`.
+        on_stage_end: see `StageCallback`.
         progress: told 1 after each denoising step.
         guidance: what the prediction is pushed toward.
         noise: instead of `generator`.
@@ -66,11 +66,21 @@ def sample(
     if (schedule.tokens, schedule.agents) != (N, P):
         raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
     noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
-    fresh, veil = noise.rows(N)
-    canvas = begin(tokens, fresh, schedule.known, layout)
+    init_noise, mask_noise = noise.draw(N)
+    canvas = begin(tokens, init_noise, schedule.known, layout)
     history = None if solver == "ddim" else History.empty(canvas)
     return run_stages(
-        denoise, schedule.stages, canvas, veil, present, layout, settle, progress, guidance, noise, history=history
+        denoise,
+        schedule.stages,
+        canvas,
+        mask_noise,
+        present,
+        layout,
+        on_stage_end,
+        progress,
+        guidance,
+        noise,
+        history=history,
     )
 
 
@@ -85,17 +95,17 @@ def run_stages(
     denoise: DenoiseFn,
     stages: Iterable[Stage],
     canvas: Tensor,
-    veil: Tensor,
+    mask_noise: Tensor,
     present: Tensor,
     layout: TokenLayout,
-    settle: Settle | None = None,
+    on_stage_end: StageCallback | None = None,
     progress: Callable[[int], None] | None = None,
     guidance: Guidance | None = None,
     noise: NoiseStream | None = None,
     offset: int = 0,
     history: History | None = None,
 ) -> Tensor:
-    """Run stages in their order on a canvas. canvas, veil (B, N, P, D) -> (B, N, P, D)
+    """Run stages in their order on a canvas. canvas, mask_noise (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`; `noise` gives what is new in each step, and `offset` says which of its rows the canvas
     begins with. A `history` of the canvas makes the solver a multistep one, and is brought up to date.
@@ -103,15 +113,15 @@ def run_stages(
     canvas = canvas.clone()
     for stage in stages:
         window = slice(stage.start, stage.stop)
-        tokens, hides, first = canvas[:, window], veil[:, window], offset + stage.start
+        tokens, hides, first = canvas[:, window], mask_noise[:, window], offset + stage.start
         past = None if history is None else history.window(window)
         canvas[:, window] = run_stage(
             denoise, stage, tokens, hides, present, layout, progress, guidance or Guidance(), noise, first, past
         )
-        if settle is not None:
+        if on_stage_end is not None:
             finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
             finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
-            canvas = settle(canvas, finished, stage.apart)
+            canvas = on_stage_end(canvas, finished, stage.decentralized)
     return canvas
 
 
@@ -119,7 +129,7 @@ def run_stage(
     denoise: DenoiseFn,
     stage: Stage,
     tokens: Tensor,
-    veil: Tensor,
+    mask_noise: Tensor,
     present: Tensor,
     layout: TokenLayout,
     progress: Callable[[int], None] | None,
@@ -128,7 +138,7 @@ def run_stage(
     first: int = 0,
     history: History | None = None,
 ) -> Tensor:
-    """The denoising steps of one window position. tokens, veil (B, W, P, D) -> (B, W, P, D)
+    """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
 
     `first` is the row of `noise` that the window begins with; `history` is that of the window.
     """
@@ -139,15 +149,15 @@ def run_stage(
         group, group_after = (layout.spread(layout.group_levels(x)) for x in (now, after))
         moves = group != group_after
         eta = noise.eta if noise is not None else 0.0
-        fresh = noise.at(first, group, moves) if noise is not None and eta else None
+        step_noise = noise.step_noise(first, group, moves) if noise is not None and eta else None
         if hidden is None:
             each = now.expand(len(tokens), -1, -1)
-            tokens, clean = guidance.apply(denoise, tokens, each, present, veil, layout, moves)
+            tokens, clean = guidance.apply(denoise, tokens, each, present, mask_noise, layout, moves)
         else:
             tokens, clean, group, group_after = _predict_in_views(
-                denoise, tokens, veil, now, after, hidden, present, layout, guidance
+                denoise, tokens, mask_noise, now, after, hidden, present, layout, guidance
             )
-        tokens = solver_step(tokens, clean, group, group_after, eta, fresh, history)
+        tokens = solver_step(tokens, clean, group, group_after, eta, step_noise, history)
         if progress is not None:
             progress(1)
     return tokens
@@ -156,7 +166,7 @@ def run_stage(
 def _predict_in_views(
     denoise: DenoiseFn,
     tokens: Tensor,
-    veil: Tensor,
+    mask_noise: Tensor,
     now: Tensor,
     after: Tensor,
     hidden: Tensor,
@@ -181,15 +191,15 @@ def _predict_in_views(
     group = layout.spread(layout.group_levels(seen_now))  # (V, W, P, D)
     group_after = layout.spread(layout.group_levels(seen_after))
     # What speaks of somebody hidden is shown as noise of its own: its own noise would tell where it is going.
-    veiled = torch.where(views_hidden, LEVELS, 0)
-    unknown = layout.spread(layout.group_levels(veiled)) == LEVELS
-    views = torch.where(unknown, veil[:, None], tokens[:, None])  # (B, V, W, P, D)
+    masked_levels = torch.where(views_hidden, LEVELS, 0)
+    unknown = layout.spread(layout.group_levels(masked_levels)) == LEVELS
+    views = torch.where(unknown, mask_noise[:, None], tokens[:, None])  # (B, V, W, P, D)
     moved, clean = guidance.apply(
         denoise,
         views.flatten(0, 1),
         seen_now.expand(B, V, W, P).flatten(0, 1),
         present[:, None].expand(B, V, P).flatten(0, 1),
-        veil[:, None].expand_as(views).flatten(0, 1),
+        mask_noise[:, None].expand_as(views).flatten(0, 1),
         layout,
         (group != group_after).expand_as(views).flatten(0, 1),
     )

@@ -53,7 +53,7 @@ class Stage:
         return (self.start + int(rows[0]), self.start + int(rows[-1]) + 1) if len(rows) else (self.stop, self.stop)
 
     @property
-    def apart(self) -> bool:
+    def decentralized(self) -> bool:
         """Whether some agent does not see what this stage generates of another."""
         generated = (self.levels[0] > 0) & (self.levels[0] != self.levels[-1])
         return self.hidden is not None and bool((self.hidden & generated).any())
@@ -86,6 +86,14 @@ class MaskSchedule:
 
     Raises:
         ValueError: a law is broken; names the stage, step, token and agent.
+
+    >>> grid = Grid(tokens=4, agents=2, context=2, steps=2)
+    >>> plan = MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)  # go on from two known tokens
+    >>> for row in plan.rows():
+    ...     print(row[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step
+    [0, 0, 1000, 1000]
+    [0, 0, 500, 500]
+    [0, 0, 0, 0]
     """
 
     tokens: int
@@ -163,7 +171,7 @@ class MaskSchedule:
                 yield level.clone()
 
     @staticmethod
-    def together(
+    def full_sequence(
         known: Tensor, target: Tensor, grid: Grid, positions: Iterable[tuple[int, int, int]] | None = None
     ) -> MaskSchedule:
         """Denoise all targets at one level, window by window (paper 3.3, causal autoregression).
@@ -171,21 +179,23 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated; what is neither stays unknown, at level K.
-            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. Where it `rolls`, the
-                window moves on token by token; with a `grid.pyramid` the new tokens of each of its places follow
-                one another.
+            grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. Where it `slides`, the
+                window moves on token by token; with a `grid.offset_in_window` the new tokens of each place
+                follow one another.
             positions: other places for the window, as `window_positions` gives them; these cannot roll.
 
         Raises:
-            ValueError: rolling was asked for where the window's places are given.
+            ValueError: a pyramid was asked for where the window's places are given.
         """
-        if grid.rolling and positions is not None:
-            raise ValueError("rolling goes forward in time, and this task looks ahead to keyframes: leave it out")
-        if grid.rolls and positions is None:
-            return MaskSchedule.roll(known, target, grid)
+        if grid.pyramid_offset and positions is not None:
+            raise ValueError(
+                "pyramid_offset: a pyramid goes forward in time, and this task looks ahead to keyframes; leave it out"
+            )
+        if grid.slides and positions is None:
+            return MaskSchedule.pyramid(known, target, grid)
         stages = []
         level = initial_levels(known)
-        plan, slope = token_levels(grid), 0 if positions is not None else grid.pyramid
+        plan, slope = token_levels(grid), 0 if positions is not None else grid.offset_in_window
         for start, first, last in positions or window_positions(target, grid):
             stop = min(start + grid.window, grid.tokens)
             active = target[start:stop].clone()
@@ -201,10 +211,10 @@ class MaskSchedule:
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
     @staticmethod
-    def roll(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
-        """Denoise along a slope: each token `grid.slope` denoising steps behind the one before it in time.
+    def pyramid(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
+        """Denoise along a slope: each token `grid.token_offset` denoising steps behind the one before it in time.
 
-        The window has to hold all that is half denoised at a time (`Grid.rolls`), and one token more.
+        The window has to hold all that is half denoised at a time (`Grid.slides`), and one token more.
 
         A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
         finishes one more token step. As long as less than half of a window lies behind, there is too little to go on
@@ -213,7 +223,7 @@ class MaskSchedule:
         Args:
             known: (N, P) bool, given clean.
             target: (N, P) bool, to be generated.
-            grid: sizes; `grid.slope` is over 0.
+            grid: sizes; `grid.token_offset` is over 0.
         """
         plan = token_levels(grid)
         level, stages, done = initial_levels(known), [], 0
@@ -223,24 +233,24 @@ class MaskSchedule:
             rows = changing(torch.where(target[:done], plan[:, :done], level[:done]))
             stages.append(Stage(0, rows.short()))
             level[:done] = rows[-1]
-        rolling = target & (torch.arange(grid.tokens) >= done)[:, None]
+        sliding = target & (torch.arange(grid.tokens) >= done)[:, None]
         wanted = [token for token in wanted if token >= done]
         first = wanted[0] if wanted else 0
         ended = 0
         for token in wanted:
-            begins, ended = ended, grid.steps + (token - first) * grid.slope
-            start = max(0, min(token + grid.rolled, grid.tokens) - grid.window)
+            begins, ended = ended, grid.steps + (token - first) * grid.token_offset
+            start = max(0, min(token + grid.tokens_in_flight, grid.tokens) - grid.window)
             stop = min(start + grid.window, grid.tokens)
-            behind = grid.slope * (torch.arange(start, stop) - first)
+            behind = grid.token_offset * (torch.arange(start, stop) - first)
             turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
             now = levels_at(plan, turn[..., None], start, stop)
-            rows = changing(torch.where(rolling[start:stop], now, level[start:stop]))
+            rows = changing(torch.where(sliding[start:stop], now, level[start:stop]))
             stages.append(Stage(start, rows.short()))
             level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
     @staticmethod
-    def blocks(
+    def autoregressive(
         known: Tensor,
         target: Tensor,
         grid: Grid,
@@ -270,12 +280,12 @@ class MaskSchedule:
             lookahead: False: nobody sees anything, even if known, after the current block.
 
         Raises:
-            ValueError: the block is no whole number of 1 up to the window, or `grid.rolling` is over 0.
+            ValueError: the block is no whole number of 1 up to the window, or `grid.pyramid_offset` is over 0.
         """
-        if grid.rolling:
+        if grid.pyramid_offset:
             raise ValueError(
-                "rolling: here agents act on what they have seen of each other, and a token begun ahead of time would "
-                "be half made up by then; leave rolling out"
+                "pyramid_offset: agents of this task act on finished tokens of each other, and a pyramid begins tokens "
+                "before those are finished; leave pyramid_offset out"
             )
         require_whole("block", block, 1, grid.window)
         causal = unseen is not None or delay is not None

@@ -61,7 +61,7 @@ def solver_step(
     now: Tensor,
     after: Tensor,
     eta: float = 0.0,
-    fresh: Tensor | None = None,
+    step_noise: Tensor | None = None,
     history: History | None = None,
 ) -> Tensor:
     """One step of every number from its level `now` down to its level `after`, given the predicted clean values.
@@ -75,15 +75,15 @@ def solver_step(
         noisy, clean: (B, N, P, D).
         now, after: (N, P, D) int.
         eta: as for `ddim_step`.
-        fresh: as for `ddim_step`.
+        step_noise: as for `ddim_step`.
         history: what came before; brought up to date.
     """
     if history is None:
-        return ddim_step(noisy, clean, now, after, eta, fresh)
+        return ddim_step(noisy, clean, now, after, eta, step_noise)
     moves = now != after
     ahead = torch.where(moves & (after > 0), carried_on(clean, now, after, history), clean)
     history.keep(clean, now, moves)
-    return ddim_step(noisy, ahead, now, after, eta, fresh)
+    return ddim_step(noisy, ahead, now, after, eta, step_noise)
 
 
 def carried_on(clean: Tensor, now: Tensor, after: Tensor, history: History) -> Tensor:

@@ -40,6 +40,11 @@ def synthesize(coupling: str, people: int, frames: int, generator: torch.Generat
 
     Raises:
         ValueError: no such coupling, a group or a stretch it is not for.
+
+    >>> from magnet.body import load_body
+    >>> made = synthesize("mirror", 2, 120, torch.Generator().manual_seed(0), load_body())
+    >>> made.scene.frames, made.scene.agents
+    (120, 2)
     """
     if coupling not in COUPLINGS:
         raise ValueError(f"coupling {coupling!r}: expected one of {', '.join(COUPLINGS)}")

@@ -28,7 +28,7 @@ class AgenticSync:
         if grid.context == 0:
             raise ValueError("agentic_sync continues a recording: give it context frames")
         unseen = ~torch.eye(grid.agents, dtype=torch.bool)
-        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, unseen=unseen)
+        return MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid, self.block, unseen=unseen)
 
 
 @register_task("agentic_async")
@@ -61,4 +61,4 @@ class AgenticAsync:
         turns = [*self.order, *(p for p in range(grid.agents) if p not in self.order)]
         turn = torch.tensor([turns.index(p) for p in range(grid.agents)])
         delay = turn * round(self.offset * grid.steps)
-        return MaskSchedule.blocks(grid.past(), ~grid.past(), grid, self.block, delay=delay)
+        return MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid, self.block, delay=delay)

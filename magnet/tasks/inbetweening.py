@@ -69,14 +69,14 @@ class Inbetweening:
 def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
     """Generate all that is not known, window by window, each token in sight of the next keyframe where it can be.
 
-    known (N, P) bool. `MaskSchedule.together` would have the last of each window's tokens see nothing ahead.
+    known (N, P) bool. `MaskSchedule.full_sequence` would have the last of each window's tokens see nothing ahead.
 
     Raises:
         ValueError: everything is known.
     """
     if bool(known.all()):
         raise ValueError("every token is a keyframe: there is nothing to generate between them")
-    return MaskSchedule.together(known, ~known, grid, key_positions(known, grid))
+    return MaskSchedule.full_sequence(known, ~known, grid, key_positions(known, grid))
 
 
 def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:

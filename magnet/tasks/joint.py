@@ -17,7 +17,7 @@ class JointFuture:
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
             raise ValueError("joint_future continues a recording: give it context frames, or use the task generation")
-        return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+        return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
 @register_task("generation")
@@ -29,4 +29,4 @@ class Generation:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         nothing = grid.mask()
-        return MaskSchedule.together(nothing, ~nothing, grid)
+        return MaskSchedule.full_sequence(nothing, ~nothing, grid)

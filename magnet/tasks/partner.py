@@ -50,7 +50,7 @@ class PartnerInpainting:
             if grid.context == 0:
                 raise ValueError("partner_inpainting with own_past goes on from a past: give it context frames")
             unknown = unknown & ~grid.past()
-        return MaskSchedule.together(~unknown, unknown, grid)
+        return MaskSchedule.full_sequence(~unknown, unknown, grid)
 
 
 @register_task("partner_prediction")
@@ -68,7 +68,7 @@ class PartnerPrediction:
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
             raise ValueError("partner_prediction continues a recording: give it context frames")
-        return MaskSchedule.together(grid.past(), chosen(grid, self.target) & ~grid.past(), grid)
+        return MaskSchedule.full_sequence(grid.past(), chosen(grid, self.target) & ~grid.past(), grid)
 
 
 @register_task("motion_control")
@@ -89,4 +89,4 @@ class MotionControl:
         if grid.context == 0:
             raise ValueError("motion_control continues a recording: give it context frames")
         unknown = chosen(grid, self.target) & ~grid.past()
-        return MaskSchedule.blocks(~unknown, unknown, grid, self.block, lookahead=False)
+        return MaskSchedule.autoregressive(~unknown, unknown, grid, self.block, lookahead=False)

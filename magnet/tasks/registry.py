@@ -127,6 +127,13 @@ def get(name: str) -> type:
 
     Raises:
         ValueError: no such task; suggests the closest name, or says why a plug-in of that name failed.
+
+    >>> from magnet.sampling.schedule import Grid
+    >>> task = get("partner_inpainting")(target=(1,))
+    >>> task.schedule(Grid(tokens=3, agents=2, context=0)).known  # (token, agent): agent 0 is given, agent 1 is made
+    tensor([[ True, False],
+            [ True, False],
+            [ True, False]])
     """
     discover()
     if not isinstance(name, str):

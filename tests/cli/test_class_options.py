@@ -20,12 +20,13 @@ from magnet.cli import class_options, train
 from magnet.cli.checkpoint_config import LINKS, OWN_WAY
 from magnet.cli.config_files import Layer, merged, read_layers
 from magnet.cli.main import TRAINER_COMMANDS
-from magnet.tasks import registry
+from magnet.datamodules import registry
+from magnet.tasks import registry as task_registry
 from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 MODELS, DATA = train.named_classes()
-TASKS = {entry.name: entry.task for entry in registry.entries()}
+TASKS = {entry.name: entry.task for entry in task_registry.entries()}
 
 
 def told(config: Path) -> dict[str, Any]:
@@ -143,7 +144,7 @@ def test_tasks_have_their_own_defaults(name: str, command: str, capsys: pytest.C
 def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    inside = [name for name in DATA if name != "Mixed"]
+    inside = [name for name in DATA if "data" not in own(DATA[name])]
     parts = [{"class_path": name, "init_args": {"seed": 3}} for name in inside]
     mixed = {"class_path": "Mixed", "init_args": {"data": parts, "max_agents": 3}}
     below = SPELT | {"class_path": "Synthetic"}
@@ -233,7 +234,7 @@ def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """An empty working folder, and toys in place of the real models and data."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
     return tmp_path
 
 

@@ -10,9 +10,10 @@ import yaml
 
 from magnet import cli
 from magnet.cli import config_files, demo, train, view
+from magnet.datamodules import registry
 from magnet.generation.conditioning import SamplerOptions
 from magnet.sampling.guidance import Guidance
-from tests.toys import ToyModel
+from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 PAPER = SamplerOptions.preset("paper")
@@ -23,7 +24,7 @@ def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """An empty working folder, and toys in place of the real models and data."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
     return tmp_path
 
 

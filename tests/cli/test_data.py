@@ -12,7 +12,7 @@ import pytest
 from magnet import cli
 from magnet.cli import data, data_options
 from magnet.cli.data_shown import NOTES_SHOWN, show_notes
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +36,14 @@ def copy(made, tmp_path, monkeypatch) -> Path:
 def test_the_list_tells_who_may_use_each_data_set_where_to_ask_and_what_must_lie_where(capsys):
     assert cli.main(["data", "list"]) == 0
     said = capsys.readouterr().out
-    for name, entry in catalogue.NAMES.items():
-        reader = entry.load_reader()
+    for name, reader in registry.readers().items():
         assert cli.main(["data", "list", name]) == 0
         alone = capsys.readouterr().out
         assert alone in said and alone.startswith(f"{name}  {reader.title}\n")
         for part in (reader.licence, reader.source, *(word for line in reader.layout for word in line)):
             assert part in alone
         assert f"magnet data prepare {name} --root DOWNLOAD" in alone and f"magnet data fake {name} FAKE" in alone
-    assert "synthetic has no files" in said
+    assert "--data Synthetic" in said
     assert cli.main(["data", "list", "dd10"]) == 2
     assert "no data set 'dd10'; did you mean dd100?" in capsys.readouterr().err
 
@@ -106,7 +105,7 @@ def test_a_check_finds_another_body(copy, capsys):
 
 
 def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
-    takes = [take.name for take in catalogue.find("dd100").load_reader()("dl").found()]
+    takes = [take.name for take in registry.reader("dd100")("dl").found()]
     (copy / "mine.txt").write_text("".join(f"{name} train\n" for name in (*takes, *(f"gone{k}" for k in range(7)))))
     words = ["--body", "dl/body.npz", "--workers", "1", "--splits", "mine.txt", "--limit", "1"]
     assert cli.main(["data", "check", "dl", "--picture", "none", *words]) == 0
@@ -148,7 +147,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("check nowhere", "is not a folder"),
         ("check empty", "neither a prepared store nor a download"),
         ("fake dd100 dl", "is not empty"),
-        ("prepare cmu --root dl --out o", "cmu trains without being prepared"),
+        ("prepare cmu --root dl --out o", "cmu has no files to prepare"),
         ("fake dd100", "out is missing"),
         ("fake dd100 new --takes 0", "takes: got 0"),
         ("fake cmu new --frames 0", "frames: got 0"),
@@ -167,7 +166,7 @@ def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message)
 
 @pytest.mark.parametrize("command", ["prepare", "check dl", "check store", "info"])
 def test_an_empty_split_is_said_loudly(copy, capsys, command):
-    takes = [take.name for take in catalogue.find("dd100").load_reader()(copy / "dl").takes()]
+    takes = [take.name for take in registry.reader("dd100")(copy / "dl").takes()]
     (copy / "mine.txt").write_text(f"{takes[0]} train\n{takes[1]} test\n")
     work = ("--splits", "mine.txt", "--body", "dl/body.npz", "--workers", "1")
     prepare = ("data", "prepare", "dd100", "--root", "dl", "--out", "store", *work)
@@ -210,7 +209,7 @@ def test_help_shows_a_data_sets_own_options(capsys):
 
 
 def test_readers_options_are_read_by_their_types():
-    kind = catalogue.find("embody3d").load_reader()
+    kind = registry.reader("embody3d")
     got = data_options.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
     assert got == {"people": [2, 3], "good": 0}
 
@@ -265,7 +264,7 @@ def test_of_notes_that_differ_in_numbers_alone_the_first_are_shown(capsys):
 
 
 def test_a_folder_of_ones_own_is_recognised_by_its_files_and_a_wrong_table_is_named(tmp_path, capsys):
-    catalogue.find("scenes").load_fake()(tmp_path / "dl", 4, 40)
+    registry.reader("scenes").write_fake(tmp_path / "dl", 4, 40)
     words = ["data", "check", str(tmp_path / "dl"), "--body", str(tmp_path / "dl/body.npz"), "--picture", "none"]
     assert cli.main([*words, "--workers", "1"]) == 0
     said = capsys.readouterr().out

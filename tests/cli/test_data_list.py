@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 
 
 def globs(pattern: str) -> list[str]:
@@ -26,10 +26,10 @@ def test_patterns_are_globs() -> None:
     assert globs("{a,b}/sXX/CAPTURE/P1.npz") == ["a/s*/*/P1.npz", "b/s*/*/P1.npz"]
 
 
-@pytest.mark.parametrize("name", catalogue.NAMES)
+@pytest.mark.parametrize("name", registry.readers())
 def test_a_download_lies_as_it_is_listed(name: str, tmp_path: Path) -> None:
-    reader = catalogue.find(name).load_reader()
-    catalogue.find(name).load_fake()(tmp_path, 4, 12)
+    reader = registry.reader(name)
+    registry.reader(name).write_fake(tmp_path, 4, 12)
     files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     listed = {glob for pattern, _ in reader.layout for glob in globs(pattern)}
     assert listed

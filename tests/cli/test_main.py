@@ -14,7 +14,9 @@ from magnet import __version__, cli
 from magnet.cli import train
 from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, usage
+from magnet.datamodules import registry
 from tests import toys
+from tests.toys import OtherData, ToyData
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
@@ -34,7 +36,7 @@ def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MAGNET_DEBUG", raising=False)
     monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
     return tmp_path
 
 
@@ -120,7 +122,10 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
         (["test", "--out", __file__], "got a file, expected a folder"),
         (["test", "--frames", "9"], "did you mean --data.window_frames?"),
         (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
-        (["test", "--sampler.rolling", "four"], "--sampler.rolling: got four, expected a whole number or null"),
+        (
+            ["test", "--sampler.pyramid_offset", "four"],
+            "--sampler.pyramid_offset: got four, expected a whole number or null",
+        ),
         (["test", "--task", "inbetweening", "--task.keys", "20"], "--task.keys: got 20, expected a list such as [0,1]"),
         (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
         (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),

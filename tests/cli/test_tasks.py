@@ -34,7 +34,7 @@ class Foreign:
     def schedule(self, grid: Grid) -> MaskSchedule:
         known = grid.past()
         known[: grid.context + self.keep] = True
-        return MaskSchedule.together(known, ~known, grid)
+        return MaskSchedule.full_sequence(known, ~known, grid)
 
 
 @pytest.fixture

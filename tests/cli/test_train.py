@@ -12,6 +12,7 @@ import yaml
 
 from magnet import cli
 from magnet.cli import train
+from magnet.datamodules import registry
 from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
@@ -22,7 +23,7 @@ def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """An empty working folder, and toys in place of the real models and data."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(train, "DATA", {"ToyData": "tests.toys", "OtherData": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
     return tmp_path
 
 

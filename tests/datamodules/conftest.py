@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from magnet.datamodules import catalogue
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules import registry
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
-from tests.datamodules.made import ENTRY, NAME, write
+from tests.datamodules.made import NAME, Made, write
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     module = request.module
     name = module.__name__.rpartition("test_")[2]
     root = tmp_path_factory.mktemp(name)
-    catalogue.NAMES[name].load_fake()(root, module.TAKES, module.FRAMES)
+    registry.reader(name).write_fake(root, module.TAKES, module.FRAMES)
     return root
 
 
@@ -34,10 +34,10 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def known() -> Iterator[None]:
-    """The catalogue has the made-up data set."""
-    catalogue.NAMES[NAME] = ENTRY
+    """The registry has the made-up data set."""
+    registry.register_data("tests")(Made)
     yield
-    del catalogue.NAMES[NAME]
+    registry.unregister(Made)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,6 @@ def store(known: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twenty takes of two people in shards of two takes each, twelve of them to train on."""
     folder = tmp_path_factory.mktemp("store")
     body = write(folder / "dl", takes=20, frames=80, more=0)
-    order = Order(NAME, str(folder / "dl"), {}, str(body), Steps())
+    order = PrepareJob(NAME, str(folder / "dl"), {}, str(body), CanonicalizeOptions())
     prepare(order, folder / "store", shard_rows=350)
     return folder / "store"

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from magnet.datamodules import catalogue
 from magnet.datamodules.clip import Split
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people
@@ -50,9 +49,6 @@ class Made(Prepared):
     """Made."""
 
     reader: ClassVar[type[Reader]] = MadeReader
-
-
-ENTRY = catalogue.Entry(f"{__name__}:MadeReader", "", f"{__name__}:Made")
 
 
 def write(root: Path, takes: int = 5, frames: int = 150, persons: int = 2, fps: float = 30.0, more: int = 10) -> Path:

@@ -1,4 +1,4 @@
-"""Random motion for any data set's fake, and where its joints must be after the common steps, worked out by scipy."""
+"""Random motion for any data set's fake, and where its joints must be after `canonicalize`, worked out by scipy."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules import registry
 from magnet.datamodules.duobox import DuoBoxReader
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.reading.recording import Reader, Recording
 from tests.datamodules.readers import fake_of, world_joints
 
@@ -25,7 +25,10 @@ MILLIMETRE = 0.001
 FITTED = 0.04
 """Metres: the bound of joints that are read, and of those that a body is fitted to, above which readers refuse."""
 FORMS: dict[str, tuple[str, dict[str, Any], float]] = {
-    **{name: (name, {}, FITTED if NAMES[name].load_reader().family == "positions" else MILLIMETRE) for name in NAMES},
+    **{
+        name: (name, {}, FITTED if registry.reader(name).family == "positions" else MILLIMETRE)
+        for name in registry.readers()
+    },
     "remocap, ready fits": ("remocap", {"fits": "fits"}, MILLIMETRE),
     "duobox, bare skeleton": ("duobox", {"form": "skeleton", "phases": 1}, FITTED),
 }
@@ -103,16 +106,16 @@ def joints_at_30_fps(motion: FakeMotion) -> NDArray:
 
 
 def placed(joints: NDArray, like: NDArray) -> NDArray:
-    """Moved as the common steps must: pelvises of the first frame about the origin, and one height for the floor."""
+    """Moved as `canonicalize` must: pelvises of the first frame about the origin, and one height for the floor."""
     joints = joints - joints[0, :, 0].mean(axis=0) * [1.0, 0.0, 1.0]
     return joints + np.array([0.0, np.median(like[..., 1] - joints[..., 1]), 0.0])
 
 
-def written(form: str, root: Path, scenes: Mapping[str, FakeMotion], steps: Steps) -> Order:
+def written(form: str, root: Path, scenes: Mapping[str, FakeMotion], steps: CanonicalizeOptions) -> PrepareJob:
     """The order to prepare scenes that now lie under `root` in a data set's layout."""
     name, options, _ = FORMS[form]
     fake_of(name).write_scenes(root, scenes)
     if "fits" in options:
         fake_remocap.write_fitted_scenes(root / "fits", scenes)
         options = {"fits": root / "fits"}
-    return Order(name, str(root), options, str(root / "body.npz"), steps)
+    return PrepareJob(name, str(root), options, str(root / "body.npz"), steps)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magnet.body.base import PARENTS
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import rest_joints
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 
 
 def fake_of(name: str) -> ModuleType:
     """The module that writes a data set's fake."""
-    return importlib.import_module(NAMES[name].fake.split(":")[0])
+    return importlib.import_module(registry.reader(name).fake.split(":")[0])
 
 
 def world_joints(recording: Recording, family: str) -> NDArray:

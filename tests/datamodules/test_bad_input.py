@@ -15,7 +15,7 @@ import pytest
 
 from magnet import cli
 from magnet.cli.data_shown import SKIPPED_SHOWN
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules import registry
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.reading.recording import Take
 from tests.datamodules.readers import Foreign, cut, fake_of
@@ -237,7 +237,7 @@ in a user's folder anybody may be alone, or beside somebody who was recorded lon
 
 def test_every_kind_of_bad_input_is_tried_on_every_data_set() -> None:
     lacking = {(form, kind) for form, damages in DAMAGES.items() for kind in set(SAID) - set(damages)}
-    assert {form.split(",")[0] for form in DAMAGES} == set(NAMES)
+    assert {form.split(",")[0] for form in DAMAGES} == set(registry.readers())
     assert lacking == LACKING
 
 
@@ -253,7 +253,7 @@ def test_bad_takes_are_listed_with_why_and_the_others_are_there(
     if form != name:
         fake_remocap.write_fitted_scenes(root / "fits", scenes)
         options = {"fits": root / "fits"}
-    takes = {take.name: take for take in NAMES[name].load_reader()(root, **options).takes()}  # type: ignore[call-arg]
+    takes = {take.name: take for take in registry.reader(name)(root, **options).takes()}  # type: ignore[call-arg]
     scene = {take: take.rpartition("_")[0] if name == "duobox" else take for take in takes}  # of a file may be more
     bad = dict(zip(sorted(set(scene.values()))[:-1], damages, strict=True))
     for one, kind in bad.items():

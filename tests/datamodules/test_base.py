@@ -10,7 +10,7 @@ import torch
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules import Clip, Mixed
 from magnet.datamodules.base import EmptySplitError
-from magnet.datamodules.store.draws import dropped
+from magnet.datamodules.store.windows import dropped
 from magnet.motion.scene import concatenate
 from magnet.testing import random_scene
 from tests.datamodules.fakes import PLAIN, FakeData, couples_and_singles, one_epoch, random_clip, same

@@ -13,7 +13,7 @@ from magnet.body import load_body
 from magnet.datamodules.bvh import BVHReader, read_joints
 from magnet.datamodules.fakes.bvh import named, write_scenes
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.convert import convert
 from magnet.datamodules.reading.own import FEW
 from magnet.datamodules.reading.recording import DataError, Reader
@@ -49,7 +49,7 @@ def test_a_skeleton_of_the_bodys_own_comes_back_exactly(tmp_path: Path) -> None:
     scene = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), body).scene.slice(0, 64)
     save_bvh(scene, tmp_path / "walk.bvh", body, unit="cm")
     reader = BVHReader(tmp_path, pattern="{scene}_{person}")
-    made = to_clips(whole(reader), body, "walk", "bvh", "train", "positions", Steps(trust_fps=True))
+    made = canonicalize(whole(reader), body, "walk", "bvh", "train", "positions", CanonicalizeOptions(trust_fps=True))
     (clip,) = made.clips
     found, wanted = body.joints(clip.scene)[0], body.joints(scene)[0]
     shift = (found - wanted)[0, 0, 0]
@@ -153,7 +153,7 @@ def test_a_line_that_maps_nothing_is_named(line: str, tmp_path: Path) -> None:
 
 def test_an_axis_that_the_user_says_is_held_against_the_motion(tmp_path: Path) -> None:
     reader = BVHReader(written(tmp_path / "dl", walk=walk(8)))
-    error = convert(reader, reader.found()[0], load_body(), Steps(min_frames=1, up="+y")).error
+    error = convert(reader, reader.found()[0], load_body(), CanonicalizeOptions(min_frames=1, up="+y")).error
     assert error and "declared up axis is +y, but people stand along +z" in error
 
 
@@ -167,7 +167,7 @@ def test_proportions_that_are_nobodys_are_refused_unless_they_are_asked_for(tmp_
                 lines[k + 2] = " ".join([words[0], *(str(3 * float(x)) for x in words[1:])])
         path.write_text("\n".join(lines) + "\n")
     reader = BVHReader(root)
-    error = convert(reader, reader.found()[0], load_body(), Steps(min_frames=1)).error
+    error = convert(reader, reader.found()[0], load_body(), CanonicalizeOptions(min_frames=1)).error
     assert error and re.search(r"mean error of [\d.]+ cm, expected at most 4\.0 cm; worst is \w+", error)
     kept = BVHReader(root, worst_fit=0.3)
-    assert convert(kept, kept.found()[0], load_body(), Steps(min_frames=1, trust_fps=True)).error is None
+    assert convert(kept, kept.found()[0], load_body(), CanonicalizeOptions(min_frames=1, trust_fps=True)).error is None

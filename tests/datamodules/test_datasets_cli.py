@@ -1,4 +1,4 @@
-"""Every data set of the catalogue, through the command line: fake, check, prepare, train two steps, test."""
+"""Every data set of the registry, through the command line: fake, check, prepare, train two steps, test."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import pytest
 import yaml
 
 from magnet import cli
-from magnet.datamodules import catalogue, cmu
+from magnet.datamodules import cmu, registry
 from magnet.datamodules.fakes import remocap as fake_remocap
-from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.reading.recording import Reader
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
@@ -39,10 +37,10 @@ def flags(prefix: str, values: dict[str, str]) -> list[str]:
     return [word for name, value in values.items() for word in (f"--{prefix}.{name}", value)]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in catalogue.NAMES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in registry.readers()])
 def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    body = () if catalogue.find(name).load_reader().family == "positions" else ("--body", "dl/body.npz")
+    body = () if registry.reader(name).family == "positions" else ("--body", "dl/body.npz")
     fitted = FRAMES.get(name, 150) < 60
     magnet("data", "fake", name, "dl", "--frames", str(FRAMES.get(name, 150)), "--takes", str(TAKES.get(name, 4)))
     few = ("--limit", "1", "--min_frames", "8") if fitted else ("--limit", "1")  # fits take their time
@@ -106,13 +104,13 @@ def test_a_mixed_model_is_tested_on_scenes_of_each_size(tmp_path, monkeypatch, c
 def prepare_fit_and_test(name, body, options, capsys):
     """From `dl` to `store`, two steps of training on it, and a test; returns the store's manifest."""
     magnet("data", "prepare", name, "--root", "dl", "--out", "store", "--workers", "1", *body, *options)
-    assert f"--data {catalogue.find(name).data.partition(':')[2]} --data.path store" in capsys.readouterr().out
+    assert f"--data {registry.data_of(registry.reader(name))} --data.path store" in capsys.readouterr().out
     magnet("data", "check", "store", "--picture", "none", *body)
     assert "all assertions hold" in capsys.readouterr().out
     manifest = json.loads(Path("store/manifest.json").read_text())
     assert manifest["skipped"] == [] and all(manifest["splits"][split]["clips"] for split in ("train", "val", "test"))
     body_model = ("--data.body_model", body[1]) if body else ()
-    kind = catalogue.find(name).load_data()
+    kind = registry.classes()[registry.data_of(registry.reader(name))]
     fit_and_test("--data", kind.__name__, "--data.path", "store", *body_model)  # the documented command
     largest = max(int(people) for split in manifest["splits"].values() for people in split["clips by people"])
     options = yaml.safe_load(Path("run/config.yaml").read_text())["data"]["init_args"]
@@ -149,20 +147,3 @@ def test_a_fake_of_cmu_is_fitted_by_a_check_and_trains_without_being_prepared(tm
     assert cli.main(["data", "check", "dl", "--picture", "none"]) == 1
     heard = capsys.readouterr()
     assert "1 of 4 takes broke an assertion" in heard.err and re.search(r"02_01: .*02_01\.amc:\d+", heard.out)
-
-
-@pytest.mark.parametrize("name", catalogue.NAMES)
-def test_an_entry_has_all_its_parts(name):
-    entry = catalogue.find(name)
-    reader, data = entry.load_reader(), entry.load_data()
-    assert issubclass(reader, Reader) and reader.name == name
-    assert reader.source and reader.licence and issubclass(data, Prepared)
-    if name in catalogue.OWN:  # any store's module trains on it
-        assert data is Prepared
-    else:
-        assert re.match(r"https?://", reader.source) and data.reader is reader
-
-
-def test_a_wrong_name_suggests_the_closest():
-    with pytest.raises(ValueError, match="no data set 'interX'; did you mean interx"):
-        catalogue.find("interX")

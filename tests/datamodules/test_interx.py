@@ -12,8 +12,8 @@ import pytest
 
 from magnet.datamodules.fakes import interx as fake
 from magnet.datamodules.interx import InterXReader
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError, Recording
 
@@ -80,7 +80,7 @@ def test_lists_beside_the_repositorys_motions_are_found(copy: Path) -> None:
 
 def test_roles_that_come_after_a_store_was_made_are_read_into_it(copy: Path, tmp_path: Path) -> None:
     (copy / "annots").rename(tmp_path / "annots")
-    order = Order("interx", str(copy), {}, str(copy / "body.npz"), Steps(min_frames=1))
+    order = PrepareJob("interx", str(copy), {}, str(copy / "body.npz"), CanonicalizeOptions(min_frames=1))
     assert prepare(order, tmp_path / "store", limit=1).folder.manifest["persons"][0]["persons"] == ["P1", "P2"]
     (tmp_path / "annots").rename(copy / "annots")
     report = prepare(order, tmp_path / "store", limit=1)

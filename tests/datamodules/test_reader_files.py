@@ -15,10 +15,10 @@ from typing import Any, get_args, get_origin, get_type_hints
 import pytest
 
 from magnet import cli
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules import registry
 from magnet.datamodules.fakes.remocap import write_fits
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order, content, take_key
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob, content, take_key
 from tests.datamodules.made_scenes import FORMS, written
 from tests.datamodules.readers import fake_of
 
@@ -47,20 +47,22 @@ def opened(under: Path) -> Iterator[set[Path]]:
 
 
 @pytest.fixture(params=FORMS)
-def order(request: pytest.FixtureRequest, tmp_path: Path) -> Order:
+def order(request: pytest.FixtureRequest, tmp_path: Path) -> PrepareJob:
     """A small download in each layout."""
     name = FORMS[request.param][0]
-    return written(request.param, tmp_path, fake_of(name).scenes(1 if name == "duobox" else 3, 20, 0), Steps())
+    return written(
+        request.param, tmp_path, fake_of(name).scenes(1 if name == "duobox" else 3, 20, 0), CanonicalizeOptions()
+    )
 
 
-def test_every_file_that_is_opened_counts_in_the_takes_key(order: Order, tmp_path: Path) -> None:
+def test_every_file_that_is_opened_counts_in_the_takes_key(order: PrepareJob, tmp_path: Path) -> None:
     for take in order.reader().found():
         with opened(tmp_path) as files:
             order.reader().read(take)  # a new one, which keeps nothing of the take before
         assert files and files <= {path.resolve() for path in (*take.files, *take.also)}
 
 
-def test_a_file_that_comes_or_goes_makes_another_key(order: Order, tmp_path: Path) -> None:
+def test_a_file_that_comes_or_goes_makes_another_key(order: PrepareJob, tmp_path: Path) -> None:
     take = order.reader().found()[0]
     whole = take_key(take, tmp_path, {})
     for path in (*take.files, *take.also):
@@ -79,9 +81,9 @@ def test_a_file_that_comes_or_goes_makes_another_key(order: Order, tmp_path: Pat
 # -- options that are files or folders ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", registry.readers())
 def test_no_option_of_free_text_hides_a_path(name: str) -> None:
-    reader = NAMES[name].load_reader()
+    reader = registry.reader(name)
     hints = get_type_hints(reader.__init__)
     for option in inspect.signature(reader).parameters:
         kinds = get_args(hints[option]) if get_origin(hints[option]) is types.UnionType else (hints[option],)
@@ -121,7 +123,7 @@ def test_a_folder_counts_by_its_name_and_content_wherever_it_lies(tmp_path: Path
 
 # -- official lists ----------------------------------------------------------------------------
 
-DOWNLOADS = {**{name: (name, "dl") for name in NAMES}, "remocap, ready fits alone": ("remocap", "fits")}
+DOWNLOADS = {**{name: (name, "dl") for name in registry.readers()}, "remocap, ready fits alone": ("remocap", "fits")}
 """Data set, and the folder that is given of what its fake wrote."""
 NO_LISTS = {
     "interx": "no splits/train.txt", "interhuman": "no train.txt",
@@ -136,10 +138,10 @@ def test_a_users_list_needs_none_of_the_data_sets_own(
 ) -> None:
     name, root = DOWNLOADS[form]
     monkeypatch.chdir(tmp_path)
-    NAMES[name].load_fake()(Path("dl"), 1 if name == "duobox" else 4, 100)
+    registry.reader(name).write_fake(Path("dl"), 1 if name == "duobox" else 4, 100)
     if root == "fits":
         write_fits(Path("fits"), frames=60)
-    takes = NAMES[name].load_reader()(root).found()
+    takes = registry.reader(name)(root).found()
     used = {path for take in takes for path in take.files}
     for path in [path for path in Path(root).rglob("*") if path.suffix in (".txt", ".csv") and path not in used]:
         path.unlink()

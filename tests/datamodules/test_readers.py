@@ -1,4 +1,4 @@
-"""Laws that every data set of the catalogue obeys, from files as they lie on disk to the joints that train."""
+"""Laws that every data set of the registry obeys, from files as they lie on disk to the joints that train."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from magnet.datamodules.catalogue import NAMES, OWN
+from magnet.datamodules import registry
 from magnet.datamodules.clip import Split
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.motion import UP, FakeMotion, turned
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import convert
-from magnet.datamodules.preparing.prepare import chosen, prepare
+from magnet.datamodules.preparing.prepare import prepare, select_takes
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.resample import times
-from magnet.datamodules.store.draws import whole_clips
+from magnet.datamodules.store.windows import recorded_windows
 from tests.datamodules.made_scenes import (
     FITTED,
     FORMS,
@@ -49,9 +49,9 @@ GENDERS = {
 """Of the fakes whose layout says them."""
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", registry.readers())
 def test_messages_name_options_as_the_command_line_takes_them(name: str) -> None:
-    reader = NAMES[name].load_reader()
+    reader = registry.reader(name)
     text = Path(inspect.getsourcefile(reader) or "").read_text()
     assert set(re.findall(r"--reader\.(\w+)", text)) <= set(inspect.signature(reader).parameters)
     assert not re.search(r"give \w+=", text)
@@ -65,7 +65,7 @@ def test_a_recording_is_what_was_written_at_its_own_rate_and_axes(form: str, tmp
     name = FORMS[form][0]
     fakes = fake_of(name).scenes(1 if name == "duobox" else 5, 20, 0)
     scenes = {take: random_scene(like, 0.8, k) for k, (take, like) in enumerate(fakes.items())}
-    reader = written(form, tmp_path, scenes, Steps()).reader()
+    reader = written(form, tmp_path, scenes, CanonicalizeOptions()).reader()
     for take in reader.takes():
         found, shown = reader.read(take), scene_of(reader, take.name, scenes)
         assert (found.fps, found.up, found.frames) == (shown.fps, shown.up, shown.frames)
@@ -77,10 +77,10 @@ def test_a_recording_is_what_was_written_at_its_own_rate_and_axes(form: str, tmp
             np.testing.assert_allclose(found.positions, shown.positions[:, :, list(found.joints)], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", registry.readers())
 def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp_path: Path) -> None:
-    NAMES[name].load_fake()(tmp_path, 1 if name == "duobox" else 4, 20)
-    reader = NAMES[name].load_reader()(tmp_path)
+    registry.reader(name).write_fake(tmp_path, 1 if name == "duobox" else 4, 20)
+    reader = registry.reader(name)(tmp_path)
     lengths = [len(times(found.frames, found.fps)[0]) for take in reader.takes() if take.split == "test"
                for found in [reader.read(take)]]  # fmt: skip
     assert set(lengths) == {20}
@@ -105,10 +105,17 @@ def check_read_back(folder: Path, form: str, seed: int, seconds: float) -> None:
     seconds *= 2 if name == "duobox" else 1  # it is split in time
     fakes = fake_of(name).scenes(TAKES.get(name, 3), 4, 0)
     scenes = {take: random_scene(like, seconds, seed + k) for k, (take, like) in enumerate(fakes.items())}
-    order, out = written(form, folder / "dl", scenes, Steps(min_frames=4, trust_fps=True)), folder / "store"
+    order, out = (
+        written(form, folder / "dl", scenes, CanonicalizeOptions(min_frames=4, trust_fps=True)),
+        folder / "store",
+    )
     manifest = prepare(order, out).folder.manifest
     assert manifest["skipped"] == []
-    found = read_back(NAMES[name].load_data()(path=str(out), body_model=order.body_file, max_agents=7))
+    found = read_back(
+        registry.classes()[registry.data_of(registry.reader(name))](
+            path=str(out), body_model=order.body_file, max_agents=7
+        )
+    )
     reader = order.reader()
     assert {clip.split(" [")[0] for clip in found} == {take.name for take in reader.takes()}
     for clip, joints in found.items():
@@ -137,7 +144,7 @@ def read_back(data: Prepared) -> dict[str, NDArray]:
             continue
         store = data.open_store(split)
         for clip, frames in enumerate(store.length.tolist()):
-            scene = store.gather(whole_clips(store, [(clip, 0)]), frames)
+            scene = store.gather(recorded_windows(store, [(clip, 0)]), frames)
             found[names[clip]] = data.body.joints(scene)[0][:, scene.present[0]].double().numpy()
     return found
 
@@ -199,7 +206,7 @@ def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
         if form == "remocap" and " m" in kind:  # offsets are of the same unit
             scenes.pop(take)
             units[1e6 if kind == "mm for m" else 1.0] = {take: shown}
-    order = written(form, tmp_path, scenes, Steps(min_frames=8))
+    order = written(form, tmp_path, scenes, CanonicalizeOptions(min_frames=8))
     for unit, some in units.items():
         monkeypatch.setattr(fake_remocap, "MILLIMETRES", unit)
         fake_remocap.write_scenes(tmp_path, some)
@@ -208,8 +215,8 @@ def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
         if name == "duobox" and not take.name.endswith("_tr0"):
             continue
         kind = asked[take.name.removesuffix("_tr0")]
-        error = convert(reader, take, body, order.steps).error
-        if name in OWN and kind in FOUND:
+        error = convert(reader, take, body, order.canonicalize).error
+        if registry.reader(name).own and kind in FOUND:
             assert error is None, f"{kind}: {error}"
             continue
         assert error is not None, f"{kind}: {take.name} was taken"
@@ -221,17 +228,17 @@ def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
 MANY = 12
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=registry.readers())
 def download(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Many takes of two frames."""
     root = tmp_path_factory.mktemp(request.param)
-    NAMES[request.param].load_fake()(root, MANY, 2)
+    registry.reader(request.param).write_fake(root, MANY, 2)
     return request.param, root
 
 
 def test_every_split_has_takes_and_no_group_is_in_two(download: tuple[str, Path]) -> None:
     name, root = download
-    takes = NAMES[name].load_reader()(root).takes()
+    takes = registry.reader(name)(root).takes()
     assert {take.split for take in takes} == {"train", "val", "test"}
     assert len({take.name for take in takes}) == len(takes) == MANY * (6 if name == "duobox" else 1)
     assert len({(take.group, take.split) for take in takes}) == len({take.group for take in takes})
@@ -240,12 +247,12 @@ def test_every_split_has_takes_and_no_group_is_in_two(download: tuple[str, Path]
 
 def test_takes_and_splits_depend_on_names_and_lists_alone(download: tuple[str, Path]) -> None:
     name, root = download
-    takes = NAMES[name].load_reader()(root).takes()
+    takes = registry.reader(name)(root).takes()
     held = {path: path.read_bytes() for take in takes for path in take.files}
     for path in held:
         path.write_bytes(b"")
     try:
-        assert NAMES[name].load_reader()(root).takes() == takes
+        assert registry.reader(name)(root).takes() == takes
     finally:
         for path, data in held.items():
             path.write_bytes(data)
@@ -253,17 +260,17 @@ def test_takes_and_splits_depend_on_names_and_lists_alone(download: tuple[str, P
 
 def test_a_users_list_takes_the_place_of_the_rule_but_parts_no_group(download: tuple[str, Path]) -> None:
     name, root = download
-    reader = NAMES[name].load_reader()(root)
+    reader = registry.reader(name)(root)
     groups = sorted({take.group for take in reader.takes()})
     turn: tuple[Split, ...] = ("test", "train", "val")
     mine = {take.name: turn[groups.index(take.group) % 3] for take in reader.takes()}
     left = groups[-1]
     wanted = {take.name: mine[take.name] for take in reader.takes() if take.group != left}
-    use = chosen(reader, {**wanted, "lost": "val"}, None)
+    use = select_takes(reader, {**wanted, "lost": "val"}, None)
     assert {take.name: take.split for take in use.takes} == wanted and use.absent == ["lost"]
     assert set(use.left_out) == {take.name for take in reader.takes() if take.group == left}
     pairs = [(a, b) for a in reader.takes() for b in reader.takes() if a.group == b.group and a.name < b.name]
     assert pairs or name not in ("duobox", "dd100")
     for a, b in pairs[:2]:
         with pytest.raises(DataError, match=f"both belong to {re.escape(a.group)}.*put them into one split"):
-            chosen(reader, {**mine, a.name: "train", b.name: "test"}, None)
+            select_takes(reader, {**mine, a.name: "train", b.name: "test"}, None)

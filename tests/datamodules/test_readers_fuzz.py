@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -10,23 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnet.datamodules.catalogue import NAMES, OWN
+from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import made_up_body
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.reading.recording import DataError, Reader, Recording
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 TAKES, FRAMES, ROUNDS, FILES = 3, 4, 2, 7
-SHORT = Steps(min_frames=1)
+SHORT = CanonicalizeOptions(min_frames=1)
 
 
 def known() -> list[str]:
-    """Data sets whose reader and fake are there."""
-    return [
-        name
-        for name, entry in NAMES.items()
-        if all(importlib.util.find_spec(part.split(":")[0]) for part in (entry.reader, entry.fake))
-    ]
+    """Data sets that bring a made-up download."""
+    return [name for name, kind in registry.readers().items() if kind.fake]
 
 
 def flipped(data: bytes, random: np.random.Generator) -> bytes:
@@ -83,7 +78,7 @@ def fakes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     def of(name: str) -> Path:
         if name not in roots:
             roots[name] = tmp_path_factory.mktemp(name)
-            NAMES[name].load_fake()(roots[name], takes=TAKES, frames=FRAMES)
+            registry.reader(name).write_fake(roots[name], takes=TAKES, frames=FRAMES)
         return roots[name]
 
     return of
@@ -113,7 +108,7 @@ def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
         if recording.poses is None:
             continue  # a fit would take its time
         try:
-            clips = to_clips(recording, made_up_body(), take.name, reader.name, "train", reader.family, SHORT).clips
+            clips = canonicalize(recording, made_up_body(), take.name, reader.name, "train", reader.family, SHORT).clips
         except DataError as error:
             assert len(str(error)) > 20
         else:
@@ -137,7 +132,7 @@ def sample(root: Path) -> list[Path]:
 
 @pytest.mark.parametrize("name", known())
 def test_damaged_files_are_read_or_refused(name: str, fakes: Callable[[str], Path]) -> None:
-    root, reader = fakes(name), NAMES[name].load_reader()
+    root, reader = fakes(name), registry.reader(name)
     assert read(reader, root) > 0
     for path in sample(root):
         whole = path.read_bytes()
@@ -152,13 +147,13 @@ def test_damaged_files_are_read_or_refused(name: str, fakes: Callable[[str], Pat
         path.write_bytes(whole)
 
 
-Outcome = tuple[int, tuple[str, ...], bool] | str
+Canonicalized = tuple[int, tuple[str, ...], bool] | str
 """Frames of a take, notes, whether a body has to be fitted (and the note will say so); or why it is refused."""
 
 
-def outcomes(reader: type[Reader], root: Path) -> dict[str, Outcome]:
+def outcomes(reader: type[Reader], root: Path) -> dict[str, Canonicalized]:
     """Of every take; under "", why all are refused. Raises anything but `DataError`."""
-    found: dict[str, Outcome] = {}
+    found: dict[str, Canonicalized] = {}
     try:
         opened = reader(root)
         takes = opened.takes()
@@ -177,7 +172,7 @@ def outcomes(reader: type[Reader], root: Path) -> dict[str, Outcome]:
 def test_what_is_missing_is_named_and_takes_that_do_not_need_it_are_read(
     name: str, fakes: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    root, reader = fakes(name), NAMES[name].load_reader()
+    root, reader = fakes(name), registry.reader(name)
     whole, takes = outcomes(reader, root), reader(root).takes()
     assert whole and not any(isinstance(how, str) for how in whole.values())
     for gone in sorted({place for path in sample(root) for place in (path, path.parent)} - {root}):
@@ -201,9 +196,9 @@ def test_what_is_missing_is_named_and_takes_that_do_not_need_it_are_read(
 
 @pytest.mark.parametrize("name", known())
 def test_a_folder_of_something_else_is_refused_with_where_to_ask(name: str, tmp_path: Path) -> None:
-    reader = NAMES[name].load_reader()
+    reader = registry.reader(name)
     (tmp_path / "holiday.txt").write_text("photographs")
     with pytest.raises(DataError, match=r"holiday|json|list|takes|motions"):
         reader(tmp_path).takes()
-    with pytest.raises(DataError, match="give the one that holds them" if name in OWN else "http"):
+    with pytest.raises(DataError, match="give the one that holds them" if registry.reader(name).own else "http"):
         reader(tmp_path / "nowhere")

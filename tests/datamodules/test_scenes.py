@@ -16,9 +16,9 @@ from magnet.body import load_body
 from magnet.datamodules.clip import SPLITS
 from magnet.datamodules.fakes.motion import made_up_body, people
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check import check_store
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.scenes import ScenesReader
@@ -112,7 +112,7 @@ def test_both_kinds_of_npz_that_magnet_writes_come_back(tmp_path: Path) -> None:
         else:
             save_smplx(scene, tmp_path / kind / "walk.npz", body)
         found = read(tmp_path / kind)
-        clips = to_clips(found, body, "walk", "scenes", "train", "any", Steps(trust_fps=True))
+        clips = canonicalize(found, body, "walk", "scenes", "train", "any", CanonicalizeOptions(trust_fps=True))
         joints = body.joints(clips.clips[0].scene)[0]
         assert (joints - wanted - (joints - wanted)[0, 0, 0]).norm(dim=-1).max() < 2e-4, kind
 
@@ -120,7 +120,7 @@ def test_both_kinds_of_npz_that_magnet_writes_come_back(tmp_path: Path) -> None:
 def test_without_a_body_file_the_open_body_dances_in_its_mean_shape_and_a_note_says_so(tmp_path: Path) -> None:
     for p in (0, 1):
         write(tmp_path / f"walk_{'AB'[p]}.npz", plain(p) | {"gender": "female"})
-    clips = to_clips(read(tmp_path), load_body(), "walk", "scenes", "train", "any", Steps())
+    clips = canonicalize(read(tmp_path), load_body(), "walk", "scenes", "train", "any", CanonicalizeOptions())
     assert not clips.clips[0].scene.betas.any()
     assert any("in its mean shape: limbs are approximate without --body FILE" in note for note in clips.notes)
     assert not any("female" in note for note in clips.notes)
@@ -173,7 +173,7 @@ def test_shapes_of_another_body_are_refused(tmp_path: Path) -> None:
     body = load_body()
     made().replace(body="theirs").save(tmp_path / "walk.npz")
     with pytest.raises(DataError, match=r"belong to body 'theirs', not to 'open-1'.*--body"):
-        to_clips(read(tmp_path), body, "walk", "scenes", "train", "any", Steps())
+        canonicalize(read(tmp_path), body, "walk", "scenes", "train", "any", CanonicalizeOptions())
 
 
 def test_a_body_file_beside_the_scenes_is_no_scene(tmp_path: Path) -> None:
@@ -188,14 +188,16 @@ def test_shapes_of_another_family_than_the_bodys_are_refused(tmp_path: Path) -> 
     body = made_up_body("smplx")
     assert body.family == "smplx"
     with pytest.raises(DataError, match=r"are SMPL's by the number of joints, but body .* is SMPL-X's: give that"):
-        to_clips(read(tmp_path), body, "walk", "scenes", "train", "any", Steps())
-    assert to_clips(read(tmp_path), made_up_body("smpl"), "walk", "scenes", "train", "any", Steps()).clips
+        canonicalize(read(tmp_path), body, "walk", "scenes", "train", "any", CanonicalizeOptions())
+    assert canonicalize(
+        read(tmp_path), made_up_body("smpl"), "walk", "scenes", "train", "any", CanonicalizeOptions()
+    ).clips
 
 
 def test_scenes_are_prepared_without_a_body_file_too(tmp_path: Path) -> None:
     for p in (0, 1):
         write(tmp_path / f"walk_{'AB'[p]}.npz", plain(p))
-    order = Order("scenes", str(tmp_path), {"split": "scenes"}, "open", Steps())
+    order = PrepareJob("scenes", str(tmp_path), {"split": "scenes"}, "open", CanonicalizeOptions())
     assert prepare(order, tmp_path / "store").folder.manifest["body"]["id"] == load_body().id
 
 
@@ -205,7 +207,7 @@ def test_a_scene_that_comes_later_leaves_the_prepared_ones_as_they_are(tmp_path:
     shown = scenes(6, 40, 0)
     *first, last = shown
     write_scenes(tmp_path / "dl", {name: shown[name] for name in first})
-    order = Order("scenes", str(tmp_path / "dl"), {}, str(tmp_path / "dl/body.npz"), Steps())
+    order = PrepareJob("scenes", str(tmp_path / "dl"), {}, str(tmp_path / "dl/body.npz"), CanonicalizeOptions())
     assert prepare(order, tmp_path / "store").made == 5
     write_scenes(tmp_path / "dl", {last: shown[last]})
     again = prepare(order, tmp_path / "store")

@@ -7,7 +7,7 @@ from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.world import Health
+from magnet.generation.world import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
@@ -86,17 +86,23 @@ def test_a_continuous_target_is_what_the_encoder_says_before_the_codebook(contin
     assert torch.equal(continuous.tokenizer.requantize(plain), codes)
 
 
-def snaps(model: Denoiser, scene: Scene, **options) -> int:
-    health = Health()
-    generate(model, scene, options=SamplerOptions(steps=2, stride=2, **options), health=health)
-    return health.snaps
+def quantization_errors(model: Denoiser, scene: Scene, **options) -> int:
+    stats = SamplingStats()
+    generate(model, scene, options=SamplerOptions(steps=2, stride=2, **options), stats=stats)
+    return stats.quantization_errors
 
 
 def test_sampling_snaps_to_codes_where_codes_were_learnt_and_else_when_asked(continuous: Denoiser, scene: Scene):
     quantized = tiny_denoiser(max_agents=3, window=8)
     generated = 2 * 6 * 3  # scenes, tokens, people
-    assert snaps(quantized, scene) == generated and snaps(quantized, scene, requantize=False) == 0
-    assert snaps(continuous, scene) == 0 and snaps(continuous, scene, requantize=True) == generated
+    assert (
+        quantization_errors(quantized, scene) == generated
+        and quantization_errors(quantized, scene, requantize=False) == 0
+    )
+    assert (
+        quantization_errors(continuous, scene) == 0
+        and quantization_errors(continuous, scene, requantize=True) == generated
+    )
 
 
 def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):

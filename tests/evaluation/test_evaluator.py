@@ -144,12 +144,12 @@ def test_no_two_samples_share_their_noise():
 def test_prediction_counts_what_it_costs():
     """Two denoising steps for the first token after the past, and one for each token that follows on the slope."""
     scenes, evaluation = predicted(data())
-    health = evaluation.health
+    stats = evaluation.stats
     tokens = scenes.frames // 4
     past = evaluation.context // 4
-    assert (evaluation.scenes, scenes.scenes, health.runs) == (9, 27, 3)
-    assert health.means()["calls"] == health.evaluations == FAST.steps + tokens - past - 1
-    assert evaluation.facts(prepared()[0])["health"]["evaluations"] == health.evaluations
+    assert (evaluation.scenes, scenes.scenes, stats.runs) == (9, 27, 3)
+    assert stats.means()["calls"] == stats.evaluations == FAST.steps + tokens - past - 1
+    assert evaluation.facts(prepared()[0])["sampling"]["evaluations"] == stats.evaluations
 
 
 @pytest.mark.parametrize("name", ["generation", "partner_inpainting", "inbetweening"])

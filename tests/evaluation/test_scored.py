@@ -32,7 +32,7 @@ class HalfGiven:
         known = grid.past()
         known[:, 0] = True
         known[grid.context + 1, -1] = True
-        return MaskSchedule.together(known, ~known, grid)
+        return MaskSchedule.full_sequence(known, ~known, grid)
 
 
 def inbetween_by_hand(every: int) -> Tensor:
@@ -179,7 +179,7 @@ def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
         evaluation = Evaluation(options=FAST, baselines=False, interval=interval)
         evaluation.start(tiny_denoiser(max_agents=3), datamodule)
         assert len(set(evaluation.unit_of.values())) == units
-        assert len(evaluation.unit_of) == len(datamodule.test_draw())
+        assert len(evaluation.unit_of) == len(datamodule.test_windows())
 
 
 def test_intervals_go_by_recordings_where_there_are_enough() -> None:

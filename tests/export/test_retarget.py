@@ -14,7 +14,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.base import JOINT_NAMES, PARENTS
-from magnet.datamodules.reading.asf_amc import Recording, read_amc, read_asf
+from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, read_asf
 from magnet.datamodules.reading.cmu_fit import fit_recordings
 from magnet.export import load_bvh, save_bvh
 from magnet.export.naming import recognised
@@ -242,7 +242,7 @@ RATE = 60.0
 """Frames a second of the salsa takes."""
 
 
-def as_bvh(recording: Recording, path: Path) -> Path:
+def as_bvh(recording: AmcRecording, path: Path) -> Path:
     """A recording as the usual BVH conversion: a joint where each bone starts, in ASF's own unit."""
     skeleton = recording.skeleton
     starts: NDArray[np.float64] = np.array([skeleton.offset[p] if p >= 0 else np.zeros(3) for p in skeleton.parents])

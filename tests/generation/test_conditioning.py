@@ -3,7 +3,7 @@ import torch
 
 from magnet.generation.blending import seam_weights
 from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub, stretches
-from magnet.generation.world import Health
+from magnet.generation.world import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_transforms
@@ -207,7 +207,7 @@ def test_tokens_fed_back_agree_with_the_world(model, scene):
         given.present,
         model.layout,
         torch.Generator().manual_seed(0),
-        canvas.settle,
+        canvas.make_consistent,
     )
     _, _, pairs = model.layout.unpack(model.normalizer.denormalize(tokens))
     T_self_partner = from_9d(pairwise_by_frame(pairs))
@@ -219,21 +219,21 @@ def test_tokens_fed_back_agree_with_the_world(model, scene):
 
 
 def test_health_tells_how_far_latents_are_from_codes_and_relations_from_the_world(model, scene):
-    health = Health()
-    model.generate(scene, JointFuture(), 16, 34, 1, FAST, torch.Generator().manual_seed(0), health=health)
-    assert (health.snaps, health.drifts) == (2 * 9 * 3, 2 * 9 * 3 * 2)
-    assert health.means()["snap"] > 0 and health.means()["drift"] > 0
-    anchored = Health()
+    stats = SamplingStats()
+    model.generate(scene, JointFuture(), 16, 34, 1, FAST, torch.Generator().manual_seed(0), stats=stats)
+    assert (stats.quantization_errors, stats.pairwise_drifts) == (2 * 9 * 3, 2 * 9 * 3 * 2)
+    assert stats.means()["quantization_error"] > 0 and stats.means()["pairwise_drift"] > 0
+    anchored = SamplingStats()
     two = scene.slice(0, 64).permute_agents(torch.tensor([0, 1]))
     options = SamplerOptions(steps=3, stride=2, placement="anchor")
-    model.generate(two, JointFuture(), 16, 34, 1, options, torch.Generator().manual_seed(0), health=anchored)
-    assert anchored.drifts == 2 * 9 * 2
+    model.generate(two, JointFuture(), 16, 34, 1, options, torch.Generator().manual_seed(0), stats=anchored)
+    assert anchored.pairwise_drifts == 2 * 9 * 2
 
 
 def test_pasted_frames_meet_the_generated_ones_without_a_pop(model, scene):
     """The step across the seam is not larger than steps elsewhere in the decode."""
     whole = run(model, scene)
-    bare = run(model, scene, options=SamplerOptions(steps=3, stride=2, paste=False))
+    bare = run(model, scene, options=SamplerOptions(steps=3, stride=2, keep_given=False))
     across = (whole.body_rot[:, 16] - whole.body_rot[:, 15]).norm(dim=(-1, -2)).mean()
     inside = (bare.body_rot[:, 1:] - bare.body_rot[:, :-1]).norm(dim=(-1, -2)).mean()
     assert across < 3 * inside

@@ -95,7 +95,7 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(denoise
         (1, FAST),
         (3, FAST),
         (2, SamplerOptions(steps=2, guidance=Guidance("partner"))),
-        (1, SamplerOptions(steps=3, paste=False, eta=0.0, placement="integrate")),
+        (1, SamplerOptions(steps=3, keep_given=False, eta=0.0, placement="integrate")),
     ],
     ids=["token by token", "three tokens", "guided", "bare"],
 )
@@ -132,7 +132,7 @@ def test_memory_does_not_grow(denoiser, duet):
     for _ in range(60):
         partner.answer(duet.slice(16, 20))
         stream = partner._stream
-        held.append((partner.past.frames, stream.scene.frames, stream.tokens.shape[1], stream.veil.shape[1]))
+        held.append((partner.past.frames, stream.scene.frames, stream.tokens.shape[1], stream.mask_noise.shape[1]))
     assert held[-1] == held[-20] and max(held[-1]) < 100
     assert torch.equal(partner.past.T_world_root[:, -4:, 1], duet.T_world_root[:, 16:20, 1])
 

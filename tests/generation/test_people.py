@@ -5,7 +5,7 @@ import torch
 
 from magnet.generation.blending import cat_time
 from magnet.generation.conditioning import SamplerOptions, known_tokens, occupied, planning_grid, scrub
-from magnet.generation.world import Canvas, Health
+from magnet.generation.world import Canvas, SamplingStats
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample
@@ -30,9 +30,9 @@ def people(slots: list[list[bool]], frames: int = 40) -> Scene:
     return without_absent(scene.replace(present=torch.tensor(slots)))
 
 
-def run(model, scene: Scene, task, context: int = 8, health: Health | None = None, seed: int = 0) -> Scene:
+def run(model, scene: Scene, task, context: int = 8, stats: SamplingStats | None = None, seed: int = 0) -> Scene:
     each = [torch.Generator().manual_seed(seed + number) for number in range(scene.scenes)]
-    return model.generate(scene, task, context, 40 - context, 1, FAST, each, health=health)
+    return model.generate(scene, task, context, 40 - context, 1, FAST, each, stats=stats)
 
 
 def close(a: Scene, b: Scene) -> bool:
@@ -41,13 +41,13 @@ def close(a: Scene, b: Scene) -> bool:
 
 @pytest.mark.parametrize("name", registry.names())
 def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, name):
-    scene, task, health = people([[True, True]]), registry.get(name)(), Health()
+    scene, task, stats = people([[True, True]]), registry.get(name)(), SamplingStats()
     context = 0 if name == "generation" else 8
-    made = run(model, scene, task, context, health)
+    made = run(model, scene, task, context, stats)
     schedule = task.schedule(planning_grid(10, 2, context // 4, 8, FAST))
-    assert health.calls == schedule.evaluations
+    assert stats.calls == schedule.evaluations
     views = {len(stage.hidden.unique(dim=0)) if stage.hidden is not None else 1 for stage in schedule.stages}
-    assert health.evaluations <= schedule.evaluations * max(views)
+    assert stats.evaluations <= schedule.evaluations * max(views)
     assert made.agents == 4 and torch.equal(made.present, torch.tensor([[True, True, False, False]]))
     if schedule.causal:  # shown block by block, see test_showing
         return
@@ -56,7 +56,9 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     canvas = Canvas(model, given, padded, FAST, 1)
     start = known_tokens(model, given, padded.known)
     noise = NoiseStream((1, 4, model.layout.width), [torch.Generator().manual_seed(0)], eta=FAST.eta)
-    out = sample(model.denoise, padded, start, given.present, model.layout, settle=canvas.settle, noise=noise)
+    out = sample(
+        model.denoise, padded, start, given.present, model.layout, on_stage_end=canvas.make_consistent, noise=noise
+    )
     with torch.no_grad():
         assert close(canvas.scene(out), made)
 
@@ -65,9 +67,9 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
 def test_nobody_waits_for_free_slots(model, task):
     costs = []
     for slots in (2, 3, 4):
-        health = Health()
-        run(model, people([[True, True]]).pad_agents(slots), task, health=health)
-        costs.append((health.calls, health.evaluations))
+        stats = SamplingStats()
+        run(model, people([[True, True]]).pad_agents(slots), task, stats=stats)
+        costs.append((stats.calls, stats.evaluations))
     assert len(set(costs)) == 1
 
 

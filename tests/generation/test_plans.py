@@ -11,8 +11,8 @@ from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_denoiser
 
-PYRAMID = SamplerOptions(steps=12, stride=2, rolling=1)
-INDEPENDENT = SamplerOptions(steps=4, stride=2, rolling=0, noise_sampling="independent")
+PYRAMID = SamplerOptions(steps=12, stride=2, pyramid_offset=1)
+INDEPENDENT = SamplerOptions(steps=4, stride=2, pyramid_offset=0, noise_sampling="independent")
 CANNOT_ROLL = ("agentic_async", "agentic_sync", "inbetweening", "motion_control")
 
 

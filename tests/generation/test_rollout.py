@@ -9,7 +9,7 @@ from magnet.generation.blending import cat_time
 from magnet.generation.conditioning import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
 from magnet.generation.plan import endless, lows
 from magnet.generation.rollout import Stream
-from magnet.generation.world import Canvas, Health
+from magnet.generation.world import Canvas, SamplingStats
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream
@@ -60,7 +60,9 @@ def at_once(model, scene: Scene, task, context: int, frames: int, options: Sampl
     generator = torch.Generator().manual_seed(seed)
     noise = NoiseStream((scene.scenes, 3, model.layout.width), generator, eta=options.eta)
     how = {"guidance": options.guidance, "noise": noise, "solver": options.solver}
-    out = sample(model.denoise, schedule, start, given.present, model.layout, settle=canvas.settle, **how)
+    out = sample(
+        model.denoise, schedule, start, given.present, model.layout, on_stage_end=canvas.make_consistent, **how
+    )
     with torch.no_grad():
         return canvas.scene(out).slice(0, context + frames)
 
@@ -131,14 +133,14 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
     "options",
     [
         SamplerOptions(steps=2, stride=2, placement="integrate"),
-        SamplerOptions(steps=2, stride=3, placement="anchor", paste=False),
+        SamplerOptions(steps=2, stride=3, placement="anchor", keep_given=False),
         SamplerOptions(steps=2, stride=2, blend=17),
         SamplerOptions(steps=2, stride=2, requantize=False),
-        SamplerOptions(steps=4, rolling=2),
+        SamplerOptions(steps=4, pyramid_offset=2),
         SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
-        SamplerOptions(steps=4, rolling=2, eta=0.5),
+        SamplerOptions(steps=4, pyramid_offset=2, eta=0.5),
         SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
-        SamplerOptions(steps=5, rolling=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
+        SamplerOptions(steps=5, pyramid_offset=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
         SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
         SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
     ],
@@ -202,7 +204,7 @@ def test_no_more_rows_are_held_for_a_longer_scene(model, name):
         stream = Stream(model, scene, TASKS[name], context, frames - context, 1, options, None, None, None, 4)
         held = 0
         for _ in stream.pieces():
-            held = max(held, stream.tokens.shape[1] + stream.veil.shape[1])
+            held = max(held, stream.tokens.shape[1] + stream.mask_noise.shape[1])
             held = max(held, stream.canvas.T_world_can.shape[1] // 4 + stream.canvas.given.frames // 4)
         return held
 
@@ -239,9 +241,9 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
     low = iter(lows(schedule))
     before: list[tuple[torch.Tensor, torch.Tensor]] = [(torch.empty(0), canvas.T_world_can.clone())]
 
-    def settle(tokens: torch.Tensor, finished: torch.Tensor, apart: bool) -> torch.Tensor:
+    def on_stage_end(tokens: torch.Tensor, finished: torch.Tensor, decentralized: bool) -> torch.Tensor:
         first = next(low)
-        after = canvas.settle(tokens.clone(), finished, apart)
+        after = canvas.make_consistent(tokens.clone(), finished, decentralized)
         old_tokens, old_world = before[-1]
         if len(old_tokens):
             assert torch.equal(old_tokens[:, :first], after[:, :first])
@@ -250,7 +252,7 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
         return after
 
     start = known_tokens(model, given, schedule.known)
-    sample(model.denoise, schedule, start, given.present, model.layout, torch.Generator().manual_seed(0), settle)
+    sample(model.denoise, schedule, start, given.present, model.layout, torch.Generator().manual_seed(0), on_stage_end)
     assert next(low, None) is None
 
 
@@ -259,10 +261,10 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
 GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partner_prediction")
 
 
-@pytest.mark.parametrize(("name", "rolling"), [*((name, 0) for name in GOES_ON), ("joint_future", 2)])
-def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, rolling):
+@pytest.mark.parametrize(("name", "pyramid_offset"), [*((name, 0) for name in GOES_ON), ("joint_future", 2)])
+def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, pyramid_offset):
     context = context_of(name)
-    options = SamplerOptions(steps=1 + 3 * bool(rolling), stride=4, rolling=rolling)
+    options = SamplerOptions(steps=1 + 3 * bool(pyramid_offset), stride=4, pyramid_offset=pyramid_offset)
     short = recording.slice(0, context).select([0])
     ended, begun = (
         cat_time(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 8)))
@@ -338,15 +340,15 @@ def test_as_many_generators_as_scenes_are_needed(model, recording):
     ],
 )
 def test_calls_and_evaluations_are_counted(model, recording, name, guidance, views, branches):
-    health = Health()
+    stats = SamplingStats()
     options = SamplerOptions(steps=3, stride=2, guidance=guidance)
     schedule = registry.get(name)().schedule(planning_grid(7, 3, 4, 8, options))
     for _ in range(2):
-        model.generate(recording, registry.get(name)(), 16, 12, 2, options, health=health)
-    assert health.calls == 2 * schedule.evaluations
-    assert health.evaluations == schedule.evaluations * views * branches
-    means = health.means()
-    assert (means["calls"], means["evaluations"]) == (schedule.evaluations, health.evaluations)
+        model.generate(recording, registry.get(name)(), 16, 12, 2, options, stats=stats)
+    assert stats.calls == 2 * schedule.evaluations
+    assert stats.evaluations == schedule.evaluations * views * branches
+    means = stats.means()
+    assert (means["calls"], means["evaluations"]) == (schedule.evaluations, stats.evaluations)
 
 
 @pytest.mark.parametrize("name", ["partner_inpainting", "inbetweening", "motion_control"])

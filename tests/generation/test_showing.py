@@ -16,7 +16,7 @@ from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 
 TOKENS, PAST = 14, 4
-BARE = SamplerOptions(steps=2, paste=False, blend=0)
+BARE = SamplerOptions(steps=2, keep_given=False, blend=0)
 
 
 @pytest.fixture(scope="module")

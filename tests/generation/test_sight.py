@@ -58,7 +58,11 @@ def sampled(model, scene: Scene, task: MotionControl) -> tuple[Canvas, torch.Ten
     canvas = Canvas(model, given, schedule, FAST, 1)
     start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid()))
     generator = torch.Generator().manual_seed(0)
-    return canvas, sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.settle), start
+    return (
+        canvas,
+        sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.make_consistent),
+        start,
+    )
 
 
 # -- how far codes look --------------------------------------------------------------------------

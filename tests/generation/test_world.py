@@ -5,7 +5,7 @@ import torch
 
 from magnet.generation.blending import hold
 from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub
-from magnet.generation.world import Canvas, Health
+from magnet.generation.world import Canvas, SamplingStats
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.sampling.sampler import sample
@@ -55,7 +55,7 @@ def test_settling_changes_nothing_but_what_it_is_told_of(model, scene):
     tokens = torch.randn(2, 8, 3, model.layout.width, generator=torch.Generator().manual_seed(0))
     finished = torch.zeros(8, 3, dtype=torch.bool)
     finished[2:4] = True
-    settled = canvas.settle(tokens.clone(), finished)
+    settled = canvas.make_consistent(tokens.clone(), finished)
     changed = (settled != tokens).any(dim=0)
     assert changed[2:4].all(dim=-1).all()
     assert not changed[[0, 1, 5, 6, 7]].any()
@@ -93,7 +93,7 @@ def told(
     model, scene: Scene, task: Task, placement: str, context: int, wrong: torch.Tensor | None = None, **about
 ) -> tuple[Canvas, torch.Tensor]:
     """The finished canvas and tokens where a model says the truth, and `wrong` (B, N, P, D) on top."""
-    options = SamplerOptions(steps=4, stride=2, placement=placement, trust=0.1)
+    options = SamplerOptions(steps=4, stride=2, placement=placement, pairwise_weight=0.1)
     schedule = task.schedule(Grid(TOKENS, 3, context, 4, 8, 2))
     given = scrub(scene, schedule.known)
     canvas = Canvas(model, given, schedule, options, 1, **about)
@@ -107,7 +107,7 @@ def told(
 
     start = known_tokens(model, given, schedule.known)
     generator = torch.Generator().manual_seed(1)
-    tokens = sample(oracle, schedule, start, scene.present, model.layout, generator, canvas.settle)
+    tokens = sample(oracle, schedule, start, scene.present, model.layout, generator, canvas.make_consistent)
     return canvas, tokens
 
 
@@ -180,14 +180,17 @@ def test_whoever_is_on_turn_is_placed_by_the_relation_to_those_who_were(model, s
 
 def test_relations_between_agents_who_saw_nothing_of_each_other_do_not_count_as_drift(model, scene):
     for task, counted in ((AgenticSync(), False), (AgenticAsync(), True), (PartnerPrediction((0, 1)), True)):
-        health = Health()
-        told(model, scene, task, "fuse", 3, health=health)
-        assert (health.drifts > 0) == counted
+        stats = SamplingStats()
+        told(model, scene, task, "fuse", 3, stats=stats)
+        assert (stats.pairwise_drifts > 0) == counted
     schedule = PartnerInpainting((0, 1)).schedule(Grid(TOKENS, 3, 0, 2, 8, 2))
     finished = torch.zeros(TOKENS, 3, dtype=torch.bool)
     finished[:2, :2] = True
-    for apart, pairs in ((False, 6), (True, 4)):  # each of two with the third, both ways; and the two, both ways
-        health = Health()
-        canvas = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 1, health)
-        canvas.settle(torch.zeros(2, TOKENS, 3, model.layout.width), finished, apart)
-        assert health.drifts == 2 * 2 * pairs
+    for decentralized, pairs in (
+        (False, 6),
+        (True, 4),
+    ):  # each of two with the third, both ways; and the two, both ways
+        stats = SamplingStats()
+        canvas = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 1, stats)
+        canvas.make_consistent(torch.zeros(2, TOKENS, 3, model.layout.width), finished, decentralized)
+        assert stats.pairwise_drifts == 2 * 2 * pairs

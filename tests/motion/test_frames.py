@@ -115,14 +115,14 @@ def test_placement_is_the_same_for_all_agents(scene: Scene, placement, generator
         T = T_world_can[:, :, agents]
         steps = canonical_steps(T)
         steps = from_planar(to_planar(steps)[0] + noise[:, :, agents], to_planar(steps)[1])
-        return place(steps[:, 1:], pairwise(T)[:, 1:], T[:, 0], placement, trust=0.3)
+        return place(steps[:, 1:], pairwise(T)[:, 1:], T[:, 0], placement, pairwise_weight=0.3)
 
     assert torch.allclose(placed(torch.arange(3))[:, :, order], placed(order), atol=1e-5)
 
 
 def test_fuse_equals_a_general_least_squares_solver(generator):
     """One frame, noisy steps and pairs, yaws known: the ground positions minimise the stated sum of squares."""
-    P, trust = 3, 0.4
+    P, pairwise_weight = 3, 0.4
     start = random_scene(1, 1, P, generator).T_world_root
     T_start = canonical_frame(start)[:, 0].double()
     step = from_planar(torch.zeros(1, 1, P), 0.1 * torch.randn(1, 1, P, 2, generator=generator)).double()
@@ -130,7 +130,7 @@ def test_fuse_equals_a_general_least_squares_solver(generator):
     exact = pairwise(stepped)
     yaw, ground = to_planar(exact)
     pairs = from_planar(yaw, ground + 0.1 * torch.randn(ground.shape, generator=generator).double())
-    placed = to_planar(place(step, pairs, T_start, "fuse", trust))[1][0, 0]  # (P, 2)
+    placed = to_planar(place(step, pairs, T_start, "fuse", pairwise_weight))[1][0, 0]  # (P, 2)
 
     rows, right = [], []
     for p in range(P):
@@ -140,10 +140,10 @@ def test_fuse_equals_a_general_least_squares_solver(generator):
         right.append(to_planar(stepped)[1][0, 0, p])
         for slot, q in enumerate(partners(P)[p].tolist()):
             row = torch.zeros(P).double()
-            row[q], row[p] = trust**0.5, -(trust**0.5)
+            row[q], row[p] = pairwise_weight**0.5, -(pairwise_weight**0.5)
             rows.append(row)
             R_world_self = stepped[0, 0, p, :3, :3]
-            right.append(trust**0.5 * (R_world_self @ pairs[0, 0, p, slot, :3, 3])[[0, 2]])
+            right.append(pairwise_weight**0.5 * (R_world_self @ pairs[0, 0, p, slot, :3, 3])[[0, 2]])
     solution = torch.linalg.lstsq(torch.stack(rows), torch.stack(right)).solution
     assert torch.allclose(placed, solution, atol=1e-9)
 
@@ -169,7 +169,7 @@ def test_fuse_bounds_the_drift_between_agents(generator):
     noisy = from_planar(yaw, ground + 0.01 * torch.randn(ground.shape, generator=generator))
     apart = {}
     for placement in PLACEMENTS:
-        placed = place(noisy[:, 1:], pairwise(T_world_can)[:, 1:], T_world_can[:, 0], placement, trust=0.1)
+        placed = place(noisy[:, 1:], pairwise(T_world_can)[:, 1:], T_world_can[:, 0], placement, pairwise_weight=0.1)
         off = pairwise(placed)[..., :3, 3] - pairwise(T_world_can[:, 1:])[..., :3, 3]
         apart[placement] = off.norm(dim=-1).mean().item()
     assert apart["anchor"] < 1e-4

@@ -13,10 +13,10 @@ LAYOUT = TokenLayout(latent=4, agents=PEOPLE)
 @pytest.fixture
 def given(generator):
     tokens = torch.randn(2, 6, PEOPLE, LAYOUT.width, generator=generator)
-    veil = torch.randn(tokens.shape, generator=generator)
+    mask_noise = torch.randn(tokens.shape, generator=generator)
     levels = torch.zeros(2, 6, PEOPLE, dtype=torch.long)
     levels[:, 4:] = 600
-    return tokens, levels, torch.ones(2, PEOPLE, dtype=torch.bool), veil
+    return tokens, levels, torch.ones(2, PEOPLE, dtype=torch.bool), mask_noise
 
 
 def model(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
@@ -26,18 +26,18 @@ def model(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
 
 def with_history(given, whose: list[int]) -> Tensor:
     """Slow reference: one branch, in which only some agents' history is seen."""
-    tokens, levels, present, veil = (x.clone() for x in given)
+    tokens, levels, present, mask_noise = (x.clone() for x in given)
     for agent in range(PEOPLE):
         if agent not in whose:
             levels[:, :4, agent] = LEVELS
     groups = LAYOUT.spread(LAYOUT.group_levels(levels))
-    tokens = torch.where((groups == LEVELS), veil, tokens)
+    tokens = torch.where((groups == LEVELS), mask_noise, tokens)
     return model(tokens, levels, present)
 
 
 def run(given, **options) -> Tensor:
-    tokens, levels, present, veil = given
-    return Guidance(**options).predict(model, tokens, levels, present, veil, LAYOUT)
+    tokens, levels, present, mask_noise = given
+    return Guidance(**options).predict(model, tokens, levels, present, mask_noise, LAYOUT)
 
 
 def moves(levels: Tensor) -> Tensor:
@@ -58,25 +58,25 @@ def test_history_guidance_is_the_papers_formula(given):
 @pytest.mark.parametrize(
     ("guide", "whose"), [("self", lambda n: [n]), ("partner", lambda n: [k for k in range(3) if k != n])]
 )
-@pytest.mark.parametrize("literal", [False, True])
-def test_self_and_partner_guidance_are_the_papers_formulas(given, guide, whose, literal):
+@pytest.mark.parametrize("paper_average", [False, True])
+def test_self_and_partner_guidance_are_the_papers_formulas(given, guide, whose, paper_average):
     cond, uncond = with_history(given, [0, 1, 2]), with_history(given, [])
     branches = [with_history(given, whose(n)) for n in range(PEOPLE)]
     own = torch.stack([branches[n][:, :, n] for n in range(PEOPLE)], dim=2)
-    special = sum(branches) / PEOPLE if literal else own
-    guided = run(given, kind=guide, literal=literal)
+    special = sum(branches) / PEOPLE if paper_average else own
+    guided = run(given, kind=guide, paper_average=paper_average)
     assert torch.allclose(guided, cond + special - uncond, atol=1e-6)
 
 
 def test_read_literally_self_and_partner_coincide_for_two_people(generator):
     layout = TokenLayout(latent=4, agents=2)
-    tokens, veil = (torch.randn(1, 6, 2, layout.width, generator=generator) for _ in range(2))
+    tokens, mask_noise = (torch.randn(1, 6, 2, layout.width, generator=generator) for _ in range(2))
     levels = torch.zeros(1, 6, 2, dtype=torch.long)
     levels[:, 4:] = 600
     present = torch.ones(1, 2, dtype=torch.bool)
 
-    def guided(guide: str, literal: bool) -> Tensor:
-        return Guidance(guide, literal=literal).predict(model, tokens, levels, present, veil, layout)
+    def guided(guide: str, paper_average: bool) -> Tensor:
+        return Guidance(guide, paper_average=paper_average).predict(model, tokens, levels, present, mask_noise, layout)
 
     assert torch.allclose(guided("self", True), guided("partner", True), atol=1e-6)
     assert not torch.allclose(guided("self", False), guided("partner", False), atol=1e-3)
@@ -90,8 +90,8 @@ def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
         sizes.append(len(noisy))
         return model(noisy, levels, present)
 
-    tokens, levels, present, veil = given
-    Guidance(guide).predict(counting, tokens, levels, present, veil, LAYOUT)
+    tokens, levels, present, mask_noise = given
+    Guidance(guide).predict(counting, tokens, levels, present, mask_noise, LAYOUT)
     assert sizes == [2 * count]
     assert len(Guidance(guide).branches(torch.ones(2, dtype=torch.bool))) == min(count, 4)
     assert len(Guidance(guide).branches(torch.tensor([True, True, False, False]))) == min(count, 4)
@@ -101,34 +101,34 @@ def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
 
 
 def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(given):
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     seen = []
 
     def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
         seen.append((noisy, shown))
         return model(noisy, shown, present)
 
-    Guidance(context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
     noisy, shown = seen[0]
     assert (shown[:, :4] == 40).all() and (shown[:, 4:] == 600).all()
     assert torch.equal(noisy[:, 4:], tokens[:, 4:])
-    expected = add_noise(tokens[:, :4], veil[:, :4], torch.tensor(40))
+    expected = add_noise(tokens[:, :4], mask_noise[:, :4], torch.tensor(40))
     assert torch.allclose(noisy[:, :4], expected, atol=1e-6)
     with pytest.raises(ValueError, match="kind: got 'histry', expected none or history or self or partner"):
         Guidance("histry")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="context_level: got 1000"):
-        Guidance(context_level=1000)
+    with pytest.raises(ValueError, match="stabilization_level: got 1000"):
+        Guidance(stabilization_level=1000)
 
 
 def test_a_forgotten_history_is_pure_noise_at_any_context_level(given):
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     shown = []
 
     def spy(noisy: Tensor, seen: Tensor, present: Tensor) -> Tensor:
         shown.append(seen)
         return model(noisy, seen, present)
 
-    Guidance("history", context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    Guidance("history", stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
     assert set(shown[0][:, :4].unique().tolist()) == {40, LEVELS}
 
 
@@ -147,9 +147,9 @@ def test_roughness_is_nothing_for_steady_motion_and_counts_kinks(generator):
 
 def test_smoothing_follows_the_slope_through_the_denoiser(given):
     """Against finite differences in float64."""
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     tokens = tokens.double()
-    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))
+    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))
     assert torch.equal(clean, model(tokens, levels, present))
     for place in ((0, 4, 0, 0), (1, 5, 2, 3), (0, 5, 1, -1)):
         shift = torch.zeros_like(tokens)
@@ -161,22 +161,22 @@ def test_smoothing_follows_the_slope_through_the_denoiser(given):
 
 @pytest.mark.parametrize("kind", ["none", "history", "self", "partner"])
 def test_smoothing_goes_with_every_guidance_and_leaves_known_numbers_alone(given, kind):
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     guidance = Guidance(kind, smooth=0.3)
-    moved, clean = guidance.apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))
+    moved, clean = guidance.apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))
     known = LAYOUT.spread(LAYOUT.group_levels(levels)) == 0
     assert torch.equal(moved[known], tokens[known])
     assert not torch.allclose(moved[~known], tokens[~known])
-    assert torch.equal(clean, Guidance(kind).predict(model, tokens, levels, present, veil, LAYOUT))
+    assert torch.equal(clean, Guidance(kind).predict(model, tokens, levels, present, mask_noise, LAYOUT))
 
 
 def test_smoothing_works_in_inference_mode(given):
     with torch.inference_mode():
         inside = tuple(x + 0 for x in given)
         moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT, moves(inside[1]))
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     assert torch.equal(
-        moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT, moves(levels))[0]
+        moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))[0]
     )
 
 
@@ -203,16 +203,16 @@ def test_smoothing_makes_samples_smoother(generator):
 
 def test_smoothing_leaves_alone_what_the_step_does_not_denoise(given):
     """A token that stays at pure noise must stay noise, however many steps go by."""
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     step = moves(levels)
     step[:, 5] = False
-    moved, _ = Guidance(smooth=0.3).apply(model, tokens, levels, present, veil, LAYOUT, step)
+    moved, _ = Guidance(smooth=0.3).apply(model, tokens, levels, present, mask_noise, LAYOUT, step)
     assert torch.equal(moved[:, 5], tokens[:, 5])
     assert not torch.equal(moved[:, 4], tokens[:, 4])
 
 
 def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
-    tokens, levels, present, veil = given
+    tokens, levels, present, mask_noise = given
     levels = levels.clone()
     levels[:, 4:] = 20
     seen = []
@@ -221,7 +221,7 @@ def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
         seen.append((noisy, shown))
         return model(noisy, shown, present)
 
-    Guidance(context_level=40).predict(spy, tokens, levels, present, veil, LAYOUT)
+    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
     noisy, shown = seen[0]
     assert (shown[:, 4:] == 20).all()
     assert torch.equal(noisy[:, 4:], tokens[:, 4:])
@@ -230,9 +230,9 @@ def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
 # -- free slots --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("literal", [False, True])
+@pytest.mark.parametrize("paper_average", [False, True])
 @pytest.mark.parametrize("kind", ["history", "self", "partner"])
-def test_free_slots_change_nothing_in_guidance(kind, literal, generator):
+def test_free_slots_change_nothing_in_guidance(kind, paper_average, generator):
     """Two people in two slots, and the same two in four: a model that looks at those present alone."""
     layout = TokenLayout(latent=4, agents=4, pairwise=False)
 
@@ -241,12 +241,12 @@ def test_free_slots_change_nothing_in_guidance(kind, literal, generator):
         seen = torch.where(there, noisy * (1 + levels[..., None] / LEVELS), 0.0)
         return torch.tanh(noisy + seen.sum(dim=(1, 2), keepdim=True) / present.sum(dim=1).view(-1, 1, 1, 1))
 
-    tokens, veil = (torch.randn(3, 6, 4, layout.width, generator=generator) for _ in range(2))
+    tokens, mask_noise = (torch.randn(3, 6, 4, layout.width, generator=generator) for _ in range(2))
     levels = torch.zeros(3, 6, 4, dtype=torch.long)
     levels[:, 4:] = 600
     there = torch.tensor([True, True, False, False]).expand(3, 4)
     few = TokenLayout(latent=4, agents=2, pairwise=False)
-    guidance = Guidance(kind, literal=literal)
-    wide = guidance.predict(blind, tokens, levels, there, veil, layout)
-    narrow = guidance.predict(blind, tokens[:, :, :2], levels[:, :, :2], there[:, :2], veil[:, :, :2], few)
+    guidance = Guidance(kind, paper_average=paper_average)
+    wide = guidance.predict(blind, tokens, levels, there, mask_noise, layout)
+    narrow = guidance.predict(blind, tokens[:, :, :2], levels[:, :, :2], there[:, :2], mask_noise[:, :, :2], few)
     assert torch.allclose(wide[:, :, :2], narrow, atol=1e-5)

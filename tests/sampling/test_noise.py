@@ -57,19 +57,19 @@ def test_with_the_true_clean_value_a_step_keeps_the_noise(generator):
 
 @pytest.mark.parametrize("eta", [0.3, 1.0])
 def test_new_noise_leaves_as_much_noise_as_there_should_be(eta, generator):
-    clean, noise, fresh = (torch.randn(200_000, generator=generator, dtype=torch.float64) for _ in range(3))
+    clean, noise, step_noise = (torch.randn(200_000, generator=generator, dtype=torch.float64) for _ in range(3))
     now, after = torch.tensor(700), torch.tensor(300)
-    stepped = ddim_step(add_noise(clean, noise, now), clean, now, after, eta, fresh)
+    stepped = ddim_step(add_noise(clean, noise, now), clean, now, after, eta, step_noise)
     left = (stepped - alpha_bar(after).double().sqrt() * clean) / (1 - alpha_bar(after).double()).sqrt()
     assert left.std() == pytest.approx(1, abs=0.01)
-    assert torch.corrcoef(torch.stack([left, fresh]))[0, 1] > 0.1
+    assert torch.corrcoef(torch.stack([left, step_noise]))[0, 1] > 0.1
 
 
 def test_all_noise_of_the_first_ancestral_step_is_new(generator):
-    clean, noise, fresh = (torch.randn(50, generator=generator) for _ in range(3))
+    clean, noise, step_noise = (torch.randn(50, generator=generator) for _ in range(3))
     now, after = torch.tensor(LEVELS), torch.tensor(600)
-    stepped = ddim_step(noise, clean, now, after, 1.0, fresh)
-    assert torch.allclose(stepped, add_noise(clean, fresh, after), atol=1e-5)
+    stepped = ddim_step(noise, clean, now, after, 1.0, step_noise)
+    assert torch.allclose(stepped, add_noise(clean, step_noise, after), atol=1e-5)
 
 
 def test_what_does_not_move_comes_back_bit_identical(generator):
@@ -96,8 +96,8 @@ def test_noise_is_the_same_however_many_rows_are_drawn_at_a_time(each):
     def stream() -> NoiseStream:
         return NoiseStream((2, 3, 5), seeded(1, 2) if each else seeded(1)[0])
 
-    whole, parts = stream().rows(7), stream()
-    pieces = [parts.rows(count) for count in (1, 0, 4, 2)]
+    whole, parts = stream().draw(7), stream()
+    pieces = [parts.draw(count) for count in (1, 0, 4, 2)]
     for kind in (0, 1):
         assert torch.equal(torch.cat([piece[kind] for piece in pieces], dim=1), whole[kind])
     assert whole[0].shape == (2, 7, 3, 5)
@@ -105,8 +105,8 @@ def test_noise_is_the_same_however_many_rows_are_drawn_at_a_time(each):
 
 
 def test_with_a_generator_each_a_scenes_noise_does_not_depend_on_the_batch():
-    both = NoiseStream((2, 3, 5), seeded(1, 2)).rows(4)
-    alone = NoiseStream((1, 3, 5), seeded(2)).rows(4)
+    both = NoiseStream((2, 3, 5), seeded(1, 2)).draw(4)
+    alone = NoiseStream((1, 3, 5), seeded(2)).draw(4)
     assert torch.equal(both[0][1:], alone[0])
     assert torch.equal(both[1][1:], alone[1])
 
@@ -125,21 +125,21 @@ def test_the_noise_of_a_step_hangs_on_its_place_alone(each):
     levels[2, 1] = 250
     moves = levels > 0
     whole, parts = stream(), stream()
-    parts.rows(6)
-    noise = whole.at(10, levels, moves)
+    parts.draw(6)
+    noise = whole.step_noise(10, levels, moves)
     assert noise.shape == (2, 4, 3, 5)
-    assert torch.equal(noise[:, 1:], parts.at(11, levels[1:], moves[1:]))
+    assert torch.equal(noise[:, 1:], parts.step_noise(11, levels[1:], moves[1:]))
     assert (noise[:, 3] == 0).all()
     others = [noise[0, 0], noise[1, 0], noise[0, 1], noise[0, 2]]
     assert not any(torch.equal(a, b) for i, a in enumerate(others) for b in others[:i])
-    again = stream().at(12, torch.full((1, 3, 5), 500), torch.ones(1, 3, 5, dtype=torch.bool))
+    again = stream().step_noise(12, torch.full((1, 3, 5), 500), torch.ones(1, 3, 5, dtype=torch.bool))
     assert torch.equal(noise[:, 2, 0], again[:, 0, 0])
 
 
 def test_with_a_generator_each_a_steps_noise_does_not_depend_on_the_batch():
     levels = torch.full((2, 3, 5), 700)
-    both = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0).at(0, levels, levels > 0)
-    alone = NoiseStream((1, 3, 5), seeded(2), eta=1.0).at(0, levels, levels > 0)
+    both = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0).step_noise(0, levels, levels > 0)
+    alone = NoiseStream((1, 3, 5), seeded(2), eta=1.0).step_noise(0, levels, levels > 0)
     assert torch.equal(both[1:], alone)
 
 

@@ -60,7 +60,7 @@ def test_every_task_is_sampled_the_papers_way_and_given_frames_come_back(name: s
 def test_fields_replace_those_of_a_preset():
     options = SamplerOptions.preset("paper", steps=50, guidance=Guidance("history"))
     assert options == dataclasses.replace(SamplerOptions.preset("paper"), steps=50, guidance=Guidance("history"))
-    assert (options.steps, options.rolling, options.guidance.kind) == (50, 0, "history")
+    assert (options.steps, options.pyramid_offset, options.guidance.kind) == (50, 0, "history")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ PRESENT = torch.ones(2, 3, dtype=torch.bool)
 
 
 def joint(grid: Grid) -> MaskSchedule:
-    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+    return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
 def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ def test_agents_have_no_names_in_the_loop(generator):
         def __init__(self, both: Tensor) -> None:
             self.both = both
 
-        def rows(self, count: int) -> tuple[Tensor, Tensor]:
+        def draw(self, count: int) -> tuple[Tensor, Tensor]:
             return self.both[0], self.both[1]
 
     def run_with(given: Tensor, both: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ def test_relations_to_unknown_agents_are_never_shown(generator):
     grid = Grid(tokens=6, agents=3, context=0, steps=3)
     known = grid.mask()
     known[:, 1] = True
-    schedule = MaskSchedule.together(known, ~known, grid)
+    schedule = MaskSchedule.full_sequence(known, ~known, grid)
     tokens = make_tokens(grid, generator)
     seen = []
 

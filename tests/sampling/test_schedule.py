@@ -17,7 +17,7 @@ GRIDS = [
 
 
 def joint(grid: Grid) -> MaskSchedule:
-    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+    return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
@@ -81,20 +81,20 @@ def test_a_lone_unknown_future_stays_at_pure_noise():
     grid = Grid(tokens=16, agents=2, context=8)
     target = ~grid.past()
     target[:, 1] = False
-    plan = MaskSchedule.together(grid.past(), target, grid)
+    plan = MaskSchedule.full_sequence(grid.past(), target, grid)
     assert (plan.final_levels()[8:, 1] == LEVELS).all()
 
 
-# -- rolling -----------------------------------------------------------------------------------
+# -- sliding windows -----------------------------------------------------------------------------------
 
 
 def rolled(**options) -> MaskSchedule:
-    grid = Grid(**{"tokens": 24, "agents": 2, "context": 4, "steps": 6, "window": 8, "rolling": 2, **options})
-    return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+    grid = Grid(**{"tokens": 24, "agents": 2, "context": 4, "steps": 6, "window": 8, "pyramid_offset": 2, **options})
+    return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
 def test_rolling_levels_are_a_slope_along_time():
-    """Each token is `rolling` denoising steps behind the one before it."""
+    """Each token is `pyramid_offset` denoising steps behind the one before it."""
     plan = rolled()
     rows = torch.stack(list(plan.rows()))[:, 4:, 0]  # (steps + 1, targets)
     slope = [1000 * (6 - s) // 6 for s in range(7)]
@@ -119,16 +119,16 @@ def test_a_rolling_window_keeps_some_past_in_view():
 
 
 def test_plans_in_which_agents_see_each_other_as_they_are_cannot_roll():
-    grid = Grid(24, 2, 4, steps=6, window=8, rolling=2)
-    with pytest.raises(ValueError, match="half made up"):
-        MaskSchedule.blocks(grid.past(), ~grid.past(), grid)
+    grid = Grid(24, 2, 4, steps=6, window=8, pyramid_offset=2)
+    with pytest.raises(ValueError, match="before those are finished"):
+        MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid)
 
 
 def test_rolling_over_what_is_known_in_between():
-    grid = Grid(24, 2, 4, steps=6, window=8, rolling=2)
+    grid = Grid(24, 2, 4, steps=6, window=8, pyramid_offset=2)
     known = grid.past()
     known[10:16] = True
-    plan = MaskSchedule.together(known, ~known, grid)
+    plan = MaskSchedule.full_sequence(known, ~known, grid)
     assert plan.finished.all()
 
 
@@ -146,13 +146,13 @@ def test_padded_plans_know_and_generate_nothing_in_free_slots_and_add_no_view(na
         if narrow.hidden is not None:
             assert len(stage.hidden.unique(dim=0)) == len(narrow.hidden.unique(dim=0))
             assert torch.equal(stage.hidden[:2, :, :2], narrow.hidden)
-        assert stage.apart == narrow.apart
+        assert stage.decentralized == narrow.decentralized
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rolling": -1}, "rolling: got -1"),
+        ({"pyramid_offset": -1}, "pyramid_offset: got -1"),
         ({"noise_sampling": "both"}, "noise_sampling: got 'both', expected joint or independent"),
     ],
 )
@@ -165,22 +165,22 @@ def test_options_that_mean_nothing_are_refused(options, message):
 
 
 def pyramid(**options) -> MaskSchedule:
-    """A slope so gentle that the window cannot roll along it."""
-    return rolled(**{"rolling": 1, "steps": 30, "window": 16, "tokens": 40, **options})
+    """A slope so gentle that the window cannot slide along it."""
+    return rolled(**{"pyramid_offset": 1, "steps": 30, "window": 16, "tokens": 40, **options})
 
 
-@pytest.mark.parametrize("rolling", [1, 2])
-def test_a_slope_too_gentle_for_the_window_is_a_pyramid_in_each_of_its_places(rolling):
-    """Diffusion forcing's pyramid matrix: token n of the new ones is at step s - n * rolling, clamped to 0..S."""
-    plan = pyramid(rolling=rolling, window=12 if rolling == 1 else 15)
+@pytest.mark.parametrize("pyramid_offset", [1, 2])
+def test_a_slope_too_gentle_for_the_window_is_a_pyramid_in_each_of_its_places(pyramid_offset):
+    """Diffusion forcing's pyramid matrix: new token n is at step s - n * pyramid_offset, clamped to 0..S."""
+    plan = pyramid(pyramid_offset=pyramid_offset, window=12 if pyramid_offset == 1 else 15)
     done = 4
     for stage in plan.stages:
         new = ((stage.levels[0] > 0).any(dim=1)).nonzero()[:, 0]
         assert stage.start + int(new[0]) == done
         done += len(new)
-        assert len(stage.levels) == 31 + rolling * (len(new) - 1)
+        assert len(stage.levels) == 31 + pyramid_offset * (len(new) - 1)
         for step, row in enumerate(stage.levels):
-            passed = [min(max(step - rolling * n, 0), 30) for n in range(len(new))]
+            passed = [min(max(step - pyramid_offset * n, 0), 30) for n in range(len(new))]
             assert row[new, 0].tolist() == row[new, 1].tolist() == [1000 * (30 - s) // 30 for s in passed]
     assert done == 40 and plan.finished.all()
 
@@ -192,16 +192,16 @@ def test_a_pyramids_window_moves_on_by_the_stride():
 
 def test_a_window_rolls_as_soon_as_it_holds_all_that_is_half_denoised():
     """15 tokens in the making fit into 16, 30 do not."""
-    rolls, strides = (pyramid(rolling=rolling, context=8) for rolling in (2, 1))
+    rolls, strides = (pyramid(pyramid_offset=pyramid_offset, context=8) for pyramid_offset in (2, 1))
     assert (len(rolls.stages), rolls.evaluations) == (32, 30 + 31 * 2)
     assert (len(strides.stages), strides.evaluations) == (7, 30 + 7 + 6 * (30 + 3))
 
 
 def test_a_pyramid_over_what_is_known_in_between_generates_the_rest():
-    grid = Grid(24, 2, 4, steps=20, window=8, rolling=1)
+    grid = Grid(24, 2, 4, steps=20, window=8, pyramid_offset=1)
     known = grid.past()
     known[10:16, 0] = True
-    plan = MaskSchedule.together(known, ~known, grid)
+    plan = MaskSchedule.full_sequence(known, ~known, grid)
     assert plan.finished.all() and torch.equal(plan.known, known)
 
 
@@ -209,18 +209,18 @@ def test_a_pyramid_over_what_is_known_in_between_generates_the_rest():
 
 
 def independent(**options) -> MaskSchedule:
-    return rolled(**{"rolling": 0, "steps": 20, "noise_sampling": "independent", **options})
+    return rolled(**{"pyramid_offset": 0, "steps": 20, "noise_sampling": "independent", **options})
 
 
-@pytest.mark.parametrize("rolling", [0, 2, 4])
-def test_jointly_agents_at_a_time_step_are_at_one_level_throughout(rolling):
-    for stage in rolled(rolling=rolling).stages:
+@pytest.mark.parametrize("pyramid_offset", [0, 2, 4])
+def test_jointly_agents_at_a_time_step_are_at_one_level_throughout(pyramid_offset):
+    for stage in rolled(pyramid_offset=pyramid_offset).stages:
         assert torch.equal(stage.levels[..., 0], stage.levels[..., 1])
 
 
-@pytest.mark.parametrize("rolling", [0, 4])
-def test_independently_each_token_passes_levels_of_its_own(rolling):
-    plan = independent(rolling=rolling)
+@pytest.mark.parametrize("pyramid_offset", [0, 4])
+def test_independently_each_token_passes_levels_of_its_own(pyramid_offset):
+    plan = independent(pyramid_offset=pyramid_offset)
     rows = torch.stack(list(plan.rows()))[:, 4:]
     passed = [tuple(column.unique_consecutive().tolist()) for column in rows.flatten(1).T]
     assert all(len(each) == 21 and each[0] == 1000 and each[-1] == 0 for each in passed)
@@ -248,14 +248,14 @@ def test_a_plan_draws_no_random_numbers():
 @pytest.mark.parametrize("window", [2, 3, 8, 16])
 @pytest.mark.parametrize("steps", [1, 4, 20, 30, 50])
 def test_by_default_half_of_the_window_is_in_the_making(steps, window):
-    grid = Grid(24, 2, 4, steps, window, stride=1, rolling=None)
-    assert grid.rolled <= window // 2
-    assert grid.slope == 1 or -(-steps // (grid.slope - 1)) > window // 2  # no gentler slope would do
+    grid = Grid(24, 2, 4, steps, window, stride=1, pyramid_offset=None)
+    assert grid.tokens_in_flight <= window // 2
+    assert grid.token_offset == 1 or -(-steps // (grid.token_offset - 1)) > window // 2  # no gentler slope would do
 
 
 def test_by_default_a_window_of_one_token_does_not_roll():
-    grid = Grid(6, 2, 2, steps=3, window=1, stride=1, rolling=None)
-    assert MaskSchedule.together(grid.past(), ~grid.past(), grid).evaluations == 4 * 3
+    grid = Grid(6, 2, 2, steps=3, window=1, stride=1, pyramid_offset=None)
+    assert MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid).evaluations == 4 * 3
 
 
 @pytest.mark.parametrize("size", ["tokens", "agents", "steps"])

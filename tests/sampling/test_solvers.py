@@ -77,17 +77,17 @@ def test_what_does_not_move_comes_back_bit_identical_and_keeps_its_memory(genera
 def test_what_reaches_level_zero_is_the_prediction(generator):
     noisy, clean, history = made(generator, 900, LEVELS, -1)
     now = spread(500, 700, LEVELS)
-    for eta, fresh in ((0.0, None), (1.0, torch.randn(noisy.shape, generator=generator))):
-        assert torch.equal(solver_step(noisy, clean, now, torch.zeros_like(now), eta, fresh, history), clean)
+    for eta, step_noise in ((0.0, None), (1.0, torch.randn(noisy.shape, generator=generator))):
+        assert torch.equal(solver_step(noisy, clean, now, torch.zeros_like(now), eta, step_noise, history), clean)
 
 
 @pytest.mark.parametrize("eta", [0.0, 1.0])
 def test_the_first_step_is_of_first_order(eta, generator):
     noisy, clean, history = made(generator, -1, -1)
-    fresh = torch.randn(noisy.shape, generator=generator)
+    step_noise = torch.randn(noisy.shape, generator=generator)
     now, after = spread(LEVELS, 500), spread(700, 20)
-    stepped = solver_step(noisy, clean, now, after, eta, fresh, history)
-    assert torch.equal(stepped, ddim_step(noisy, clean, now, after, eta, fresh))
+    stepped = solver_step(noisy, clean, now, after, eta, step_noise, history)
+    assert torch.equal(stepped, ddim_step(noisy, clean, now, after, eta, step_noise))
     assert torch.equal(history.clean, clean) and torch.equal(history.levels, now)
 
 
@@ -185,9 +185,11 @@ def run(
 def test_numbers_are_solved_as_if_alone_however_a_plan_is_laid(eta, spacing):
     """Strides, slopes, pyramids, turns and views give each number the same levels at other times: the same sample."""
     grid = {"tokens": 16, "agents": 2, "context": 4, "steps": 6, "spacing": spacing}
-    whole = run(JointFuture(), Grid(window=16, stride=16, rolling=0, **grid), eta=eta)
-    assert not torch.equal(whole, run(JointFuture(), Grid(window=16, stride=16, rolling=0, **grid), "ddim", eta=eta))
-    for shape in ({"window": 8, "stride": 3}, {"window": 8, "rolling": 2}, {"window": 8, "rolling": 1}):
+    whole = run(JointFuture(), Grid(window=16, stride=16, pyramid_offset=0, **grid), eta=eta)
+    assert not torch.equal(
+        whole, run(JointFuture(), Grid(window=16, stride=16, pyramid_offset=0, **grid), "ddim", eta=eta)
+    )
+    for shape in ({"window": 8, "stride": 3}, {"window": 8, "pyramid_offset": 2}, {"window": 8, "pyramid_offset": 1}):
         assert torch.equal(run(JointFuture(), Grid(**grid, **shape), eta=eta), whole)
     for offset in (0.0, 0.5, 1.0):
         turns = run(AgenticAsync(offset, (1, 0), block=2), Grid(window=8, stride=3, **grid), eta=eta)
@@ -198,12 +200,14 @@ def test_numbers_are_solved_as_if_alone_however_a_plan_is_laid(eta, spacing):
 
 
 @pytest.mark.parametrize(
-    "guidance", [Guidance(), Guidance("partner"), Guidance(smooth=0.01), Guidance(context_level=50)]
+    "guidance", [Guidance(), Guidance("partner"), Guidance(smooth=0.01), Guidance(stabilization_level=50)]
 )
 @pytest.mark.parametrize("name", registry.names())
 def test_a_batch_is_sampled_as_each_scene_alone(name, guidance):
     task = registry.get(name)()
-    grid = Grid(12, 3, 0 if name == "generation" else 4, steps=4, window=8, stride=3, rolling=None, spacing="log_snr")
+    grid = Grid(
+        12, 3, 0 if name == "generation" else 4, steps=4, window=8, stride=3, pyramid_offset=None, spacing="log_snr"
+    )
     both = run(task, grid, denoise=mixing, guidance=guidance)
     each = [run(task, grid, denoise=mixing, scenes=[scene], guidance=guidance) for scene in (1, 2)]
     torch.testing.assert_close(both, torch.cat(each), atol=1e-5, rtol=0)
@@ -217,10 +221,10 @@ def test_rows_may_come_and_go_between_stages(name):
         Grid(14, 3, 0 if name == "generation" else 4, steps=4, window=6, stride=2, spacing="log_snr")
     )
     generator = torch.Generator().manual_seed(4)
-    tokens, noise, veil = (torch.randn(2, 14, 3, layout.width, generator=generator) for _ in range(3))
+    tokens, noise, mask_noise = (torch.randn(2, 14, 3, layout.width, generator=generator) for _ in range(3))
     present = torch.ones(2, 3, dtype=torch.bool)
     start = begin(tokens, noise, schedule.known, layout)
-    whole = run_stages(mixing, schedule.stages, start, veil, present, layout, history=History.empty(start))
+    whole = run_stages(mixing, schedule.stages, start, mask_noise, present, layout, history=History.empty(start))
 
     held, first = start[:, :0], 0
     history, out = History.empty(held), start.clone()
@@ -230,7 +234,7 @@ def test_rows_may_come_and_go_between_stages(name):
         more = start[:, first + held.shape[1] : stage.stop]
         held, history = torch.cat([held, more], dim=1), history.extend(more)
         moved = type(stage)(stage.start - first, stage.levels, stage.hidden)
-        held = run_stages(mixing, [moved], held, veil[:, first:], present, layout, history=history)
+        held = run_stages(mixing, [moved], held, mask_noise[:, first:], present, layout, history=history)
         out[:, first : first + held.shape[1]] = held
     assert torch.equal(out, whole)
 

@@ -19,7 +19,7 @@ from magnet.testing import random_scene, tiny_denoiser
 
 # What an untrained model says of pairs contradicts what it says of steps: it is trusted as little as steps allow.
 FAST = {
-    placement: SamplerOptions(steps=3, stride=2, placement=placement, trust=0.003)
+    placement: SamplerOptions(steps=3, stride=2, placement=placement, pairwise_weight=0.003)
     for placement in ("integrate", "fuse")
 }
 
@@ -41,7 +41,7 @@ def settled(model, scene, task, options, tokens: int, context: int = 2):
     canvas = Canvas(model, given, schedule, options, 1)
     start = known_tokens(model, given, schedule.known)
     generator = torch.Generator().manual_seed(0)
-    out = sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.settle)
+    out = sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.make_consistent)
     return canvas, out, start, schedule.known
 
 
@@ -206,7 +206,7 @@ def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene
         return truth[:, stage.start : stage.stop]
 
     start = known_tokens(model, given, schedule.known)
-    out = sample(oracle, schedule, start, scene.present, model.layout, settle=canvas.settle)
+    out = sample(oracle, schedule, start, scene.present, model.layout, on_stage_end=canvas.make_consistent)
     true = canonical_frame(scene.T_world_root)
     yaw, ground = to_planar(inverse(true) @ canvas.T_world_can)
     assert yaw[:, :, :3].abs().max() < 0.02 and ground[:, :, :3].abs().max() < 0.02

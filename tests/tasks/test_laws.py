@@ -27,18 +27,20 @@ NAMELESS = ("joint_future", "generation", "agentic_sync", "inbetweening")
 def test_every_task_obeys_the_laws(name: str):
     checked = task_laws(registry.get(name)(), nameless=name in NAMELESS)
     expected = [g for g in TASK_GRIDS if g.agents > 1 or name not in TWO_AND_MORE]
-    expected = [g for g in expected if not (g.rolling and name in CANNOT_ROLL)]
+    expected = [g for g in expected if not (g.pyramid_offset and name in CANNOT_ROLL)]
     assert checked == [g for g in expected if g.context or name in FROM_NOTHING]
 
 
 @pytest.mark.parametrize("name", registry.names())
-@pytest.mark.parametrize("rolling", [0, 2])
-def test_every_task_obeys_the_laws_where_each_token_has_levels_of_its_own(name: str, rolling: int):
+@pytest.mark.parametrize("pyramid_offset", [0, 2])
+def test_every_task_obeys_the_laws_where_each_token_has_levels_of_its_own(name: str, pyramid_offset: int):
     """Paper A.6.2. Levels are drawn by slot, so this is the one choice in which slots are not treated alike."""
-    if rolling and name in CANNOT_ROLL:
+    if pyramid_offset and name in CANNOT_ROLL:
         pytest.skip("refused, with a reason: see below")
     context = 0 if name == "generation" else 4
-    grid = Grid(20, 3, context, steps=6, window=8, stride=3, rolling=rolling, noise_sampling="independent")
+    grid = Grid(
+        20, 3, context, steps=6, window=8, stride=3, pyramid_offset=pyramid_offset, noise_sampling="independent"
+    )
     assert task_laws(registry.get(name)(), [grid]) == [grid]
 
 
@@ -50,14 +52,14 @@ def test_inpainting_with_the_targets_own_past_obeys_the_laws(target: tuple[int, 
 
 @pytest.mark.parametrize("name", CANNOT_ROLL)
 def test_a_task_that_cannot_roll_says_why(name: str):
-    with pytest.raises(ValueError, match="rolling"):
-        registry.get(name)().schedule(Grid(20, 2, 4, steps=6, window=8, rolling=2))
+    with pytest.raises(ValueError, match="pyramid_offset"):
+        registry.get(name)().schedule(Grid(20, 2, 4, steps=6, window=8, pyramid_offset=2))
 
 
 @pytest.mark.parametrize("name", registry.names())
 def test_tasks_that_can_roll_do_so_unless_told_otherwise(name: str):
-    def plan(rolling: int | None) -> list[Tensor]:
-        grid = Grid(20, 2, 0 if name == "generation" else 4, steps=8, window=8, rolling=rolling)
+    def plan(pyramid_offset: int | None) -> list[Tensor]:
+        grid = Grid(20, 2, 0 if name == "generation" else 4, steps=8, window=8, pyramid_offset=pyramid_offset)
         return list(registry.get(name)().schedule(grid).rows())
 
     left_to_itself, told = plan(None), plan(0 if name in CANNOT_ROLL else 2)
@@ -81,11 +83,11 @@ HIDING = ("agentic_async", "agentic_sync")
     [
         Guidance("history"),
         Guidance("self"),
-        Guidance("partner", literal=True),
+        Guidance("partner", paper_average=True),
         Guidance(smooth=0.1),
-        Guidance(context_level=50),
+        Guidance(stabilization_level=50),
     ],
-    ids=lambda guidance: f"{guidance.kind}-{guidance.smooth}-{guidance.context_level}",
+    ids=lambda guidance: f"{guidance.kind}-{guidance.smooth}-{guidance.stabilization_level}",
 )
 def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, guidance: Guidance):
     task, grid = registry.get(name)(), Grid(8, 3, 3, steps=4, window=6, stride=2)
@@ -129,9 +131,9 @@ def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypat
 )
 def test_an_agent_is_treated_as_its_role_says_whichever_slot_it_is_in(name: str, options: dict[str, Any]):
     task = registry.get(name)
-    rolling = (0,) if name in CANNOT_ROLL else (0, 2)
-    for order, slope in itertools.product(itertools.permutations(range(3)), rolling):
-        grid = Grid(14, 3, 4, steps=4, window=8, stride=3, rolling=slope)
+    pyramid_offset = (0,) if name in CANNOT_ROLL else (0, 2)
+    for order, slope in itertools.product(itertools.permutations(range(3)), pyramid_offset):
+        grid = Grid(14, 3, 4, steps=4, window=8, stride=3, pyramid_offset=slope)
         moved = dict(options)
         for field in set(options) & {"target", "order", "agents"}:
             moved[field] = tuple(order.index(slot) for slot in options[field])
@@ -151,9 +153,9 @@ def test_empty_slots_change_nothing(name: str):
     """Two people are sampled in four slots as in two, whatever stands in the slots that nobody is in."""
     small, large = (TokenLayout(latent=4, agents=agents) for agents in (2, 4))
     checked = 0
-    for context, rolling in itertools.product((0, 4), (0, 2)):
+    for context, pyramid_offset in itertools.product((0, 4), (0, 2)):
         try:
-            plan = registry.get(name)().schedule(Grid(14, 2, context, 4, 8, 3, rolling))
+            plan = registry.get(name)().schedule(Grid(14, 2, context, 4, 8, 3, pyramid_offset))
         except ValueError:
             continue
         generator = torch.Generator().manual_seed(3)
@@ -188,7 +190,7 @@ class Broken:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         known = grid.past()
-        plan = MaskSchedule.together(known, ~known, grid)
+        plan = MaskSchedule.full_sequence(known, ~known, grid)
         rows = torch.full((3, grid.tokens, grid.agents), LEVELS)
         rows[1], rows[2] = 500, 0
         if self.law == "rise":
@@ -201,15 +203,15 @@ class Broken:
             return MaskSchedule(grid.tokens, grid.agents, (), known)
         if self.law == "random":
             known = torch.rand(grid.tokens, grid.agents) < 0.5
-            return MaskSchedule.together(known, ~known, grid)
+            return MaskSchedule.full_sequence(known, ~known, grid)
         if self.law == "names":
             known[:, 0] = True
-            return MaskSchedule.together(known, ~known, grid)
+            return MaskSchedule.full_sequence(known, ~known, grid)
         if self.law in ("rumour", "blind"):
             # Rumour: 0 does not see 1, but sees 2, who sees 1.
             unseen = torch.zeros(grid.agents, grid.agents, dtype=torch.bool)
             unseen[0, 1 if self.law == "rumour" else 0] = True
-            return MaskSchedule.blocks(known, ~known, grid, unseen=unseen)
+            return MaskSchedule.autoregressive(known, ~known, grid, unseen=unseen)
         if self.law == "refuse":
             raise ValueError("this task needs seven agents")
         return plan

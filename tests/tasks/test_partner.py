@@ -69,7 +69,7 @@ def test_whoever_has_not_started_is_hidden_and_nobody_else(offset):
         assert (stage.hidden is not None) == bool(waiting.any())
         if stage.hidden is not None:
             assert torch.equal(stage.hidden, waiting.expand_as(stage.hidden))
-        assert not stage.apart, "what is denoised beside each other is placed together"
+        assert not stage.decentralized, "what is denoised beside each other is placed together"
 
 
 def test_at_the_full_offset_turns_are_stages():

@@ -14,7 +14,7 @@ class Foreign:
     formula: ClassVar[str] = "P(A)"
 
     def schedule(self, grid: Grid) -> MaskSchedule:
-        return MaskSchedule.together(grid.past(), ~grid.past(), grid)
+        return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
 @pytest.fixture

@@ -47,17 +47,17 @@ def test_with_an_oracle_every_task_reconstructs_the_scene(name: str, people: int
         views = len(noisy) // len(truth)
         return truth[:, stage.start : stage.stop].repeat_interleave(views, dim=0)
 
-    def settle(canvas: Tensor, finished: Tensor, apart: bool) -> Tensor:
+    def on_stage_end(canvas: Tensor, finished: Tensor, decentralized: bool) -> Tensor:
         """Relations between agents that did not see each other come from where they then stand, as in `Canvas`."""
         done = torch.zeros_like(canvas, dtype=torch.bool)
         done[:, finished] = True
         done[..., : layout.latent + 36] = False
         return torch.where(done, truth, canvas)
 
-    apart = name == "agentic_sync"  # there nobody has seen what the others were about to do
+    decentralized = name == "agentic_sync"  # there nobody has seen what the others were about to do
     shown = torch.where(schedule.known[..., None], truth, torch.nan)
     present = torch.ones(2, people, dtype=torch.bool)
-    out = sample(oracle, schedule, shown, present, layout, generator, settle if apart else None)
+    out = sample(oracle, schedule, shown, present, layout, generator, on_stage_end if decentralized else None)
     assert next(position, None) is None
     # Relations to somebody who is never generated stay unknown.
     groups = layout.spread(layout.group_levels(schedule.final_levels()) == 0)
@@ -141,28 +141,28 @@ class Gaussian:
 
 
 class Given:
-    """Noise and veil of one's own choice, and new noise that is one number at a time."""
+    """Noise and mask_noise of one's own choice, and new noise that is one number at a time."""
 
-    def __init__(self, noise: Tensor, veil: Tensor, eta: float = 0.0, levels: Sequence[int] = ()) -> None:
-        self.noise, self.veil, self.eta, self.levels = noise, veil, eta, levels
+    def __init__(self, noise: Tensor, mask_noise: Tensor, eta: float = 0.0, levels: Sequence[int] = ()) -> None:
+        self.noise, self.mask_noise, self.eta, self.levels = noise, mask_noise, eta, levels
 
     @property
     def plain(self) -> int:
         """How many draws come before those that hold a number of new noise each."""
         return len(self.noise) - len(self.levels) * self.noise[0, :, :, 0].numel()
 
-    def at(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
+    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
         """Draw `plain` + (level number, token, agent): 1 there, 0 everywhere else."""
         N, P = self.noise.shape[1:3]
-        fresh = torch.zeros_like(self.noise[:, first : first + len(levels)])
+        step_noise = torch.zeros_like(self.noise[:, first : first + len(levels)])
         for row, agent in moves[..., 0].nonzero().tolist():
             number = self.levels.index(int(levels[row, agent, 0]))
-            fresh[self.plain + (number * N + first + row) * P + agent, row, agent] = 1.0
-        return fresh
+            step_noise[self.plain + (number * N + first + row) * P + agent, row, agent] = 1.0
+        return step_noise
 
-    def rows(self, count: int) -> tuple[Tensor, Tensor]:
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
         assert count == self.noise.shape[1]
-        return self.noise, self.veil
+        return self.noise, self.mask_noise
 
 
 def distribution(
@@ -173,7 +173,7 @@ def distribution(
     layout = TokenLayout(latent=1, agents=P, pairwise=False)
     size = N * P
     levels = sorted({int(x) for stage in schedule.stages for x in stage.levels[:-1].unique()} - {0}) if eta else []
-    # Row 0 without noise; then each token's own noise alone; then each token's veil alone; then each new noise alone.
+    # Row 0 without noise; then each token's own noise alone; then its mask noise alone; then each step noise alone.
     draws = [torch.zeros(1 + (2 + len(levels)) * size, size, dtype=torch.float64) for _ in range(2)]
     draws[0][1 : 1 + size] = torch.eye(size)
     draws[1][1 + size : 1 + 2 * size] = torch.eye(size)
@@ -207,10 +207,10 @@ def check(
     )
     found = []
     for steps in STEPS:
-        rolling = steps // share if share else 0
+        pyramid_offset = steps // share if share else 0
         # Windows of blocks keep room for what lies ahead: everything is to stay in sight all the same.
-        window = tokens if rolling else tokens + AHEAD
-        grid = Grid(tokens, people, context, steps, window=window, stride=1, rolling=rolling, shift=shift)
+        window = tokens if pyramid_offset else tokens + AHEAD
+        grid = Grid(tokens, people, context, steps, window=window, stride=1, pyramid_offset=pyramid_offset, shift=shift)
         schedule = task.schedule(grid)
         found.append(distribution(gaussian, schedule, values, eta, solver))
     (mean, coarse), (_, fine) = found

@@ -55,15 +55,15 @@ class Related:
 
 
 class Given:
-    """Noise and veil of one's own choice."""
+    """Noise and mask_noise of one's own choice."""
 
     eta = 0.0
 
-    def __init__(self, noise: Tensor, veil: Tensor) -> None:
-        self.noise, self.veil = noise, veil
+    def __init__(self, noise: Tensor, mask_noise: Tensor) -> None:
+        self.noise, self.mask_noise = noise, mask_noise
 
-    def rows(self, count: int) -> tuple[Tensor, Tensor]:
-        return self.noise, self.veil
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        return self.noise, self.mask_noise
 
 
 def covariance(world: Related, task: Task, steps: int) -> Tensor:
@@ -72,12 +72,12 @@ def covariance(world: Related, task: Task, steps: int) -> Tensor:
     G = world.agents
     size = TOKENS * world.agents * G
     noise = torch.zeros(2 * size, TOKENS, world.agents, world.layout.width, dtype=torch.float64)
-    veil = noise.clone()
+    mask_noise = noise.clone()
     one = torch.eye(size, dtype=torch.float64).view(size, TOKENS, world.agents, G)
-    noise[:size, ..., world.numbers], veil[size:, ..., world.numbers] = one, one
+    noise[:size, ..., world.numbers], mask_noise[size:, ..., world.numbers] = one, one
     present = torch.ones(2 * size, world.agents, dtype=torch.bool)
     start = torch.zeros_like(noise)
-    out = sample(world.denoise, schedule, start, present, world.layout, noise=Given(noise, veil))
+    out = sample(world.denoise, schedule, start, present, world.layout, noise=Given(noise, mask_noise))
     made = out[:, PAST:][..., world.numbers].flatten(1)  # (draws, numbers)
     assert (made[size:].abs() < 1e-9).all(), "what hides a token tells nothing"
     return made[:size].T @ made[:size]

@@ -1,4 +1,4 @@
-"""The steps between any reader and clips: y up, 30 fps at exact times, floor at 0, origin, cuts at lost tracking."""
+"""A recording to canonical clips: y up, 30 fps at exact times, floor at 0, origin, cuts at lost tracking."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from magnet.datamodules.resample import FPS, resample_points, resample_rotations
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
-STEPS_VERSION = 3
+CANONICALIZE_VERSION = 3
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
 FLOOR_PERCENTILE = 5.0
 """Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
@@ -40,8 +40,8 @@ R_WORLD_FILE: dict[Axis, Tensor] = {
 
 
 @dataclass(frozen=True)
-class Steps:
-    """What can be chosen about the common steps; part of what a prepared store is remembered by.
+class CanonicalizeOptions:
+    """What can be chosen about `canonicalize`; part of what a prepared store is remembered by.
 
     Args:
         min_frames: shortest clip that is kept, at 30 fps.
@@ -61,7 +61,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Motion:
+class WorldMotion:
     """T frames of P people at 30 fps on their way to clips."""
 
     rotations: Tensor  # (T, P, 22, 3, 3) float32, the pelvis's in the world, others relative to their parents
@@ -71,36 +71,36 @@ class Motion:
     joints: Tensor  # (T, P, 22, 3) float32 world
     notes: tuple[str, ...] = ()
 
-    def turned(self, R: Tensor) -> Motion:
+    def turned(self, R: Tensor) -> WorldMotion:
         """Seen from a world turned by R_new_old (3, 3) float64."""
         rotations = self.rotations.clone()
         rotations[:, :, 0] = R.float() @ rotations[:, :, 0]
         return replace(self, rotations=rotations, pelvis=self.pelvis @ R.T, joints=self.joints @ R.T.float())
 
-    def lowered(self, height: float) -> Motion:
+    def lowered(self, height: float) -> WorldMotion:
         """With the floor, now at `height`, at 0."""
         down = torch.tensor([0.0, height, 0.0], dtype=torch.float64)
         return replace(self, pelvis=self.pelvis - down, joints=self.joints - down.float())
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Canonicalized:
     """The clips of one take, and what should be known about them."""
 
     clips: list[Clip]
     notes: tuple[str, ...]
 
 
-def to_clips(
+def canonicalize(
     recording: Recording,
     body: Body,
     name: str,
     source: str,
     split: Split,
     family: Family = "smplx",
-    steps: Steps | None = None,
-) -> Outcome:
-    """All common steps: a recording to clips of `body`.
+    options: CanonicalizeOptions | None = None,
+) -> Canonicalized:
+    """A recording as read to clips of `body`.
 
     Args:
         recording: as read, at any rate and with any up axis.
@@ -109,50 +109,50 @@ def to_clips(
         source: the data set.
         split: of the take.
         family: of the data set.
-        steps: what can be chosen.
+        options: what can be chosen.
 
     Raises:
         DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or
             positions that the body does not fit within 4 cm.
     """
-    steps = steps or Steps()
+    options = options or CanonicalizeOptions()
     recording = of_body(recording, body, source, family)
     names = recording.persons
     notes = list(recording.notes)
     for p, gender in enumerate(recording.genders):  # of a body that nobody gave
         notes.append(f"{names[p] if names else f'person {p}'}: {gender}; the shape is used with the body model given")
-    motion, flags, flagged = _moved(recording, body, steps)
+    motion, flags, flagged = _moved(recording, body, options)
     quat = roma.rotmat_to_unitquat(motion.rotations).numpy()
     flags += check_people.jumps(quat, motion.joints.numpy(), motion.valid, but=flags)
-    flagged += check_people.words(flags, names, FPS)
+    flagged += check_people.described(flags, names, FPS)
     notes += [*flagged, *motion.notes]
     jumps = check_motion.jumps(motion.pelvis.numpy(), motion.valid, FPS)
     if len(jumps):
         notes.append(f"cut at {len(jumps)} jumps of more than {check_motion.JUMP:g} m between frames")
-    if not steps.trust_fps:
+    if not options.trust_fps:
         check_motion.check_rate(
             motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.said_fps or recording.fps, FPS
         )
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
     motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
     cuts = sorted({*jumps.tolist(), *(flag.start for flag in flags if flag.cut)})
-    return Outcome(_cut(motion, cuts, flagged, body, name, source, split, steps.min_frames), tuple(notes))
+    return Canonicalized(_cut(motion, cuts, flagged, body, name, source, split, options.min_frames), tuple(notes))
 
 
-def _moved(recording: Recording, body: Body, steps: Steps) -> tuple[Motion, list[Flag], list[str]]:
+def _moved(recording: Recording, body: Body, options: CanonicalizeOptions) -> tuple[WorldMotion, list[Flag], list[str]]:
     """At 30 fps, y up; what is wrong with whom there, and in words what was so in the file's own frames."""
-    up, valid = steps.up or recording.up, check_motion.usable(recording)
+    up, valid = options.up or recording.up, check_motion.usable(recording)
     if recording.poses is not None:
         check_motion.check_angles(recording.poses, valid, recording.persons)
     valid, wild = check_people.screened(recording, valid)
     if recording.poses is not None:
         motion, flags = _posed(recording, valid, body)
-        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=steps.up is not None)
+        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=options.up is not None)
         motion = motion.turned(R_WORLD_FILE[up])
         check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
     else:
-        motion, flags = _fitted(recording, valid, body, up, steps)
-    return motion, flags, check_people.words(wild, recording.persons, recording.fps)
+        motion, flags = _fitted(recording, valid, body, up, options)
+    return motion, flags, check_people.described(wild, recording.persons, recording.fps)
 
 
 def of_body(recording: Recording, body: Body, source: str, family: Family) -> Recording:
@@ -190,7 +190,7 @@ def of_body(recording: Recording, body: Body, source: str, family: Family) -> Re
 # -- the two kinds of recording ----------------------------------------------------------------
 
 
-def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[Motion, list[Flag]]:
+def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[WorldMotion, list[Flag]]:
     place = recording.transl if recording.pelvis is None else recording.pelvis
     assert recording.poses is not None and place is not None and recording.betas is not None
     poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
@@ -210,12 +210,12 @@ def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[
     good = resample_valid(valid, recording.fps)
     flags = check_people.frozen(*check_people.held(pelvis.numpy(), quat.numpy()), good)
     good = check_people.without(good, flags, recording.persons, FPS)
-    return Motion(rotations, pelvis, betas, good, joints), flags
+    return WorldMotion(rotations, pelvis, betas, good, joints), flags
 
 
 def _fitted(
-    recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, steps: Steps
-) -> tuple[Motion, list[Flag]]:
+    recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, options: CanonicalizeOptions
+) -> tuple[WorldMotion, list[Flag]]:
     assert recording.positions is not None
     positions = check_motion.filled(np.asarray(recording.positions, dtype=np.float64), valid)
     points = resample_points(torch.from_numpy(positions), recording.fps)
@@ -225,20 +225,20 @@ def _fitted(
     check_motion.check_limbs(points.numpy(), recording.joints, good)
     spread = np.full((*points.shape[:2], BODY_JOINTS, 3), np.nan)
     spread[:, :, list(recording.joints)] = points.numpy()
-    check_motion.check_up(up, spread, good, chosen=steps.up is not None)
+    check_motion.check_up(up, spread, good, chosen=options.up is not None)
     flags += check_people.jumps(None, spread, good)
     spread = spread @ R_WORLD_FILE[up].numpy().T
     if np.isfinite(spread[:, :, check_motion.WALKING]).all():
         check_motion.check_apart(spread[:, :, 0], good)
         check_motion.check_lengths(spread, spread[:, :, 0], good)
-    if not steps.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
+    if not options.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
         check_motion.check_rate(
             spread[:, :, check_motion.WALKING], good, recording.said_fps or recording.fps, FPS
         )  # before a fit of minutes
     targets = (points @ R_WORLD_FILE[up].T).float()
     try:
-        if recording.rigs:
-            people, offs = zip(*(rig.onto(body, up, FPS) for rig in recording.rigs), strict=True)
+        if recording.skeletons:
+            people, offs = zip(*(rig.onto(body, up, FPS) for rig in recording.skeletons), strict=True)
             scene = _side_by_side(people)
             residual = torch.stack(offs, dim=1)
         else:
@@ -249,9 +249,9 @@ def _fitted(
     rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
     off = 100 * residual.numpy()[good]
     said = f"mean residual {off.mean():.1f} cm, 95 % below {np.percentile(off, 95):.1f} cm"
-    notes = (f"body {body.id} fitted to {'skeletons' if recording.rigs else 'positions'}: {said}",)
+    notes = (f"body {body.id} fitted to {'skeletons' if recording.skeletons else 'positions'}: {said}",)
     pelvis = scene.T_world_root[0, :, :, :3, 3].double()
-    return Motion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0], notes), flags
+    return WorldMotion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0], notes), flags
 
 
 def _side_by_side(people: Sequence[Scene]) -> Scene:
@@ -268,14 +268,21 @@ def _side_by_side(people: Sequence[Scene]) -> Scene:
 
 
 def _cut(
-    motion: Motion, cuts: list[int], flagged: list[str], body: Body, name: str, source: str, split: Split, least: int
+    motion: WorldMotion,
+    cuts: list[int],
+    flagged: list[str],
+    body: Body,
+    name: str,
+    source: str,
+    split: Split,
+    least: int,
 ) -> list[Clip]:
     together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
     frames = len(together)
     pieces: list[tuple[int, int]] = []
     edges = [0, *cuts, frames]
     for first, end in pairwise(edges):
-        pieces += [(first + a, first + b) for a, b in check_people.stretches(together[first:end], least)]
+        pieces += [(first + a, first + b) for a, b in check_people.true_runs(together[first:end], least)]
     if not pieces:
         raise DataError(
             f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "

@@ -14,16 +14,15 @@ import roma
 import torch
 
 from magnet.body import Body, load_body
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.preparing import check_people
-from magnet.datamodules.preparing.convert import Order, Part, Tell, convert_all
-from magnet.datamodules.preparing.prepare import absent_note, chosen
+from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all
+from magnet.datamodules.preparing.prepare import absent_note, select_takes
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.recording import DataError, Reader
-from magnet.datamodules.store.reader import SCALE, Folder, StoreError, body_hash, decode, file_hash
-from magnet.datamodules.store.reader import Part as Stored
+from magnet.datamodules.store.reader import SCALE, StoreError, StoreReader, StoreSplit, body_hash, decode, file_hash
 from magnet.export.picture import contact_sheet
 from magnet.motion.scene import Scene
 
@@ -36,7 +35,7 @@ SHOWN, SHOWN_FRAMES = 4, 120
 
 
 @dataclass
-class Checked:
+class CheckReport:
     """What a check found."""
 
     name: str  # of the data set
@@ -81,20 +80,20 @@ def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], pe
 # -- a store -----------------------------------------------------------------------------------
 
 
-def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = None) -> Checked:
+def check_store(folder: StoreReader, body: Body | None = None, progress: Progress | None = None) -> CheckReport:
     """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
 
     Args:
         folder: the opened store.
         body: its body, to check that it is; None: not checked.
-        tell: is told of progress, by file.
+        progress: is told of progress, by file.
     """
     manifest = folder.manifest
-    found = Checked(manifest["name"], manifest["title"])
+    found = CheckReport(manifest["name"], manifest["title"])
     files = folder.files()
     for number, (name, digest) in enumerate(sorted(files.items())):
-        if tell is not None:
-            tell(name, number, 2 * len(files))
+        if progress is not None:
+            progress(name, number, 2 * len(files))
         path = folder.path / name
         if not path.is_file():
             found.problems.append(f"{name} is missing; prepare the store again")
@@ -117,7 +116,7 @@ def check_store(folder: Folder, body: Body | None = None, tell: Tell | None = No
     return found
 
 
-def _check_split(folder: Folder, split: Split, found: Checked) -> None:
+def _check_split(folder: StoreReader, split: Split, found: CheckReport) -> None:
     part, said = folder.split(split), folder.manifest["splits"][split]
     take_of: dict[str, tuple[list[int], list[int]]] = {}
     for c, take in enumerate(part.take):
@@ -145,7 +144,7 @@ def _check_split(folder: Folder, split: Split, found: Checked) -> None:
     found.scenes += _scenes(folder, part, SHOWN - len(found.scenes))
 
 
-def _wrong_rows(part: Stored, clip: int) -> str | None:
+def _wrong_rows(part: StoreSplit, clip: int) -> str | None:
     rows = part.rows(clip)
     length = np.sqrt(np.square(rows["rotations"].astype(np.float32)).sum(axis=-1))
     if np.abs(length - SCALE).max() > UNIT:
@@ -159,12 +158,12 @@ def _wrong_rows(part: Stored, clip: int) -> str | None:
     return None
 
 
-def _wrong_people(part: Stored, clip: int, own: bool) -> list[str]:
+def _wrong_people(part: StoreSplit, clip: int, own: bool) -> list[str]:
     """By person and frame; shape numbers only where they are those of the data set, and not of another body."""
     names, rows = part.persons_of()[clip], part.rows(clip)
     quat, pelvis = (rows[key].swapaxes(0, 1).astype(np.float32) for key in ("rotations", "pelvis"))
     flags = check_people.seen(quat, pelvis, np.ones(pelvis.shape[:2], dtype=bool))
-    said = check_people.words(flags, names, 30.0, met=False)
+    said = check_people.described(flags, names, 30.0, met=False)
     try:
         check_people.check_shapes(part.betas_of(clip) if own else part.betas_of(clip)[:0], names)
     except DataError as error:
@@ -172,7 +171,7 @@ def _wrong_people(part: Stored, clip: int, own: bool) -> list[str]:
     return said
 
 
-def _scenes(folder: Folder, part: Stored, most: int) -> list[tuple[str, Scene]]:
+def _scenes(folder: StoreReader, part: StoreSplit, most: int) -> list[tuple[str, Scene]]:
     """Some clips, evenly spread over those that are long enough."""
     longest = int(part.frames.max()) if len(part.frames) else 0
     good = np.flatnonzero(part.frames >= min(SHOWN_FRAMES, longest))
@@ -202,7 +201,7 @@ def recognise(root: Path) -> str:
     Raises:
         ValueError: none does, or several do, or a table of a user's own recordings is wrong.
     """
-    found = _readable(root, [name for name in catalogue.NAMES if name not in catalogue.OWN])
+    found = _readable(root, [name for name, kind in registry.readers().items() if not kind.own])
     with suppress(OSError):
         found += ["cmu"] if CMU(str(root)).takes() else []
     found = found or _own(root)
@@ -221,44 +220,44 @@ def _readable(root: Path, names: Sequence[str]) -> list[str]:
     found = []
     for name in names:
         with suppress(ValueError, OSError):  # what this one lacks
-            found += [name] if catalogue.find(name).load_reader()(root).found() else []
+            found += [name] if registry.reader(name)(root).found() else []
     return found
 
 
 def _own(root: Path) -> list[str]:
     """Which of a user's own kinds of files there are. What is wrong with a table of them is raised."""
     readers = []
-    for name in catalogue.OWN:
+    for kind in registry.readers().values():
         with suppress(ValueError, OSError):  # no such files
-            readers.append(catalogue.find(name).load_reader()(root))
+            readers += [kind(root)] if kind.own else []
     return [reader.name for reader in readers if reader.found()]
 
 
 def check_download(
-    order: Order,
+    job: PrepareJob,
     workers: int = 1,
     splits: dict[str, Split] | None = None,
     limit: int | None = None,
-    tell: Tell | None = None,
-) -> Checked:
-    """Every take of a download read and put through the common steps; nothing is written.
+    progress: Progress | None = None,
+) -> CheckReport:
+    """Every take of a download read and canonicalized; nothing is written.
 
     Args:
-        order: which data set, where, and how.
+        job: which data set, where, and how.
         workers: processes.
         splits: as for `prepare`.
         limit: as for `prepare`.
-        tell: is told of progress.
+        progress: is told of progress.
 
     Raises:
         DataError: there are no takes at all.
         ValueError: a list of splits that does not fit, or a number out of range.
     """
     at_least(1, workers=workers, limit=limit)
-    reader: Reader = order.reader()
-    body = order.body()
-    found = Checked(reader.name, reader.title)
-    use = chosen(reader, splits, limit)
+    reader: Reader = job.reader()
+    body = job.body()
+    found = CheckReport(reader.name, reader.title)
+    use = select_takes(reader, splits, limit)
     takes = use.takes
     found.notes += reader.summary()
     if use.left_out:
@@ -267,8 +266,8 @@ def check_download(
     if use.absent:
         found.notes.append(absent_note(use.absent))
     notes: dict[str, list[str]] = {}
-    parts: dict[str, Part] = {}
-    for take, part in convert_all(order, takes, lambda take: None, workers, tell):
+    parts: dict[str, ConvertedTake] = {}
+    for take, part in convert_all(job, takes, lambda take: None, workers, progress):
         if part.error is None and len(found.scenes) < SHOWN:
             P, T = part.people[0], part.frames[0]
             found.scenes.append((part.names[0], _scene(part.rows[: P * T].reshape(P, T), part.betas[:P], body.id)))
@@ -286,20 +285,20 @@ def check_download(
     return found
 
 
-def check_cmu(data: CMU) -> Checked:
+def check_cmu(data: CMU) -> CheckReport:
     """Every recording of CMU fitted as for training, into its cache; a second check only reads that.
 
     Raises:
         FileNotFoundError: the folder holds no recordings.
     """
-    found = Checked("cmu", "CMU Graphics Lab Motion Capture Database")
+    found = CheckReport("cmu", "CMU Graphics Lab Motion Capture Database")
     found.skipped = list(data.fit_takes().items())
     for split in SPLITS:
         clips = data.clips(split)
         for clip in clips:
             tally(found.counts, split, [clip.frames], [clip.agents])
             flags = _flags(clip.scene, data.body)
-            found.notes += [f"{clip.name}, {said}" for said in check_people.words(flags, (), 30.0, met=False)]
+            found.notes += [f"{clip.name}, {said}" for said in check_people.described(flags, (), 30.0, met=False)]
         seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
         found.scenes += [(clip.name, clip.scene.slice(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
     found.scenes = found.scenes[:SHOWN]
@@ -329,7 +328,7 @@ def _flags(scene: Scene, body: Body) -> list[check_people.Flag]:
 # -- the picture -------------------------------------------------------------------------------
 
 
-def draw(found: Checked, path: Path, body: Body | None) -> Path | None:
+def draw(found: CheckReport, path: Path, body: Body | None) -> Path | None:
     """A contact sheet of the scenes kept, as skeletons; None when there are none.
 
     Without the store's own body the open one is drawn, in its mean shape.
@@ -346,7 +345,7 @@ def draw(found: Checked, path: Path, body: Body | None) -> Path | None:
     return contact_sheet(scenes, path, context_frames=0, body=body, style="capsules", title=title)
 
 
-def lines(found: Checked) -> Iterator[tuple[str, ...]]:
+def lines(found: CheckReport) -> Iterator[tuple[str, ...]]:
     """Rows of the table of counts: split, takes, clips by people, frames, minutes."""
     for split in SPLITS:
         count = found.counts.get(split, Counter())

@@ -65,8 +65,8 @@ def who(person: int, names: Sequence[str]) -> str:
     return f"person {person} ({names[person]})" if person < len(names) else f"person {person}"
 
 
-def stretches(mask: Bools, least: int = 1) -> list[tuple[int, int]]:
-    """Stretches of True of at least so many frames, as (start, stop). mask: (T,)"""
+def true_runs(mask: Bools, least: int = 1) -> list[tuple[int, int]]:
+    """Runs of True of at least so many frames, as (start, stop). mask: (T,)"""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 
@@ -120,7 +120,7 @@ def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
     for mask, what in _nonsense(recording):
         for person in range(valid.shape[1]):
             bad = mask[:, person] & valid[:, person]
-            found += [Flag(person, a, b, what) for a, b in stretches(bad)]
+            found += [Flag(person, a, b, what) for a, b in true_runs(bad)]
             if bad.any() and not (valid[:, person] & ~bad).any():
                 raise DataError(
                     f"{who(person, recording.persons)}: {what} in all of {len(valid)} frames: nothing was tracked; "
@@ -176,7 +176,7 @@ def frozen(still_place: Bools, still_pose: Bools, valid: Bools) -> list[Flag]:
         moving = np.delete(~(still_place | still_pose) & both, person, axis=1)
         others: Bools = np.logical_or.reduce(moving, axis=1)
         for still, least, what in kinds:
-            for start, stop in stretches(still[:, person] & both[:, person], least - 1):
+            for start, stop in true_runs(still[:, person] & both[:, person], least - 1):
                 known = any(f.person == person and f.start <= start and stop < f.stop for f in found)
                 if not known and others[start:stop].mean() > 0.5:
                     found.append(Flag(person, start, stop + 1, what))
@@ -253,13 +253,13 @@ def without(valid: Bools, flags: Sequence[Flag], names: Sequence[str], fps: floa
     for person in np.flatnonzero(~left.any(axis=0)).tolist():
         mine = [flag for flag in flags if flag.person == person]
         raise DataError(
-            f"{'; '.join(words(mine, names, fps))}: nothing is left; tracking was lost: leave the take out, or take "
-            f"the file as it was published"
+            f"{'; '.join(described(mine, names, fps))}: nothing is left; tracking was lost: "
+            f"leave the take out, or take the file as it was published"
         )
     return left
 
 
-def words(flags: Sequence[Flag], names: Sequence[str], fps: float, met: bool = True, most: int = 5) -> list[str]:
+def described(flags: Sequence[Flag], names: Sequence[str], fps: float, met: bool = True, most: int = 5) -> list[str]:
     """Flags in words; of one kind and person at most so many, and how many more there are."""
     count: dict[tuple[int, bool], int] = {}
     said: list[str] = []

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from magnet.body import Body, load_body
 from magnet.body.family import title, titles
-from magnet.datamodules import catalogue
-from magnet.datamodules.preparing.canonicalize import STEPS_VERSION, Steps, to_clips
+from magnet.datamodules import registry
+from magnet.datamodules.preparing.canonicalize import CANONICALIZE_VERSION, CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check_people import check_shapes
 from magnet.datamodules.preparing.genders import load_bodies, one_body
 from magnet.datamodules.reading.recording import Gender, Reader, Take
@@ -63,15 +63,15 @@ def require_family(kind: type[Reader], body: Body, option: str, file: str) -> No
 
 
 @dataclass(frozen=True)
-class Order:
+class PrepareJob:
     """What is to be prepared, and how; plain values that every process builds its own reader and body from.
 
     Args:
-        name: of the data set in the catalogue.
+        name: of the reader in the registry.
         root: folder of the download.
         options: of the reader's constructor; files and folders among them as `Path`.
         body_file: path of the body file, or "open".
-        steps: what can be chosen about the common steps.
+        canonicalize: what can be chosen about `canonicalize`.
         body_files: folder or files of gendered bodies that shape numbers belong to; none: all belong to `body_file`.
     """
 
@@ -79,12 +79,12 @@ class Order:
     root: str
     options: dict[str, Any]
     body_file: str
-    steps: Steps
+    canonicalize: CanonicalizeOptions
     body_files: tuple[str, ...] = ()
 
     def reader(self) -> Reader:
         """The data set's reader on the download."""
-        return catalogue.find(self.name).load_reader()(self.root, **self.options)
+        return registry.reader(self.name)(self.root, **self.options)
 
     def body(self) -> Body:
         """The body model.
@@ -93,7 +93,7 @@ class Order:
             ValueError: the data set holds shape numbers, but no body file was given, or another family's; says where to
                 get it.
         """
-        kind = catalogue.find(self.name).load_reader()
+        kind = registry.reader(self.name)
         if self.body_file == "open" and kind.family not in ("positions", "any"):
             raise ValueError(
                 f"{kind.title} holds shape numbers of {kind.family.upper()}: give the body's file with --body FILE, "
@@ -110,7 +110,7 @@ class Order:
         Raises:
             ValueError: files that are not there, not to be told apart, or of another family.
         """
-        kind = catalogue.find(self.name).load_reader()
+        kind = registry.reader(self.name)
         bodies = load_bodies(self.body_files, families_of(kind)) if self.body_files else {}
         for gender, body in bodies.items():
             require_family(kind, body, "--bodies", f"the {gender} one")
@@ -118,12 +118,12 @@ class Order:
 
     def settings(self, body: Body) -> dict[str, Any]:
         """Everything besides a take's files that its part depends on."""
-        kind = catalogue.find(self.name).load_reader()
+        kind = registry.reader(self.name)
         return {
             "format": FORMAT,
             "part version": PART_VERSION,
-            "steps version": STEPS_VERSION,
-            "steps": self.steps.__dict__,
+            "steps version": CANONICALIZE_VERSION,
+            "steps": self.canonicalize.__dict__,
             "reader": self.name,
             "reader version": kind.version,
             "options": {key: content(value) for key, value in self.options.items()},
@@ -162,7 +162,7 @@ def take_key(take: Take, root: Path, settings: dict[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Part:
+class ConvertedTake:
     """What one take became."""
 
     error: str | None
@@ -175,9 +175,11 @@ class Part:
     persons: tuple[str, ...] = ()  # names or roles of the people in all its clips; (): none are known
 
     @staticmethod
-    def failed(error: str) -> Part:
+    def failed(error: str) -> ConvertedTake:
         """A take that gives nothing."""
-        return Part(shortened(error), (), (), (), (), np.zeros((0, 10), dtype=np.float32), np.zeros(0, dtype=ROW))
+        return ConvertedTake(
+            shortened(error), (), (), (), (), np.zeros((0, 10), dtype=np.float32), np.zeros(0, dtype=ROW)
+        )
 
     def save(self, path: Path) -> None:
         """All of it or nothing."""
@@ -190,13 +192,13 @@ class Part:
 
         write_whole(path.parent, lambda _: path.name, write)
 
-    def saved(self, path: Path) -> Part:
+    def saved(self, path: Path) -> ConvertedTake:
         """Itself without rows, once it is on disk."""
         self.save(path)
         return replace(self, rows=self.rows[:0])
 
     @staticmethod
-    def load(path: Path, rows: bool = True) -> Part:
+    def load(path: Path, rows: bool = True) -> ConvertedTake:
         """What `save` wrote, with or without its rows.
 
         Raises:
@@ -207,23 +209,25 @@ class Part:
             betas = np.lib.format.read_array(file, allow_pickle=False)
             array = np.lib.format.read_array(file, allow_pickle=False) if rows else np.zeros(0, dtype=ROW)
         lists = {name: tuple(facts[name]) for name in ("notes", "names", "frames", "people", "persons")}
-        return Part(error=facts["error"], betas=betas, rows=array, **lists)
+        return ConvertedTake(error=facts["error"], betas=betas, rows=array, **lists)
 
 
-def convert(reader: Reader, take: Take, body: Body, steps: Steps, bodies: Mapping[Gender, Body] | None = None) -> Part:
-    """Read a take and put it through the common steps; whatever is wrong with it becomes the part's error."""
+def convert(
+    reader: Reader, take: Take, body: Body, options: CanonicalizeOptions, bodies: Mapping[Gender, Body] | None = None
+) -> ConvertedTake:
+    """Read a take and canonicalize it; whatever is wrong with it becomes the part's error."""
     try:
         recording = reader.read(take)
         if recording.betas is not None:
             check_shapes(recording.betas, recording.persons)
         recording = one_body(recording, bodies or {}, body)
-        made = to_clips(recording, body, take.name, reader.name, take.split or "train", reader.family, steps)
+        made = canonicalize(recording, body, take.name, reader.name, take.split or "train", reader.family, options)
     except (ValueError, OSError) as error:
-        return Part.failed(relative(str(error) or type(error).__name__, reader.root))
+        return ConvertedTake.failed(relative(str(error) or type(error).__name__, reader.root))
     except Exception as error:  # a reader that does not know what to say: the others go on
-        return Part.failed(relative(f"{type(error).__name__}: {error}", reader.root))
+        return ConvertedTake.failed(relative(f"{type(error).__name__}: {error}", reader.root))
     clips = made.clips
-    return Part(
+    return ConvertedTake(
         error=None,
         notes=tuple(relative(note, reader.root) for note in made.notes),
         names=tuple(clip.name for clip in clips),
@@ -252,11 +256,11 @@ def relative(text: str, root: Path) -> str:
 _HERE: dict[str, Any] = {}
 
 
-def begin(order: Order) -> None:
+def begin(job: PrepareJob) -> None:
     """Set up a worker process: one thread, its own reader and body; it ends when its parent is gone."""
     torch.set_num_threads(1)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    _HERE.update(order=order, reader=order.reader(), body=order.body(), bodies=order.bodies())
+    _HERE.update(job=job, reader=job.reader(), body=job.body(), bodies=job.bodies())
 
 
 def _follow_parent() -> None:
@@ -266,23 +270,23 @@ def _follow_parent() -> None:
         os._exit(1)
 
 
-def work(take: Take, path: Path | None) -> Part:
+def work(take: Take, path: Path | None) -> ConvertedTake:
     """Make one part in a worker process, on disk if there is a path. Returns it without its rows if so."""
-    part = convert(_HERE["reader"], take, _HERE["body"], _HERE["order"].steps, _HERE["bodies"])
+    part = convert(_HERE["reader"], take, _HERE["body"], _HERE["job"].canonicalize, _HERE["bodies"])
     return part if path is None else part.saved(path)
 
 
-Tell = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many bytes of the download are done, and how many there are."""
 
 
 def convert_all(
-    order: Order,
+    job: PrepareJob,
     takes: list[Take],
     file: Callable[[Take], Path | None],
     workers: int,
-    tell: Tell | None = None,
-) -> Iterator[tuple[Take, Part]]:
+    progress: Progress | None = None,
+) -> Iterator[tuple[Take, ConvertedTake]]:
     """Make the parts of all takes as they are done, each on disk, whole, where `file` says; in any order.
 
     Raises:
@@ -290,28 +294,28 @@ def convert_all(
     """
     size = {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
     total, done = sum(size.values()), 0
-    tell = tell or (lambda name, done, total: None)
+    progress = progress or (lambda name, done, total: None)
     if takes:
-        tell(takes[0].name, 0, total)
-    for take, part in _converted(order, sorted(takes, key=lambda take: -size[take.name]), file, workers):
+        progress(takes[0].name, 0, total)
+    for take, part in _converted(job, sorted(takes, key=lambda take: -size[take.name]), file, workers):
         done += size[take.name]
-        tell(take.name, done, total)
+        progress(take.name, done, total)
         yield take, part
 
 
 def _converted(
-    order: Order, takes: list[Take], file: Callable[[Take], Path | None], workers: int
-) -> Iterator[tuple[Take, Part]]:
+    job: PrepareJob, takes: list[Take], file: Callable[[Take], Path | None], workers: int
+) -> Iterator[tuple[Take, ConvertedTake]]:
     if workers == 1 or len(takes) < 2:
-        reader, body, bodies = order.reader(), order.body(), order.bodies()
+        reader, body, bodies = job.reader(), job.body(), job.bodies()
         for take in takes:
             with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
-                part, path = convert(reader, take, body, order.steps, bodies), file(take)
+                part, path = convert(reader, take, body, job.canonicalize, bodies), file(take)
                 part = part if path is None else part.saved(path)
             yield take, part
         return
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(order,))
+    pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job,))
     try:
         running = {pool.submit(work, take, file(take)): take for take in takes}
         while running:

@@ -12,40 +12,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.datamodules.clip import SPLITS, Split
-from magnet.datamodules.preparing.convert import Part
+from magnet.datamodules.preparing.convert import ConvertedTake
 from magnet.datamodules.reading.recording import Take
 from magnet.datamodules.resample import FPS
-from magnet.datamodules.store.reader import FORMAT, MANIFEST, Folder, as_json, write_whole
+from magnet.datamodules.store.reader import FORMAT, MANIFEST, StoreReader, as_json, write_whole
 from magnet.datamodules.store.rows import ROW
 
 
 @dataclass(frozen=True)
-class Source:
+class PackSource:
     """Where a take's rows are: in its part, or still in the present store."""
 
     take: Take
     file: Path
     place: dict[str, Any] | None  # in the present store
 
-    def head(self, old: Folder | None) -> Part:
+    def head(self, old: StoreReader | None) -> ConvertedTake:
         """All but the rows."""
-        return self._stored(old, False) if self._kept(old) else Part.load(self.file, rows=False)
+        return self._stored(old, False) if self._kept(old) else ConvertedTake.load(self.file, rows=False)
 
-    def whole(self, old: Folder | None) -> Part:
+    def whole(self, old: StoreReader | None) -> ConvertedTake:
         """With its rows."""
-        return self._stored(old, True) if self._kept(old) else Part.load(self.file)
+        return self._stored(old, True) if self._kept(old) else ConvertedTake.load(self.file)
 
-    def _kept(self, old: Folder | None) -> bool:
+    def _kept(self, old: StoreReader | None) -> bool:
         return self.place is not None and old is not None
 
-    def _stored(self, old: Folder | None, rows: bool) -> Part:
+    def _stored(self, old: StoreReader | None, rows: bool) -> ConvertedTake:
         assert self.place is not None and old is not None
         split, first, count = self.place["split"], self.place["first"], self.place["clips"]
         part = old.split(split)
         mine = range(first, first + count)
         end = np.cumsum(part.people)
         low = int(end[first] - part.people[first])
-        return Part(
+        return ConvertedTake(
             error=None,
             notes=tuple(self.place["notes"]),
             names=tuple(part.name[c] for c in mine),
@@ -58,7 +58,7 @@ class Source:
 
 
 def pack(
-    sources: list[Source], old: Folder | None, out: Path, facts: dict[str, Any], shard_rows: int
+    sources: list[PackSource], old: StoreReader | None, out: Path, facts: dict[str, Any], shard_rows: int
 ) -> dict[str, dict[str, Any]] | None:
     """Write the store; the manifest comes last, and until then the old one is whole.
 
@@ -116,9 +116,11 @@ def by_first(pairs: list[tuple[Any, str]]) -> list[tuple[Any, list[str]]]:
     return list(found.items())
 
 
-def groups(mine: list[tuple[Source, Part]], most: int) -> Iterator[tuple[int, list[tuple[Source, Part]]]]:
+def groups(
+    mine: list[tuple[PackSource, ConvertedTake]], most: int
+) -> Iterator[tuple[int, list[tuple[PackSource, ConvertedTake]]]]:
     """Takes in order, as many to a shard as fit; with each shard's number of rows."""
-    held: list[tuple[Source, Part]] = []
+    held: list[tuple[PackSource, ConvertedTake]] = []
     rows = 0
     for source, head in mine:
         count = sum(f * p for f, p in zip(head.frames, head.people, strict=True))
@@ -132,7 +134,7 @@ def groups(mine: list[tuple[Source, Part]], most: int) -> Iterator[tuple[int, li
 
 
 def write_shard(
-    out: Path, split: Split, number: int, rows: int, sources: list[Source], old: Folder | None
+    out: Path, split: Split, number: int, rows: int, sources: list[PackSource], old: StoreReader | None
 ) -> dict[str, Any]:
     """One npy of `rows` rows, streamed take by take. Returns its entry in the manifest."""
 
@@ -157,7 +159,7 @@ def write_npy_or_json(out: Path, name: str, value: Any) -> dict[str, str]:
     return {"file": file, "sha256": digest}
 
 
-def summary(mine: list[tuple[Source, Part]], shards: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(mine: list[tuple[PackSource, ConvertedTake]], shards: list[dict[str, Any]]) -> dict[str, Any]:
     """What the manifest says of a split."""
     clips = [(f, p) for _, head in mine for f, p in zip(head.frames, head.people, strict=True)]
     return {

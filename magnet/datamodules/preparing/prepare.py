@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from magnet.datamodules.clip import SPLITS, Split, at_least
-from magnet.datamodules.preparing.convert import Order, Part, Tell, convert_all, take_key
-from magnet.datamodules.preparing.pack import Source, pack
+from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all, take_key
+from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.reading.recording import DataError, Reader, Take
-from magnet.datamodules.store.reader import MANIFEST, STATE, Folder, StoreError, as_json, file_hash, write_whole
+from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json, file_hash, write_whole
 from magnet.files import writing
 
 SHARD_ROWS = 2**18
@@ -25,35 +25,35 @@ ON_FULL = "choose another --out; then run the same command again, which keeps fi
 
 
 @dataclass(frozen=True)
-class Report:
+class PrepareReport:
     """What a run of `prepare` did."""
 
-    folder: Folder
+    folder: StoreReader
     made: int  # takes converted in this run
     kept: int  # takes that an earlier run had finished
 
 
 def prepare(
-    order: Order,
+    job: PrepareJob,
     out: str | Path,
     *,
     workers: int = 1,
     splits: dict[str, Split] | None = None,
     limit: int | None = None,
     shard_rows: int = SHARD_ROWS,
-    tell: Tell | None = None,
-) -> Report:
+    progress: Progress | None = None,
+) -> PrepareReport:
     """Make or bring up to date the store at `out`.
 
     Args:
-        order: which data set, where, and how.
+        job: which data set, where, and how.
         out: the store's folder; an earlier run's finished takes in it are kept while their files and the options
             are the same.
         workers: processes; 1: this one. The store's bytes do not depend on it.
         splits: split of each take by name, in place of the official rule; takes it does not name are left out.
         limit: at most so many takes of each split, to try things out.
         shard_rows: rows of a shard, one frame of one person each; a take stays in one shard.
-        tell: is told of progress.
+        progress: is told of progress.
 
     Raises:
         DataError: nothing of the data set was found, or no take could be used; says why for each.
@@ -61,8 +61,8 @@ def prepare(
         OSError: another prepare works there, the disk is full, or the folder may not be written to.
     """
     at_least(1, workers=workers, limit=limit, shard_rows=shard_rows)
-    reader, body = order.reader(), order.body()
-    use = chosen(reader, splits, limit)
+    reader, body = job.reader(), job.body()
+    use = select_takes(reader, splits, limit)
     takes = use.takes
     out = Path(out).expanduser()
     opened(out, reader)  # a stranger's folder is refused before anything is made in it
@@ -71,13 +71,13 @@ def prepare(
         state.mkdir(parents=True, exist_ok=True)
     with writing(out, ON_FULL), locked(state):
         old = opened(out, reader)  # again: whoever held the lock before may have made a new store
-        settings = order.settings(body)
+        settings = job.settings(body)
         keys = {take.name: take_key(take, reader.root, settings) for take in takes}
         finished = remembered(state, old)
         todo = [t for t in takes if keys[t.name] not in finished and not _whole(part_file(state, keys[t.name]))]
-        for _ in convert_all(order, todo, lambda take: part_file(state, keys[take.name]), workers, tell):
+        for _ in convert_all(job, todo, lambda take: part_file(state, keys[take.name]), workers, progress):
             pass
-        sources = [Source(take, part_file(state, keys[take.name]), finished.get(keys[take.name])) for take in takes]
+        sources = [PackSource(take, part_file(state, keys[take.name]), finished.get(keys[take.name])) for take in takes]
         facts: dict[str, Any] = {
             "name": reader.name,
             "title": reader.title,
@@ -96,15 +96,15 @@ def prepare(
         if packed is None:
             listed = "".join(f"\n  {s.take.name}: {s.head(None).error}" for s in sources[:20])
             raise DataError(f"{reader.title}: none of {len(takes)} takes could be used:{listed}")
-        folder = Folder(out)
+        folder = StoreReader(out)
         done = {keys[name]: place for name, place in packed.items()}
         remember(state, folder, done)
         clean(folder, state, set(done))
-    return Report(folder, len(todo), len(takes) - len(todo))
+    return PrepareReport(folder, len(todo), len(takes) - len(todo))
 
 
 @dataclass(frozen=True)
-class Chosen:
+class TakeSelection:
     """What is to be prepared of a download, and what is not."""
 
     takes: list[Take]  # each with its split
@@ -112,7 +112,7 @@ class Chosen:
     absent: list[str]  # what the lists name and the download lacks
 
 
-def chosen(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> Chosen:
+def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> TakeSelection:
     """The takes to prepare; official lists are not looked at where `splits` are given.
 
     Raises:
@@ -152,7 +152,7 @@ def chosen(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -
             count[take.split] += 1
     if not used:
         raise DataError(f"{reader.title}: none of {len(takes)} takes belongs to a split")
-    return Chosen(used, left_out, absent)
+    return TakeSelection(used, left_out, absent)
 
 
 def absent_note(names: list[str], most: int = 5) -> str:
@@ -198,7 +198,7 @@ def read_splits(path: str | Path) -> dict[str, Split]:
 # -- what lies in the folder -------------------------------------------------------------------
 
 
-def opened(out: Path, reader: Reader) -> Folder | None:
+def opened(out: Path, reader: Reader) -> StoreReader | None:
     """The store that is there already.
 
     Raises:
@@ -211,7 +211,7 @@ def opened(out: Path, reader: Reader) -> Folder | None:
     if not (out / MANIFEST).exists() and not (out / STATE).is_dir():
         raise ValueError(f"{out} is not empty and holds no store; choose another --out")
     try:
-        folder = Folder(out)
+        folder = StoreReader(out)
     except StoreError:
         return None  # not finished, or of another format: made anew
     if folder.manifest.get("name") != reader.name:
@@ -228,7 +228,7 @@ def _whole(path: Path) -> bool:
     if not path.exists():
         return False
     try:
-        return Part.load(path, rows=False).error is None
+        return ConvertedTake.load(path, rows=False).error is None
     except (OSError, ValueError, KeyError, EOFError):
         return False
 
@@ -246,7 +246,7 @@ def locked(state: Path) -> Iterator[None]:
         yield
 
 
-def remembered(state: Path, old: Folder | None) -> dict[str, Any]:
+def remembered(state: Path, old: StoreReader | None) -> dict[str, Any]:
     """Keys of takes whose rows are in the present store, and which clips they are."""
     path = state / "state.json"
     if old is None or not path.exists():
@@ -265,7 +265,7 @@ def remembered(state: Path, old: Folder | None) -> dict[str, Any]:
     return {} if damaged else found["takes"]
 
 
-def remember(state: Path, folder: Folder, done: dict[str, Any]) -> None:
+def remember(state: Path, folder: StoreReader, done: dict[str, Any]) -> None:
     facts = {"manifest": file_hash(folder.path / MANIFEST), "takes": done}
     write_whole(state, lambda _: "state.json", lambda out: out.write(as_json(facts)))
 
@@ -273,7 +273,7 @@ def remember(state: Path, folder: Folder, done: dict[str, Any]) -> None:
 OURS = re.compile(r"((train|val|test)-\d{5}|clips|betas)-[0-9a-f]{8}\.(npy|json)|\.new-.*")
 
 
-def clean(folder: Folder, state: Path, keys: set[str]) -> None:
+def clean(folder: StoreReader, state: Path, keys: set[str]) -> None:
     """Remove what the new store does not need: an older store's files, and parts, which can be got from it."""
     needed = set(folder.files())
     for path in folder.path.iterdir():

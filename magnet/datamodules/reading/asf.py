@@ -17,7 +17,7 @@ TRANSLATIONS, ROTATIONS = ("tx", "ty", "tz"), ("rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
-class Skeleton:
+class AsfSkeleton:
     """K bones, the root first and every parent before its children."""
 
     names: tuple[str, ...]
@@ -106,7 +106,7 @@ def _order(where: str, word: str) -> str:
     return word.lower()
 
 
-def read_asf(path: str | Path) -> Skeleton:
+def read_asf(path: str | Path) -> AsfSkeleton:
     """A skeleton from an ASF file.
 
     Lengths: `:units length` u says that a number x is x / u inches (checked on CMU's files, where u is 0.45).
@@ -173,7 +173,7 @@ def _bone_line(where: str, key: str, rest: list[str], bone: _Bone) -> None:
             raise ValueError(f"{where}: bone {bone.name!r} moves along its parent, which is not supported")
 
 
-def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) -> Skeleton:
+def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) -> AsfSkeleton:
     """Bones with parents first."""
     order = ["root"]
     for name in order:
@@ -185,7 +185,7 @@ def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) 
     angles = np.array([bone.angles for bone in chosen], dtype=np.float64)
     angles = np.radians(angles) if degrees else angles
     metres = INCH / unit
-    return Skeleton(
+    return AsfSkeleton(
         names=tuple(order),
         parents=tuple(-1 if name == "root" else order.index(bones[name].parent) for name in order),
         offset=np.array([np.multiply(bone.direction, bone.length * metres) for bone in chosen]),

@@ -18,24 +18,24 @@ from numpy.typing import NDArray
 from magnet.datamodules.reading.asf import (
     ROTATIONS,
     TRANSLATIONS,
+    AsfSkeleton,
     Floats,
-    Skeleton,
     euler,
     numbers,
     read_asf,
     said_lines,
 )
 
-__all__ = ["Bools", "Floats", "Recording", "Skeleton", "euler", "read_amc", "read_asf", "together"]
+__all__ = ["AmcRecording", "AsfSkeleton", "Bools", "Floats", "euler", "read_amc", "read_asf", "together"]
 
 Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Recording:
+class AmcRecording:
     """Motion of one skeleton: T frames of K bones."""
 
-    skeleton: Skeleton
+    skeleton: AsfSkeleton
     root: Floats  # (T, 3) metres
     local: Floats  # (T, K, 3, 3) rotation of each bone relative to its parent
     fps: float
@@ -54,13 +54,13 @@ class Recording:
             end[:, k] = start + rotation[:, k] @ self.skeleton.offset[k]
         return rotation, end
 
-    def resampled(self, fps: float) -> Recording:
+    def resampled(self, fps: float) -> AmcRecording:
         """The same motion at exact times t = i / fps: slerp on rotations, straight lines between positions."""
         frames = math.floor((self.frames - 1) / self.fps * fps + 1e-6) + 1
         at = np.arange(frames) * (self.fps / fps)
         return replace(self.at(at), fps=fps)
 
-    def at(self, at: NDArray[np.floating]) -> Recording:
+    def at(self, at: NDArray[np.floating]) -> AmcRecording:
         """The motion at fractional frame numbers, as a recording of the same rate. at: (T,)"""
         low = np.clip(np.floor(at + 1e-9).astype(int), 0, self.frames - 1)
         high = np.minimum(low + 1, self.frames - 1)
@@ -83,7 +83,7 @@ def _slerp(a: Floats, b: Floats, share: Floats) -> Floats:
 # -- motion ------------------------------------------------------------------------------------
 
 
-def read_amc(path: str | Path, skeleton: Skeleton, fps: float) -> Recording:
+def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecording:
     """Motion from an AMC file, which does not say its frame rate.
 
     Raises:
@@ -110,10 +110,10 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float) -> Recording:
     for k, order in enumerate(skeleton.axis_order):
         C = skeleton.axis[k]
         local[:, k] = C @ euler(angles[:, k], order) @ C.T
-    return Recording(skeleton, root, local, float(fps), path)
+    return AmcRecording(skeleton, root, local, float(fps), path)
 
 
-def _fast(path: Path, skeleton: Skeleton) -> Floats | None:
+def _fast(path: Path, skeleton: AsfSkeleton) -> Floats | None:
     """All values (T, D) of a file whose frames all list the skeleton's bones in one order; else None."""
     try:
         words = path.read_text(encoding="latin-1").split()
@@ -151,7 +151,7 @@ def _fast(path: Path, skeleton: Skeleton) -> Floats | None:
     return values if np.isfinite(values).all() else None
 
 
-def _slow(path: Path, skeleton: Skeleton) -> Floats:
+def _slow(path: Path, skeleton: AsfSkeleton) -> Floats:
     """The same line by line: takes bones in any order, and says where a file is wrong."""
     moving = skeleton.moving
     starts, width = {}, 0
@@ -193,7 +193,7 @@ def _slow(path: Path, skeleton: Skeleton) -> Floats:
     return np.array(rows)
 
 
-def together(recordings: Sequence[Recording], trim: bool = False) -> list[Recording]:
+def together(recordings: Sequence[AmcRecording], trim: bool = False) -> list[AmcRecording]:
     """Recordings of people captured together, which must be equally long; `trim` cuts them to the shortest.
 
     Raises:

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from magnet.body import PARENTS, Body
 from magnet.body.fit import Fit, fit_body, floor_height, swing
-from magnet.datamodules.reading.asf_amc import Recording, Skeleton, euler, together
+from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
 from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
@@ -79,7 +79,7 @@ def _about(letter: str, degrees: float) -> Tensor:
     return torch.from_numpy(euler(angles, "xyz"))
 
 
-def alignment(skeleton: Skeleton, rest: Tensor) -> Tensor:
+def alignment(skeleton: AsfSkeleton, rest: Tensor) -> Tensor:
     """Rotation of each joint's part of the body from our rest pose to CMU's. rest (22, 3) -> (22, 3, 3)"""
     aligned = torch.eye(3, dtype=torch.float64).repeat(22, 1, 1)
     rest = rest.double()
@@ -99,7 +99,7 @@ def alignment(skeleton: Skeleton, rest: Tensor) -> Tensor:
     return aligned
 
 
-def hints(recording: Recording, rest: Tensor) -> Tensor:
+def hints(recording: AmcRecording, rest: Tensor) -> Tensor:
     """World rotations of our joints as far as the recording knows them. rest (22, 3) -> (T, 22, 3, 3), NaN elsewhere"""
     names = recording.skeleton.names
     turned, _ = recording.world()
@@ -146,7 +146,7 @@ def _half_roll(hand: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fit_recordings(
-    recordings: Sequence[Recording],
+    recordings: Sequence[AmcRecording],
     body: Body,
     *,
     trim: bool = False,
@@ -244,7 +244,7 @@ def on_floor(scene: Scene, found: Tensor, body: Body) -> tuple[Scene, float]:
     return scene.replace(T_world_root=T_world_root), floor
 
 
-def check_rate(recording: Recording) -> None:
+def check_rate(recording: AmcRecording) -> None:
     """Whether people move like that: the frame rate is not in the file, and a wrong one shows in speeds.
 
     A rate that is wrong by two shows only where somebody jumps or falls, and then gives a warning: 143_35, called

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnet.datamodules.reading.asf_amc import Bools, Floats, Recording
+from magnet.datamodules.reading.asf_amc import AmcRecording, Bools, Floats
 
 JUMP = 0.15
 """Metres between two frames: 9 m/s at 60 fps, which no body joint of the recordings reaches by itself."""
@@ -39,7 +39,7 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _turned(recording: Recording, end: Floats) -> Bools:
+def _turned(recording: AmcRecording, end: Floats) -> Bools:
     """Frames whose pelvis does not go with the trunk. (T,)"""
     names = recording.skeleton.names
     if not {"lhipjoint", "rhipjoint", "lclavicle", "rclavicle", "lowerback"} <= set(names):
@@ -51,7 +51,7 @@ def _turned(recording: Recording, end: Floats) -> Bools:
     return (cosine < np.cos(np.radians(TURNED))) | (bend < np.cos(np.radians(FOLDED)))
 
 
-def repaired(recording: Recording) -> tuple[Recording, Glitches]:
+def repaired(recording: AmcRecording) -> tuple[AmcRecording, Glitches]:
     """The recording with glitches interpolated over, and what they were."""
     _, end = recording.world()
     far = np.linalg.norm(np.diff(end, axis=0), axis=-1) > JUMP
@@ -73,7 +73,7 @@ def repaired(recording: Recording) -> tuple[Recording, Glitches]:
     return (recording, found) if not bad.any() or bad.all() else (_bridged(recording, bad), found)
 
 
-def _bridged(recording: Recording, bad: Bools) -> Recording:
+def _bridged(recording: AmcRecording, bad: Bools) -> AmcRecording:
     root, local = recording.root.copy(), recording.local.copy()
     for a, b in runs(bad):
         before, after = max(a - 1, 0), min(b, recording.frames - 1)

@@ -16,7 +16,7 @@ from magnet.datamodules.reading.recording import GENDERS, Axis, DataError, Gende
 
 
 @dataclass(frozen=True)
-class Person:
+class PersonMotion:
     """One person's file: T frames in radians and metres."""
 
     poses: Doubles  # (T, 22, 3) axis-angle
@@ -85,7 +85,7 @@ def person(
     orient: str = "global_orient",
     body: str = "body_pose",
     transl: str = "transl",
-) -> Person:
+) -> PersonMotion:
     """One person from a dict with keys of SMPL-X's family: root and 21 body joints in axis-angle, metres.
 
     Args:
@@ -105,11 +105,11 @@ def person(
     frames = one_length(where, {key: len(part) for key, part in parts.items()})
     poses = np.concatenate([parts[orient], parts[body]], axis=1).reshape(frames, 22, 3)
     shape, notes = shape_numbers(where, held)
-    return Person(poses, parts[transl], shape, name, notes, gender_of(gender))
+    return PersonMotion(poses, parts[transl], shape, name, notes, gender_of(gender))
 
 
 def side_by_side(
-    where: object, people: Sequence[Person], fps: float, up: Axis, *, cut: bool = False, notes: Iterable[str] = ()
+    where: object, people: Sequence[PersonMotion], fps: float, up: Axis, *, cut: bool = False, notes: Iterable[str] = ()
 ) -> Recording:
     """People who were recorded together as one recording.
 

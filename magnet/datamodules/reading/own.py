@@ -13,7 +13,7 @@ from typing import ClassVar, Generic, Literal, Protocol, Self, TypeVar
 from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.reading.arrays import hashed_split
 from magnet.datamodules.reading.fields import listing
-from magnet.datamodules.reading.own_files import TABLE, Group, Seat, by_names, by_pattern, by_table, files_of
+from magnet.datamodules.reading.own_files import TABLE, PersonFile, SceneFiles, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.resample import FPS
 
@@ -28,7 +28,7 @@ SHOWN = 6
 HOW = "name files NAME_A and NAME_B, or give --reader.pattern '{scene}/{person}' or a table (docs/own.md)"
 
 
-class Track(Protocol):
+class PersonTrack(Protocol):
     """One person's motion out of a file, at the file's rate."""
 
     @property
@@ -46,7 +46,7 @@ class Track(Protocol):
         ...
 
 
-T = TypeVar("T", bound=Track)
+T = TypeVar("T", bound=PersonTrack)
 
 
 class OwnReader(Reader, Generic[T]):
@@ -68,6 +68,7 @@ class OwnReader(Reader, Generic[T]):
 
     source: ClassVar[str] = "your own recordings"
     licence: ClassVar[str] = "yours to know"
+    own: ClassVar[bool] = True
     suffixes: ClassVar[tuple[str, ...]]
     one_person_a_file: ClassVar[bool] = True
 
@@ -99,11 +100,11 @@ class OwnReader(Reader, Generic[T]):
         return files_of(self.root, self.suffixes)
 
     @cached_property
-    def _grouped(self) -> tuple[dict[str, Group], list[Path]]:
+    def _grouped(self) -> tuple[dict[str, SceneFiles], list[Path]]:
         """Scenes by name, and files that belong to none."""
         if self.table is not None:
             groups, left = by_table(self.root, self.table, self.suffixes), []
-            used = {seat.file for group in groups for seat in group.seats}
+            used = {person_file.file for group in groups for person_file in group.people}
             left = [path for path in self._files if path not in used]
         elif self.pattern is not None:
             groups, left = by_pattern(self.root, self._files, self.pattern)
@@ -117,11 +118,11 @@ class OwnReader(Reader, Generic[T]):
         return {group.scene: group for group in groups}, left
 
     @property
-    def groups(self) -> dict[str, Group]:
+    def groups(self) -> dict[str, SceneFiles]:
         """Every scene by name, told by files' names alone."""
         return self._grouped[0]
 
-    def scenes(self) -> dict[str, Group]:
+    def scenes(self) -> dict[str, SceneFiles]:
         """Those that are recordings; a look into the files may leave some out."""
         return self.groups
 
@@ -133,7 +134,7 @@ class OwnReader(Reader, Generic[T]):
     def found(self) -> list[Take]:
         also = () if self.table is None else (self.table,)
         return [
-            Take(scene, tuple(seat.file for seat in group.seats), None, scene, also)
+            Take(scene, tuple(person_file.file for person_file in group.people), None, scene, also)
             for scene, group in self.scenes().items()
         ]
 
@@ -164,7 +165,7 @@ class OwnReader(Reader, Generic[T]):
     def summary(self) -> list[str]:
         """What the folder holds, by names alone."""
         groups, left = self.scenes(), self._grouped[1]
-        sizes = Counter(len(group.seats) for group in groups.values())
+        sizes = Counter(len(group.people) for group in groups.values())
         said = []
         for size, count in sorted(sizes.items(), reverse=True):
             scenes, files = "scene" + "s" * (count > 1), "file" + "s" * (size > 1)
@@ -183,11 +184,11 @@ class OwnReader(Reader, Generic[T]):
     # -- reading ---------------------------------------------------------------------------------
 
     @abstractmethod
-    def open(self, seat: Seat, alone: bool) -> tuple[list[T], list[str]]:
+    def open(self, person_file: PersonFile, alone: bool) -> tuple[list[T], list[str]]:
         """The people in a file, and what should be known of it.
 
         Args:
-            seat: whose file.
+            person_file: whose file.
             alone: it is the only one of its scene, and may hold several people.
 
         Raises:
@@ -205,12 +206,12 @@ class OwnReader(Reader, Generic[T]):
         names: list[str] = []
         starts: list[float] = []
         notes: list[str] = []
-        for seat in group.seats:
-            held, said = self.open(seat, len(group.seats) == 1)
+        for person_file in group.people:
+            held, said = self.open(person_file, len(group.people) == 1)
             notes += said
             tracks += held
-            starts += [seat.start] * len(held)
-            names += [seat.person] if len(held) == 1 else [f"person {p + 1}" for p in range(len(held))]
+            starts += [person_file.start] * len(held)
+            names += [person_file.person] if len(held) == 1 else [f"person {p + 1}" for p in range(len(held))]
         if group.alone:
             notes.append("named like one of several people, but no other file goes with it")
         tracks = self._one_rate(tracks, group, notes)
@@ -223,7 +224,7 @@ class OwnReader(Reader, Generic[T]):
         tracks = [track.slice(start, stop) for track in tracks]
         return self.recording(group.scene, tracks, names, notes)
 
-    def _meant(self, take: Take) -> tuple[Group, Split | None]:
+    def _meant(self, take: Take) -> tuple[SceneFiles, Split | None]:
         if take.name in self.groups:
             return self.groups[take.name], None
         for split in SPLITS:
@@ -233,12 +234,12 @@ class OwnReader(Reader, Generic[T]):
         missing = next((path for path in take.files if not path.is_file()), self.root)
         raise DataError(f"{missing}: no such file; {take.name} was made of it")
 
-    def _one_rate(self, tracks: list[T], group: Group, notes: list[str]) -> list[T]:
+    def _one_rate(self, tracks: list[T], group: SceneFiles, notes: list[str]) -> list[T]:
         rates = sorted({track.fps for track in tracks})
         if not all(SLOWEST <= rate <= FASTEST for rate in rates):
             said = ", ".join(f"{rate:g}" for rate in rates)
             raise DataError(
-                f"{group.seats[0].file}: {said} frames a second, expected {SLOWEST:g} to {FASTEST:g}; mend that number"
+                f"{group.people[0].file}: {said} frames a second, expected {SLOWEST:g} to {FASTEST:g}; mend that number"
             )
         if len(rates) == 1:
             return tracks
@@ -259,7 +260,7 @@ def span(part: Split, frames: int, fps: float) -> tuple[int, int]:
     return {"train": (0, val), "val": (val, test), "test": (test, frames)}[part]
 
 
-def _from_latest(tracks: list[T], starts: list[float], group: Group) -> list[T]:
+def _from_latest(tracks: list[T], starts: list[float], group: SceneFiles) -> list[T]:
     """Cut so that all begin when the last of them does, to the nearest frame."""
     latest = max(starts)
     cut = []
@@ -268,7 +269,7 @@ def _from_latest(tracks: list[T], starts: list[float], group: Group) -> list[T]:
         if skipped >= track.frames:
             ends = start + track.frames / track.fps
             raise DataError(
-                f"{group.seats[0].file}: people of {group.scene} never overlap: one begins at {latest:g} s, another "
+                f"{group.people[0].file}: people of {group.scene} never overlap: one begins at {latest:g} s, another "
                 f"ends at {ends:g} s; mend the starts in the table"
             )
         cut.append(track.slice(skipped, track.frames))
@@ -280,12 +281,12 @@ def _place(name: str, split: str) -> str:
     return hashlib.sha256(f"{split}: {name}".encode(errors="replace")).hexdigest()
 
 
-def _some(groups: Mapping[str, Group], size: int) -> str:
-    def shown(group: Group) -> str:
-        people = ", ".join(seat.person or seat.file.name for seat in group.seats)
+def _some(groups: Mapping[str, SceneFiles], size: int) -> str:
+    def shown(group: SceneFiles) -> str:
+        people = ", ".join(person_file.person or person_file.file.name for person_file in group.people)
         return f"{group.scene} ({people})" if size > 1 else group.scene
 
-    return _listed([shown(group) for group in groups.values() if len(group.seats) == size])
+    return _listed([shown(group) for group in groups.values() if len(group.people) == size])
 
 
 def _listed(names: Sequence[str]) -> str:

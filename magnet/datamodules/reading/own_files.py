@@ -31,7 +31,7 @@ HERE = "scene"
 
 
 @dataclass(frozen=True)
-class Seat:
+class PersonFile:
     """One person's file.
 
     Args:
@@ -46,17 +46,17 @@ class Seat:
 
 
 @dataclass(frozen=True)
-class Group:
+class SceneFiles:
     """A scene and its people's files.
 
     Args:
         scene: its name.
-        seats: one a file, in the order of people.
+        people: one a file, in the order of people.
         alone: its one file is named like one of several people's, and there is no other.
     """
 
     scene: str
-    seats: tuple[Seat, ...]
+    people: tuple[PersonFile, ...]
     alone: bool = False
 
 
@@ -75,26 +75,26 @@ def files_of(root: Path, suffixes: Sequence[str]) -> list[Path]:
 # -- by names ----------------------------------------------------------------------------------
 
 
-def by_names(root: Path, files: Iterable[Path]) -> list[Group]:
+def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
     """Files whose names differ in the last word alone, such as dance_A and dance_B; in a folder, A and B alone.
 
     Everybody else is alone in a scene.
     """
     told = [_told(root, path) for path in files]
     members = Counter(scene for scene, person, _ in told if person)
-    together: dict[str, list[Seat]] = {}
+    together: dict[str, list[PersonFile]] = {}
     alone: set[str] = set()
     for scene, person, path in told:
         whole = _label(root, path)
         if person and members[scene] > 1:
-            together.setdefault(scene, []).append(Seat(person, path))
+            together.setdefault(scene, []).append(PersonFile(person, path))
             continue
         while (whole in members and members[whole] > 1) or whole in together:
             whole += path.suffix
-        together[whole] = [Seat("", path)]
+        together[whole] = [PersonFile("", path)]
         if person:
             alone.add(whole)
-    return [Group(scene, tuple(seats), scene in alone) for scene, seats in together.items()]
+    return [SceneFiles(scene, tuple(people), scene in alone) for scene, people in together.items()]
 
 
 def _label(root: Path, path: Path) -> str:
@@ -115,7 +115,7 @@ def _told(root: Path, path: Path) -> tuple[str, str, Path]:
 # -- by a pattern ------------------------------------------------------------------------------
 
 
-def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Group], list[Path]]:
+def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[SceneFiles], list[Path]]:
     """Groups by a pattern of the path under `root` without its suffix, such as {scene}/{person} or {person}-{scene}.
 
     A `*` stands for anything but a slash. Also returns the files that do not fit.
@@ -130,27 +130,27 @@ def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Gr
     words = {"{scene}": "(?P<scene>.+)", "{person}": "(?P<person>[^/]+?)", "*": "[^/]*"}
     parts = re.split(r"(\{scene\}|\{person\}|\*)", pattern)
     form = re.compile("".join(words.get(part, re.escape(part)) for part in parts))
-    together: dict[str, list[Seat]] = {}
+    together: dict[str, list[PersonFile]] = {}
     strangers = []
     for path in files:
         if match := form.fullmatch(_label(root, path)):
-            together.setdefault(match["scene"], []).append(Seat(match["person"], path))
+            together.setdefault(match["scene"], []).append(PersonFile(match["person"], path))
         else:
             strangers.append(path)
-    return [Group(scene, tuple(seats)) for scene, seats in together.items()], strangers
+    return [SceneFiles(scene, tuple(people)) for scene, people in together.items()], strangers
 
 
 # -- by a table --------------------------------------------------------------------------------
 
 
-def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[Group]:
+def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[SceneFiles]:
     """Groups by a CSV with a head: scene and file (under `root`), and, where they are wanted, person, role and start.
 
     Raises:
         DataError: a column is missing or unknown, a file is not there, lies elsewhere, is of another kind or is named
             twice, or a start is no number of seconds; names the line.
     """
-    together: dict[str, list[Seat]] = {}
+    together: dict[str, list[PersonFile]] = {}
     used: dict[Path, int] = {}
     for number, row in _rows(table):
         where = f"{table}, line {number}"
@@ -159,10 +159,10 @@ def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[Group]:
             raise DataError(f"{where}: {row['file']} is named in line {used[file]} already; one row a file")
         used[file] = number
         person = " ".join(filter(None, (row.get("person", ""), row.get("role", ""))))
-        together.setdefault(row["scene"], []).append(Seat(person, file, _seconds(where, row.get("start", ""))))
+        together.setdefault(row["scene"], []).append(PersonFile(person, file, _seconds(where, row.get("start", ""))))
     if not together:
         raise DataError(f"{table}: lists no file; expected a row a file with {', '.join(COLUMNS)}")
-    return [Group(scene, tuple(seats)) for scene, seats in together.items()]
+    return [SceneFiles(scene, tuple(people)) for scene, people in together.items()]
 
 
 def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:

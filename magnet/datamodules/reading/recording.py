@@ -1,7 +1,8 @@
-"""What a data set's reader gives: takes as its files hold them, before the common steps."""
+"""What a data set's reader gives: takes as its files hold them, before `canonicalize`."""
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -47,7 +48,7 @@ class Take:
     also: tuple[Path, ...] = ()
 
 
-class Rig(Protocol):
+class PosedSkeleton(Protocol):
     """One person's skeleton, which knows how it is brought onto a body."""
 
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
@@ -71,7 +72,7 @@ class Recording:
     """
 
     fps: float
-    up: Axis  # as the data set declares it; the common steps check it against the motion
+    up: Axis  # as the data set declares it; `canonicalize` checks it against the motion
     poses: Floats | None = None  # (T, P, 22, 3) axis-angle, pelvis first
     transl: Floats | None = None  # (T, P, 3) SMPL's transl, not the pelvis
     betas: Floats | None = None  # (P, 10)
@@ -84,7 +85,9 @@ class Recording:
     persons: tuple[str, ...] = ()  # names or roles, such as "leader", which a store keeps
     notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt
     genders: tuple[Gender, ...] = ()  # (P,) of the body that each one's `betas` belong to; (): not known
-    rigs: tuple[Rig, ...] = ()  # (P,) skeletons with rotations, which say more of a body than `positions`
+    skeletons: tuple[
+        PosedSkeleton, ...
+    ] = ()  # (P,) skeletons with rotations, which say more of a body than `positions`
     said_fps: float | None = None  # of the files, where `fps` is another because motion was resampled on the way
 
     def __post_init__(self) -> None:
@@ -103,7 +106,7 @@ class Recording:
         for name, want in expected.items():
             if (got := np.shape(getattr(self, name))) != want:
                 raise DataError(f"{name}: got {got}, expected {want} for {T} frames of {P} people")
-        for name, words in {"persons": self.persons, "genders": self.genders, "rigs": self.rigs}.items():
+        for name, words in {"persons": self.persons, "genders": self.genders, "skeletons": self.skeletons}.items():
             if words and len(words) != P:
                 raise DataError(
                     f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} people"
@@ -140,12 +143,26 @@ class Reader(ABC):
     family: ClassVar[Family] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = ()  # what must lie where in `root`: pattern, what it is
     shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
+    fake: ClassVar[str] = ""  # "module:function(out, takes, frames, seed)" that writes a made-up download
+    own: ClassVar[bool] = False  # recordings of a user's own, which any folder of such files may be
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
         if not self.root.is_dir():
             raise DataError(f"{self.title}: {self.root} is not a folder; ask for the data at {self.source}")
+
+    @classmethod
+    def write_fake(cls, out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
+        """Write a made-up download of so many takes and frames at 30 fps into a folder.
+
+        Raises:
+            ValueError: the data set brings no fake.
+        """
+        module, _, name = cls.fake.partition(":")
+        if not name:
+            raise ValueError(f"{cls.title} brings no made-up download; ask for the data at {cls.source}")
+        getattr(importlib.import_module(module), name)(out, takes, frames, seed)
 
     @abstractmethod
     def found(self) -> list[Take]:

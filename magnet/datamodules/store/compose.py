@@ -8,7 +8,9 @@ from torch import Tensor
 from magnet.motion.frames import from_planar, turn
 
 
-def place_apart(T_world_root: Tensor, present: Tensor, second: Tensor, placing: Tensor, clearance: float) -> Tensor:
+def place_apart(
+    T_world_root: Tensor, present: Tensor, second: Tensor, relative_pose: Tensor, clearance: float
+) -> Tensor:
     """Turn each scene's second group about its own centre and put it beside the first.
 
     A group's centre is the mean of its pelvises over people and frames. Where pelvises of the two groups
@@ -19,14 +21,14 @@ def place_apart(T_world_root: Tensor, present: Tensor, second: Tensor, placing: 
         T_world_root: (B, T, P, 4, 4) pelvis poses; each group in its own recording's world.
         present: (B, P) bool.
         second: (B, P) bool, True for people of the second group.
-        placing: (B, 3) radians that the second group turns; direction in radians, 0 along +z, of its centre as
+        relative_pose: (B, 3) radians that the second group turns; direction in radians, 0 along +z, of its centre as
             seen from the first group's; least metres between the centres.
         clearance: metres between pelvises of different groups, at every frame.
 
     Returns:
         (B, T, P, 4, 4) in the first group's world.
     """
-    yaw, direction, distance = placing.unbind(-1)
+    yaw, direction, distance = relative_pose.unbind(-1)
     ground = T_world_root[..., [0, 2], 3]
     ours, theirs = present & ~second, present & second
 

@@ -14,35 +14,35 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
-from magnet.datamodules.store.memory import Draw
+from magnet.datamodules.store.window_index import WindowIndex
 from magnet.motion.scene import Scene
 
-Gather = Callable[[Draw], Scene]
-Place = tuple[int, int]
+Gather = Callable[[WindowIndex], Scene]
+Cursor = tuple[int, int]
 """Epoch, and batch in it."""
 
 
-class Ahead:
+class Prefetcher:
     """Batches that threads begin before they are asked for. What is asked for decides; what was begun in vain is lost.
 
     Args:
-        make: a place's batch; depends on the place alone, and may be called by several threads at once.
-        after: the place that follows.
+        make: a cursor's batch; depends on the cursor alone, and may be called by several threads at once.
+        after: the cursor that follows.
         depth: batches begun while the last one given is used, each in a thread of its own.
     """
 
-    def __init__(self, make: Callable[[Place], Any], after: Callable[[Place], Place], depth: int) -> None:
+    def __init__(self, make: Callable[[Cursor], Any], after: Callable[[Cursor], Cursor], depth: int) -> None:
         self.make, self.after, self.depth = make, after, depth
-        self.begun: deque[tuple[Place, Future[Any]]] = deque()
+        self.begun: deque[tuple[Cursor, Future[Any]]] = deque()
         self.threads: ThreadPoolExecutor | None = None
 
-    def get(self, place: Place) -> Any:
-        """The batch of a place. Whatever went wrong when it was made is raised here."""
-        if self.begun and self.begun[0][0] != place:  # a state was loaded
+    def get(self, cursor: Cursor) -> Any:
+        """The batch of a cursor. Whatever went wrong when it was made is raised here."""
+        if self.begun and self.begun[0][0] != cursor:  # a state was loaded
             self._forget()
-        self._begin(place, 1)
+        self._begin(cursor, 1)
         _, future = self.begun.popleft()
-        self._begin(self.after(place), self.depth)
+        self._begin(self.after(cursor), self.depth)
         try:
             return future.result()
         except BaseException:
@@ -61,12 +61,12 @@ class Ahead:
             future.cancel()
         self.begun.clear()
 
-    def _begin(self, place: Place, count: int) -> None:
+    def _begin(self, cursor: Cursor, count: int) -> None:
         """Have so many batches under way."""
         self.threads = self.threads or ThreadPoolExecutor(self.depth, thread_name_prefix="read-ahead")
         while len(self.begun) < count:
-            place = self.after(self.begun[-1][0]) if self.begun else place
-            self.begun.append((place, self.threads.submit(self.make, place)))
+            cursor = self.after(self.begun[-1][0]) if self.begun else cursor
+            self.begun.append((cursor, self.threads.submit(self.make, cursor)))
 
 
 class TrainLoader:
@@ -91,19 +91,19 @@ class TrainLoader:
 
     def __init__(
         self,
-        draw: Callable[[int, int, int], Draw],
+        draw: Callable[[int, int, int], WindowIndex],
         gather: Callable[[Any], Scene],
         batch_size: int,
         epoch_size: int,
         rank: int = 0,
         world: int = 1,
         shared: bool = False,
-        fetch: Callable[[Draw], Any] | None = None,
+        fetch: Callable[[WindowIndex], Any] | None = None,
         ahead: int = 0,
     ) -> None:
         self.draw, self.gather, self.shared = draw, gather, shared
-        self.fetch = fetch or (lambda draw: draw)
-        self.ahead = Ahead(self._fetched, self._after, ahead) if ahead else None
+        self.fetch = fetch or (lambda windows: windows)
+        self.ahead = Prefetcher(self._fetched, self._after, ahead) if ahead else None
         self.batch_size, self.rank, self.world = batch_size, rank, world
         self.batches = max(1, epoch_size // (batch_size * world))
         self.epoch, self.batch = 0, 0
@@ -112,22 +112,22 @@ class TrainLoader:
         return self.batches
 
     def __iter__(self) -> Iterator[Scene]:
-        # Lightning makes the iterator before it restores anything: read the place only when asked for a batch.
+        # Lightning makes the iterator before it restores anything: read the cursor only when asked for a batch.
         while True:
-            place = (self.epoch, self.batch)
-            batch = self.gather(self.ahead.get(place) if self.ahead else self._fetched(place))
-            self.epoch, self.batch = self._after(place)
+            cursor = (self.epoch, self.batch)
+            batch = self.gather(self.ahead.get(cursor) if self.ahead else self._fetched(cursor))
+            self.epoch, self.batch = self._after(cursor)
             yield batch
-            if self._after(place)[1] == 0:
+            if self._after(cursor)[1] == 0:
                 return
 
-    def _fetched(self, place: Place) -> Any:
-        epoch, batch = place
+    def _fetched(self, cursor: Cursor) -> Any:
+        epoch, batch = cursor
         block = batch if self.shared else batch * self.world + self.rank
         return self.fetch(self.draw(epoch, block * self.batch_size, self.batch_size))
 
-    def _after(self, place: Place) -> Place:
-        epoch, batch = place
+    def _after(self, cursor: Cursor) -> Cursor:
+        epoch, batch = cursor
         return (epoch, batch + 1) if batch + 1 < self.batches else (epoch + 1, 0)
 
     def close(self) -> None:
@@ -153,7 +153,7 @@ class FixedLoader:
     step (DDP does, where there are buffers) would otherwise wait for ever.
 
     Args:
-        draw: all windows.
+        windows: all windows.
         gather: windows drawn to the batch.
         batch_size: scenes a batch and process at most; one more where shards of odd sizes need it.
         rank: of this process.
@@ -163,11 +163,11 @@ class FixedLoader:
         ValueError: fewer windows than processes.
     """
 
-    def __init__(self, draw: Draw, gather: Gather, batch_size: int, rank: int = 0, world: int = 1) -> None:
-        if len(draw) < world:
-            raise ValueError(f"{len(draw)} windows for {world} processes; use at most {len(draw)} devices")
-        self.mine, self.gather = draw[slice(rank, None, world)], gather
-        smallest, largest = len(draw) // world, -(-len(draw) // world)
+    def __init__(self, windows: WindowIndex, gather: Gather, batch_size: int, rank: int = 0, world: int = 1) -> None:
+        if len(windows) < world:
+            raise ValueError(f"{len(windows)} windows for {world} processes; use at most {len(windows)} devices")
+        self.mine, self.gather = windows[slice(rank, None, world)], gather
+        smallest, largest = len(windows) // world, -(-len(windows) // world)
         self.batches = min(smallest, -(-largest // batch_size))
 
     def __len__(self) -> int:

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from magnet.body import MIRROR
 from magnet.datamodules.clip import Clip, Ints, Split
-from magnet.datamodules.store.memory import Draw, Store
-from magnet.datamodules.store.reader import Folder, Part
+from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.reader import StoreReader, StoreSplit
 from magnet.datamodules.store.rows import ROW, SCALE, encode, matrices
+from magnet.datamodules.store.window_index import WindowIndex
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -31,10 +32,10 @@ OTHER_SIDE = [joint - 1 for joint in MIRROR[1:]]
 
 
 @dataclass(frozen=True)
-class Piece:
+class SplitData:
     """Clips of one split as rows, and what is known of them besides."""
 
-    part: Part
+    part: StoreSplit
     sources: list[str]
     fps: float
     body: str
@@ -42,17 +43,17 @@ class Piece:
     bad: Mapping[int, NDArray[np.bool_]]  # clips with invalid frames: which are valid (T,)
 
     @staticmethod
-    def stored(folder: Folder, split: Split, roles: Sequence[str] = ()) -> Piece:
+    def stored(folder: StoreReader, split: Split, roles: Sequence[str] = ()) -> SplitData:
         """Of a prepared store, people in the order of `roles`; may be empty."""
         part = folder.split(split)
         sources = [folder.manifest["name"]] * len(part.name)
-        return Piece(part, sources, folder.fps, folder.body, part.seats(roles), {})
+        return SplitData(part, sources, folder.fps, folder.body, part.seats(roles), {})
 
     @staticmethod
-    def encoded(clips: Sequence[Clip]) -> Piece:
+    def encoded(clips: Sequence[Clip]) -> SplitData:
         """Of clips in memory, as a store would hold them; at least one."""
         rows = [encode(clip.scene) for clip in clips]
-        part = Part(
+        part = StoreSplit(
             name=[clip.name for clip in clips],
             take=[clip.name for clip in clips],
             frames=np.array([clip.frames for clip in clips], dtype=np.int64),
@@ -64,10 +65,10 @@ class Piece:
         )
         goods = {c: good for c, clip in enumerate(clips) if not (good := clip.good()).all()}
         first = clips[0].scene
-        return Piece(part, [clip.source for clip in clips], first.fps, first.body, part.seats(()), goods)
+        return SplitData(part, [clip.source for clip in clips], first.fps, first.body, part.seats(()), goods)
 
     @staticmethod
-    def joined(pieces: Sequence[Piece]) -> Piece:
+    def concatenate(pieces: Sequence[SplitData]) -> SplitData:
         """One after the other.
 
         Raises:
@@ -84,16 +85,16 @@ class Piece:
                 )
             bad |= {clips + c: good for c, good in piece.bad.items()}
             clips += len(piece.sources)
-        part = Part.joined([piece.part for piece in pieces])
+        part = StoreSplit.concatenate([piece.part for piece in pieces])
         seats = np.concatenate([np.pad(piece.seats, ((0, 0), (0, most - piece.seats.shape[1]))) for piece in pieces])
-        return Piece(part, [s for piece in pieces for s in piece.sources], first.fps, first.body, seats, bad)
+        return SplitData(part, [s for piece in pieces for s in piece.sources], first.fps, first.body, seats, bad)
 
 
 @dataclass(frozen=True)
-class Rows:
+class RawBatch:
     """A batch as it lies on disk: what one process reads ahead, and another device decodes."""
 
-    draw: Draw
+    windows: WindowIndex
     raw: Tensor  # (B, T, P, bytes of a row) uint8
     betas: Tensor  # (B, P, 10)
     present: Tensor  # (B, P) bool
@@ -101,8 +102,8 @@ class Rows:
     names: tuple[str, ...]
 
 
-class MappedStore(Store):
-    """Like `Store`, with rows read through memory maps and decoded on `device`.
+class MappedStore(MemoryStore):
+    """Like `MemoryStore`, with rows read through memory maps and decoded on `device`.
 
     Only the index is held in memory: some hundred bytes a clip. Rows travel to the device as they lie on disk.
 
@@ -116,7 +117,7 @@ class MappedStore(Store):
         StoreError: a file is missing or damaged.
     """
 
-    def __init__(self, piece: Piece, max_agents: int, spread: bool = True) -> None:
+    def __init__(self, piece: SplitData, max_agents: int, spread: bool = True) -> None:
         self.part = part = piece.part
         self.seats, self.bad = piece.seats, piece.bad
         self._index(
@@ -162,29 +163,29 @@ class MappedStore(Store):
 
     # -- from disk -----------------------------------------------------------------------------
 
-    def fetch(self, draw: Draw, frames: int, clearance: float = 0.0) -> Rows | Scene:
+    def fetch(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> RawBatch | Scene:
         """All that a CPU has to do for a batch: rows in pinned memory for a GPU; without one, the batch itself."""
-        rows = self.read(draw, frames)
+        rows = self.read(windows, frames)
         return self.decoded(rows, clearance) if self.device.type == "cpu" else rows
 
-    def finish(self, fetched: Rows | Scene, clearance: float = 0.0) -> Scene:
+    def finish(self, fetched: RawBatch | Scene, clearance: float = 0.0) -> Scene:
         """What `fetch` gave, as a batch on `device`."""
         return fetched if isinstance(fetched, Scene) else self.decoded(fetched, clearance)
 
-    def gather(self, draw: Draw, frames: int, clearance: float = 0.0) -> Scene:
+    def gather(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Scene:
         """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
 
         Beyond a clip's end its last frame is repeated with `valid` False.
         """
-        return self.finish(self.fetch(draw, frames, clearance), clearance)
+        return self.finish(self.fetch(windows, frames, clearance), clearance)
 
-    def read(self, draw: Draw, frames: int) -> Rows:
+    def read(self, windows: WindowIndex, frames: int) -> RawBatch:
         """Copy the windows drawn out of the maps; computes nothing."""
-        B, P = draw.members.shape
-        present = draw.members >= 0
-        clip = np.take_along_axis(np.maximum(draw.clips, 0), draw.groups, 1)  # (B, P)
-        start = np.take_along_axis(draw.starts, draw.groups, 1)
-        member = self.seats[clip, np.maximum(draw.members, 0)]
+        B, P = windows.members.shape
+        present = windows.members >= 0
+        clip = np.take_along_axis(np.maximum(windows.clips, 0), windows.groups, 1)  # (B, P)
+        start = np.take_along_axis(windows.starts, windows.groups, 1)
+        member = self.seats[clip, np.maximum(windows.members, 0)]
         row = self.part.first[clip] + member * self.length[clip] + start
         count = np.minimum(frames, self.length[clip] - start)
         shard = np.searchsorted(self.part.ends, row, side="right")
@@ -195,21 +196,21 @@ class MappedStore(Store):
         if not present.all():
             out.transpose(0, 2, 1)[~present] = NOBODY
         scenes, slots = present.nonzero()
-        windows = zip(scenes.tolist(), slots.tolist(), *(x[present].tolist() for x in (shard, row, count)), strict=True)
-        for b, p, number, first, n in windows:
+        copies = zip(scenes.tolist(), slots.tolist(), *(x[present].tolist() for x in (shard, row, count)), strict=True)
+        for b, p, number, first, n in copies:
             out[b, :n, p] = self._shard(number)[first : first + n]
             if n < frames:
                 out[b, n:, p] = out[b, n - 1, p]
 
         person = self.part.last_person[clip] - self.part.people[clip] + member
         betas = np.where(present[..., None], self.part.betas[person], np.float32(0))
-        return Rows(
-            draw=draw,
+        return RawBatch(
+            windows=windows,
             raw=raw,
             betas=torch.from_numpy(betas),
             present=torch.from_numpy(present),
-            valid=torch.from_numpy(self._valid(draw, frames)),
-            names=self.labels(draw, frames),
+            valid=torch.from_numpy(self._valid(windows, frames)),
+            names=self.labels(windows, frames),
         )
 
     def _shard(self, number: int) -> NDArray[np.void]:
@@ -223,28 +224,28 @@ class MappedStore(Store):
         with torch.cuda.device(self.device) if on_gpu else nullcontext():
             return torch.empty(*shape, ROW.itemsize, dtype=torch.uint8, pin_memory=on_gpu)
 
-    def _valid(self, draw: Draw, frames: int) -> NDArray[np.bool_]:
+    def _valid(self, windows: WindowIndex, frames: int) -> NDArray[np.bool_]:
         """Frames at which all clips of a scene are there and valid. (B, T)"""
-        clips = np.maximum(draw.clips, 0)
-        frame = draw.starts[..., None] + np.arange(frames)  # (B, 2, T)
-        good = (frame < self.length[clips][..., None]) | (draw.clips < 0)[..., None]
+        clips = np.maximum(windows.clips, 0)
+        frame = windows.starts[..., None] + np.arange(frames)  # (B, 2, T)
+        good = (frame < self.length[clips][..., None]) | (windows.clips < 0)[..., None]
         if self.bad:
-            for b, k in np.argwhere(~self.whole[clips] & (draw.clips >= 0)).tolist():
+            for b, k in np.argwhere(~self.whole[clips] & (windows.clips >= 0)).tolist():
                 mask = self.bad[int(clips[b, k])]
                 good[b, k] &= mask[np.minimum(frame[b, k], len(mask) - 1)]
         return np.logical_and(good[:, 0], good[:, 1])
 
     # -- on the device -------------------------------------------------------------------------
 
-    def decoded(self, rows: Rows, clearance: float) -> Scene:
+    def decoded(self, rows: RawBatch, clearance: float) -> Scene:
         """Rows to the batch that they are, on `device`."""
         raw = rows.raw.to(self.device, non_blocking=True)
-        present, groups = rows.present.to(self.device), torch.from_numpy(rows.draw.groups).to(self.device)
+        present, groups = rows.present.to(self.device), torch.from_numpy(rows.windows.groups).to(self.device)
         root = raw[..., :QUAT].contiguous().view(torch.int16)
         pelvis = raw[..., PELVIS:].contiguous().view(torch.float32)
         body = raw[..., QUAT:PELVIS].contiguous().view(torch.int16).unflatten(-1, (BODY_JOINTS - 1, 4))
-        T_world_root = self._compose(rigid(matrices(root), pelvis), present, groups, rows.draw, clearance)
-        chosen = np.flatnonzero(rows.draw.mirrored)
+        T_world_root = self._compose(rigid(matrices(root), pelvis), present, groups, rows.windows, clearance)
+        chosen = np.flatnonzero(rows.windows.mirrored)
         if len(chosen):
             index = torch.from_numpy(chosen).to(self.device)
             body.index_copy_(0, index, mirrored(body[index]))

@@ -1,10 +1,9 @@
-"""Clips of a split: their index, and flat rows of all frames, from which batches of windows are gathered."""
+"""All clips of a split in memory: flat rows of all frames, from which batches of windows are gathered."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,35 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
-from magnet.checks import require_whole
 from magnet.datamodules.clip import Clip, Ints
 from magnet.datamodules.store.compose import place_apart
+from magnet.datamodules.store.window_index import WindowIndex
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 
-@dataclass(frozen=True)
-class Draw:
-    """What a batch of B windows shows: up to two clips each and who stands in which of the P slots."""
-
-    clips: Ints  # (B, 2) index of the clip; the second is -1 unless the scene is composed
-    starts: Ints  # (B, 2) first frame
-    members: Ints  # (B, P) which person of the clip a slot shows, -1: nobody
-    groups: Ints  # (B, P) which of the two clips the person comes from
-    mirrored: NDArray[np.bool_]  # (B,)
-    placing: NDArray[np.float64]  # (B, 3) of the second group: yaw, direction in radians, distance in metres
-
-    def __len__(self) -> int:
-        return len(self.clips)
-
-    def __getitem__(self, part: slice) -> Draw:
-        return Draw(*(getattr(self, f)[part] for f in self.__dataclass_fields__))
-
-    @staticmethod
-    def concatenate(draws: Sequence[Draw]) -> Draw:
-        return Draw(*(np.concatenate([getattr(d, f) for d in draws]) for f in Draw.__dataclass_fields__))
-
-
-class Store:
+class MemoryStore:
     """All clips of a split as flat tensors on one device; rows are frames of one person.
 
     Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there. What
@@ -133,7 +110,7 @@ class Store:
         """Which of `world` processes draws from each clip, given how likely each is; None: all draw from all. (C,)"""
         return None
 
-    def to(self, device: torch.device | str) -> Store:
+    def to(self, device: torch.device | str) -> MemoryStore:
         """The same clips on another device; itself when they are there already."""
         if torch.device(device) == self.device:
             return self
@@ -142,7 +119,7 @@ class Store:
         other.tensors = {name: tensor.to(device) for name, tensor in self.tensors.items()}
         return other
 
-    def gather(self, draw: Draw, frames: int, clearance: float = 0.0) -> Scene:
+    def gather(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Scene:
         """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
 
         Beyond a clip's end its last frame is repeated with `valid` False.
@@ -152,15 +129,15 @@ class Store:
         def to_index(array: Ints) -> Tensor:
             return torch.from_numpy(array).to(self.device, non_blocking=True)
 
-        clips, starts = to_index(np.maximum(draw.clips, 0)), to_index(draw.starts)
-        members, groups = to_index(draw.members), to_index(draw.groups)
+        clips, starts = to_index(np.maximum(windows.clips, 0)), to_index(windows.starts)
+        members, groups = to_index(windows.members), to_index(windows.groups)
         there, member = members >= 0, members.clamp_min(0)
 
         wanted = starts[..., None] + torch.arange(frames, device=self.device)  # (B, 2, T)
         last = t["length"][clips][..., None] - 1
         frame = torch.minimum(wanted, last)
         good = (wanted <= last) & t["valid"][t["first_frame"][clips][..., None] + frame]
-        valid = (good | to_index(draw.clips)[..., None].lt(0)).all(dim=1)
+        valid = (good | to_index(windows.clips)[..., None].lt(0)).all(dim=1)
 
         clip = clips.gather(1, groups)  # (B, P)
         frame_of_slot = frame.gather(1, groups[..., None].expand(-1, -1, frames))  # (B, P, T)
@@ -169,27 +146,29 @@ class Store:
         T_world_root = t["T_world_root"].index_select(0, rows.flatten()).unflatten(0, rows.shape)
         scene = Scene(
             body_rot=t["body_rot"].index_select(0, rows.flatten()).unflatten(0, rows.shape),
-            T_world_root=self._compose(T_world_root, there, groups, draw, clearance),
+            T_world_root=self._compose(T_world_root, there, groups, windows, clearance),
             betas=t["betas"][torch.where(there, t["person"][clip, member], 0)],
             present=there,
             fps=self.fps,
             body=self.body,
             valid=valid,
-            names=self.labels(draw, frames),
+            names=self.labels(windows, frames),
         )
-        return self._mirror(scene, draw)
+        return self._mirror(scene, windows)
 
-    def _compose(self, T_world_root: Tensor, there: Tensor, groups: Tensor, draw: Draw, clearance: float) -> Tensor:
-        chosen = torch.from_numpy(np.flatnonzero(draw.clips[:, 1] >= 0)).to(self.device)
+    def _compose(
+        self, T_world_root: Tensor, there: Tensor, groups: Tensor, windows: WindowIndex, clearance: float
+    ) -> Tensor:
+        chosen = torch.from_numpy(np.flatnonzero(windows.clips[:, 1] >= 0)).to(self.device)
         if not len(chosen):
             return T_world_root
-        placing = torch.from_numpy(draw.placing).to(self.device, T_world_root.dtype)[chosen]
-        moved = place_apart(T_world_root[chosen], there[chosen], groups[chosen] == 1, placing, clearance)
+        relative_pose = torch.from_numpy(windows.relative_pose).to(self.device, T_world_root.dtype)[chosen]
+        moved = place_apart(T_world_root[chosen], there[chosen], groups[chosen] == 1, relative_pose, clearance)
         return T_world_root.index_copy_(0, chosen, moved)
 
-    def _mirror(self, scene: Scene, draw: Draw) -> Scene:
+    def _mirror(self, scene: Scene, windows: WindowIndex) -> Scene:
         # Only the chosen half is computed, in place: on a CPU, moving the numbers is what a batch costs.
-        chosen = np.flatnonzero(draw.mirrored)
+        chosen = np.flatnonzero(windows.mirrored)
         if len(chosen):
             index = torch.from_numpy(chosen).to(self.device)
             half = mirror_scene(scene.replace(**{n: v[index] for n, v in scene.tensors().items()}, names=()))
@@ -197,7 +176,7 @@ class Store:
             scene.T_world_root.index_copy_(0, index, half.T_world_root)
         return scene
 
-    def labels(self, draw: Draw, frames: int) -> tuple[str, ...]:
+    def labels(self, windows: WindowIndex, frames: int) -> tuple[str, ...]:
         """A label a scene: clip and frames, such as "60_05+61_05 [120:302]"; composed ones say so."""
 
         def label(clip: int, start: int) -> str:
@@ -205,37 +184,5 @@ class Store:
 
         return tuple(
             label(a, s) if b < 0 else f"composed: {label(a, s)} + {label(b, z)}"
-            for (a, b), (s, z) in zip(draw.clips.tolist(), draw.starts.tolist(), strict=True)
+            for (a, b), (s, z) in zip(windows.clips.tolist(), windows.starts.tolist(), strict=True)
         )
-
-
-def all_starts(good: NDArray[np.bool_], frames: int) -> Ints:
-    """First frames of every window of a clip to train on. good: (T,) bool
-
-    Windows that hold an invalid frame are left out, unless the clip has no other: then the best ones stay.
-    A clip shorter than the window has one, which starts at 0.
-    """
-    if len(good) <= frames:
-        return np.zeros(1 if good.any() else 0, dtype=np.int64)
-    total = np.concatenate([[0], np.cumsum(good)])
-    count = total[frames:] - total[:-frames]
-    best = count.max()
-    return np.flatnonzero(count == best) if best else np.zeros(0, dtype=np.int64)
-
-
-def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
-    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool
-
-    Raises:
-        ValueError: the stride is less than a frame.
-    """
-    require_whole("stride", stride, 1)
-    starts, start = [], 0
-    while start + frames <= len(good):
-        bad = np.flatnonzero(~good[start : start + frames])
-        if len(bad):
-            start += int(bad[-1]) + 1
-        else:
-            starts.append(start)
-            start += stride
-    return np.array(starts, dtype=np.int64)

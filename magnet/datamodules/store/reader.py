@@ -27,7 +27,18 @@ from magnet.datamodules.store.rows import ROW, SCALE, decode, encode
 from magnet.files import file_hash, inside, write_whole
 from magnet.motion.scene import Scene
 
-__all__ = ["ROW", "SCALE", "Folder", "Part", "StoreError", "body_hash", "decode", "encode", "file_hash", "write_whole"]
+__all__ = [
+    "ROW",
+    "SCALE",
+    "StoreError",
+    "StoreReader",
+    "StoreSplit",
+    "body_hash",
+    "decode",
+    "encode",
+    "file_hash",
+    "write_whole",
+]
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -54,7 +65,7 @@ def as_json(value: Any) -> bytes:
 
 
 @dataclass(frozen=True)
-class Part:
+class StoreSplit:
     """The clips of one split: parallel columns, and shards that hold their rows in the same order."""
 
     name: list[str]
@@ -68,7 +79,7 @@ class Part:
     maps: dict[int, NDArray[np.void]] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def joined(parts: Sequence[Part]) -> Part:
+    def concatenate(parts: Sequence[StoreSplit]) -> StoreSplit:
         """Several parts one after the other, each with shards of its own."""
         before = np.cumsum([0, *(int(part.ends[-1]) for part in parts)])
         maps: dict[int, NDArray[np.void]] = {}
@@ -76,7 +87,7 @@ class Part:
         for part in parts:
             maps |= {number + k: rows for k, rows in part.maps.items()}
             number += len(part.files)
-        return Part(
+        return StoreSplit(
             name=[name for part in parts for name in part.name],
             take=[take for part in parts for take in part.take],
             frames=np.concatenate([part.frames for part in parts]),
@@ -151,7 +162,7 @@ def words(name: str) -> set[str]:
     return {name, *re.findall(r"[^\s,;:()]+", name)}
 
 
-class Folder:
+class StoreReader:
     """A prepared store, opened: its manifest is read, rows are not.
 
     Raises:
@@ -171,7 +182,7 @@ class Folder:
             raise StoreError(f"{self.path / MANIFEST} cannot be read ({error}); prepare the store again") from error
         if version != FORMAT:
             raise StoreError(f"{self.path}: store format {version}, this version reads {FORMAT}; prepare it again")
-        self._splits: dict[str, Part] = {}
+        self._splits: dict[str, StoreSplit] = {}
         self.body: str = self.manifest["body"]["id"]
 
     @property
@@ -194,7 +205,7 @@ class Folder:
         except (OSError, ValueError, EOFError) as error:
             raise StoreError(f"{path}: the shapes cannot be read ({error}); prepare the store again") from error
 
-    def split(self, split: Split) -> Part:
+    def split(self, split: Split) -> StoreSplit:
         """The clips of a split; none where it is empty."""
         if split not in self._splits:
             self._splits[split] = self._part(split)
@@ -207,14 +218,14 @@ class Folder:
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{self.path / MANIFEST}: damaged ({error}); prepare the store again") from error
 
-    def _part(self, split: Split) -> Part:
+    def _part(self, split: Split) -> StoreSplit:
         table = self._clips
         mine = [i for i, name in enumerate(table["split"]) if name == split]
         people = np.array(table["people"], dtype=np.int64)
         end = np.cumsum(people)
         low, high = (int(end[mine[0]] - people[mine[0]]), int(end[mine[-1]])) if mine else (0, 0)
         shards = self.manifest["splits"][split]["shards"]
-        return Part(
+        return StoreSplit(
             name=[table["name"][i] for i in mine],
             take=[table["take"][i] for i in mine],
             frames=np.array([table["frames"][i] for i in mine], dtype=np.int64),
@@ -226,7 +237,7 @@ class Folder:
         )
 
     def clips(self, split: Split, roles: Sequence[str] = ()) -> list[Clip]:
-        """All clips of a split in memory, people in the order of `roles`, as `Part.seats` says."""
+        """All clips of a split in memory, people in the order of `roles`, as `StoreSplit.seats` says."""
         part = self.split(split)
         seats = part.seats(roles)
         clips = []

@@ -1,4 +1,4 @@
-"""The common steps: exact times, any up axis, one floor, and what cannot be people."""
+"""Canonical clips: exact times, any up axis, one floor, and what cannot be people."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet.body import load_body
 from magnet.datamodules.fakes.motion import UP, made_up_body, people, turned
 from magnet.datamodules.preparing import check_motion
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
-from magnet.datamodules.preparing.check_people import stretches
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
+from magnet.datamodules.preparing.check_people import true_runs
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.resample import resample_rotations, resample_valid, times
@@ -26,7 +26,7 @@ BODY = made_up_body()
 
 
 def clip_of(recording, **steps):
-    (clip,) = to_clips(recording, BODY, "take", "made", "train", steps=Steps(**steps)).clips
+    (clip,) = canonicalize(recording, BODY, "take", "made", "train", options=CanonicalizeOptions(**steps)).clips
     return clip
 
 
@@ -72,7 +72,7 @@ def test_a_frame_is_valid_when_all_it_is_made_of_is():
 @pytest.mark.parametrize(("up", "kind"), [*((up, recorded) for up in UP), ("-z", tracked)])
 def test_the_same_motion_comes_out_whatever_axis_is_up(up, kind):
     motion = people(60, 2, seed=5) if kind is recorded else people(30, 1, seed=5)  # a fit takes its time
-    outcome = to_clips(kind(turned(motion, up)), BODY, "take", "made", "train")
+    outcome = canonicalize(kind(turned(motion, up)), BODY, "take", "made", "train")
     assert [note for note in outcome.notes if "mean residual" in note] if kind is tracked else not outcome.notes
     found = BODY.joints(outcome.clips[0].scene)[0]
     true = torch.from_numpy(motion.positions).float()
@@ -108,7 +108,7 @@ def test_a_wrong_axis_unit_or_rate_is_named(kind, wrong):
         recording = kind(replace_frames(recording))
         spoil = lambda r: r  # noqa: E731
     with pytest.raises(DataError, match=message):
-        to_clips(spoil(recording), BODY, "take", "made", "train")
+        canonicalize(spoil(recording), BODY, "take", "made", "train")
 
 
 def replace_frames(recording):
@@ -118,7 +118,7 @@ def replace_frames(recording):
 
 def test_degrees_are_named():
     with pytest.raises(DataError, match=r"radians.*look like degrees"):
-        to_clips(in_degrees(recorded(people(60, 2))), BODY, "take", "made", "train")
+        canonicalize(in_degrees(recorded(people(60, 2))), BODY, "take", "made", "train")
 
 
 def test_nothing_that_people_do_is_refused():
@@ -178,14 +178,21 @@ def test_lost_tracking_and_jumps_cut_a_take():
     poses[52, 1] = np.nan  # what is not valid may be anything
     transl = motion.transl.copy()
     transl[100:] += [2.0, 0.0, 0.0]
-    outcome = to_clips(
+    outcome = canonicalize(
         replace(recorded(motion), poses=poses, transl=transl, valid=valid), BODY, "take", "made", "train",
-        steps=Steps(min_frames=41),
+        options=CanonicalizeOptions(min_frames=41),
     )  # fmt: skip
     assert [clip.name for clip in outcome.clips] == ["take [0:50]", "take [55:100]"]
     assert any("1 jumps" in note for note in outcome.notes)
     with pytest.raises(DataError, match="no stretch of 60 frames"):
-        to_clips(replace(recorded(motion), transl=transl, valid=valid), BODY, "t", "m", "train", steps=Steps(60))
+        canonicalize(
+            replace(recorded(motion), transl=transl, valid=valid),
+            BODY,
+            "t",
+            "m",
+            "train",
+            options=CanonicalizeOptions(60),
+        )
 
 
 @pytest.mark.parametrize("field", ["poses", "transl", "betas"])
@@ -217,7 +224,7 @@ def test_positions_that_no_body_fits_are_refused_with_the_residual():
 @given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 5))
 @settings(max_examples=50, deadline=None)
 def test_stretches_are_all_the_runs_and_nothing_else(good, least):
-    found = stretches(np.array(good), least)
+    found = true_runs(np.array(good), least)
     inside = {i for a, b in found for i in range(a, b)}
     for a, b in found:
         assert b - a >= least and all(good[a:b]) and (a == 0 or not good[a - 1]) and (b == len(good) or not good[b])
@@ -232,4 +239,4 @@ def test_stretches_are_all_the_runs_and_nothing_else(good, least):
 
 def test_rotations_are_not_put_on_a_body_that_they_do_not_belong_to():
     with pytest.raises(DataError, match="belong to SMPL-X's body, not to open-1: give --body"):
-        to_clips(recorded(people(60, 2, 30.0, seed=3)), load_body(), "take", "made", "train")
+        canonicalize(recorded(people(60, 2, 30.0, seed=3)), load_body(), "take", "made", "train")

@@ -14,17 +14,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from magnet import cli
-from magnet.datamodules.catalogue import NAMES
+from magnet.datamodules import registry
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.fakes.motion import FakeMotion, made_up_body, people
 from magnet.datamodules.preparing import check_people
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check import check_cmu, check_store
-from magnet.datamodules.preparing.check_people import Flag, frozen, held, jumps, words
-from magnet.datamodules.preparing.convert import Order, Part, convert
+from magnet.datamodules.preparing.check_people import Flag, described, frozen, held, jumps
+from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError, Recording
-from magnet.datamodules.store.reader import Folder
+from magnet.datamodules.store.reader import StoreReader
 from tests.datamodules import made
 from tests.datamodules.made_scenes import FITTED, FORMS, random_scene, with_positions, written
 from tests.datamodules.readers import fake_of
@@ -139,13 +139,13 @@ def check_spoiled(form: str, root: Path, slow: bool) -> None:
     whats = dict(zip(scenes, done, strict=True))
     for take, kind in whats.items():
         scenes[take] = SPOILS[kind].change(scenes[take]) if kind != "clean" else scenes[take]
-    order = written(form, root, scenes, Steps(min_frames=4, trust_fps=True))
+    order = written(form, root, scenes, CanonicalizeOptions(min_frames=4, trust_fps=True))
     reader, body = order.reader(), order.body()
     for take in reader.takes():
         kind = whats.get(take.name.removesuffix("_tr0"))
         if kind is None or (kind == "clean" and fast):  # other parts of the same; a fit takes its time
             continue
-        part = convert(reader, take, body, order.steps)
+        part = convert(reader, take, body, order.canonicalize)
         if kind == "clean":
             assert part.error is None and not flagged(part), f"{take.name}: {part.error or flagged(part)}"
             continue
@@ -156,11 +156,11 @@ def check_spoiled(form: str, root: Path, slow: bool) -> None:
             check_left_out(part, said)
 
 
-def flagged(part: Part) -> list[str]:
+def flagged(part: ConvertedTake) -> list[str]:
     return [note for note in part.notes if re.search(r"cut (out|there)", note)]
 
 
-def check_left_out(part: Part, said: str) -> None:
+def check_left_out(part: ConvertedTake, said: str) -> None:
     """No clip has frames of the time that was cut out."""
     spans = [(float(a) * 30, float(b) * 30) for a, b in re.findall(r"\(([\d.]+) to ([\d.]+) s\): cut out", said)]
     clips = [tuple(map(int, found)) for label in part.names for found in re.findall(r"\[(\d+):(\d+)\]", label)]
@@ -190,7 +190,7 @@ def recorded(motion: FakeMotion) -> Recording:
 def test_nothing_is_said_of_people_who_move(seed: int) -> None:
     for fps in (30.0, 50.0, 120.0):
         motion = people(round(6 * fps), 1 + seed, fps, seed)
-        outcome = to_clips(replace(made.recorded(motion)), BODY, "take", "made", "train")
+        outcome = canonicalize(replace(made.recorded(motion)), BODY, "take", "made", "train")
         assert outcome.notes == () and len(outcome.clips) == 1
 
 
@@ -200,7 +200,7 @@ def test_somebody_who_stands_still_or_sits_is_not_called_frozen() -> None:
     poses, transl = motion.poses.copy(), motion.transl.copy()
     poses[:, 1] = poses[0, 1] + random.normal(0.0, 1e-3, poses[:, 1].shape)  # what capture adds, and less
     transl[:, 1] = transl[0, 1] + random.normal(0.0, 1e-4, transl[:, 1].shape)
-    outcome = to_clips(recorded(replace(motion, poses=poses, transl=transl)), BODY, "take", "made", "train")
+    outcome = canonicalize(recorded(replace(motion, poses=poses, transl=transl)), BODY, "take", "made", "train")
     assert outcome.notes == ()
 
 
@@ -209,13 +209,15 @@ def test_people_who_all_hold_a_pose_are_not_called_frozen() -> None:
     arrays = {name: getattr(motion, name).copy() for name in ("poses", "transl")}
     for array in arrays.values():
         array[50:66] = array[50]
-    outcome = to_clips(recorded(replace(motion, **arrays)), BODY, "take", "made", "train", steps=Steps(trust_fps=True))
+    outcome = canonicalize(
+        recorded(replace(motion, **arrays)), BODY, "take", "made", "train", options=CanonicalizeOptions(trust_fps=True)
+    )
     assert not any("frozen" in note for note in outcome.notes)
 
 
 def test_frames_are_numbered_as_clips_are() -> None:
     motion = people(150, 2, seed=2)
-    outcome = to_clips(recorded(held_still(motion, *ALL)), BODY, "take", "made", "train")
+    outcome = canonicalize(recorded(held_still(motion, *ALL)), BODY, "take", "made", "train")
     said = "person 1 (follower): frozen while others move in frames 45 to 81 at 30 fps (1.50 to 2.73 s): cut out"
     assert outcome.notes == (said,)
     assert [clip.name for clip in outcome.clips] == ["take [0:45]", "take [82:150]"]
@@ -226,7 +228,7 @@ def test_what_is_left_of_a_take_that_is_too_short_says_what_was_cut() -> None:
     with pytest.raises(
         DataError, match=r"no stretch of 60 frames.*; person 1 \(follower\): frozen .*; lower --min_frames"
     ):
-        to_clips(recorded(motion), BODY, "take", "made", "train", steps=Steps(min_frames=60))
+        canonicalize(recorded(motion), BODY, "take", "made", "train", options=CanonicalizeOptions(min_frames=60))
 
 
 def test_a_body_of_no_size_that_people_have_is_refused() -> None:
@@ -245,7 +247,7 @@ def test_numbers_that_are_no_rotation_matrices_are_refused(tmp_path: Path) -> No
     held = json.loads(path.read_text())
     held["body_pose"][1][7][4] = [[1e30] * 3] * 3
     path.write_text(json.dumps(held))
-    (take,) = (reader := NAMES[name].load_reader()(tmp_path)).takes()
+    (take,) = (reader := registry.reader(name)(tmp_path)).takes()
     with pytest.raises(DataError, match=r"body_pose: 1 of .* matrices are no rotations"):
         reader.read(take)
 
@@ -272,7 +274,7 @@ def test_jumps_and_holds_of_plain_arrays_are_at_their_frames() -> None:
 
 
 def test_many_flags_are_counted_and_not_all_listed() -> None:
-    said = words([Flag(0, 10 * k, 10 * k + 1, "x", cut=True) for k in range(1, 30)], ("one",), 30.0)
+    said = described([Flag(0, 10 * k, 10 * k + 1, "x", cut=True) for k in range(1, 30)], ("one",), 30.0)
     assert len(said) == 6 and said[-1] == "person 0 (one): 24 more such jumps"
 
 
@@ -280,7 +282,7 @@ def test_many_flags_are_counted_and_not_all_listed() -> None:
 
 
 @pytest.fixture
-def order(tmp_path: Path, known: None, monkeypatch: pytest.MonkeyPatch) -> Order:
+def order(tmp_path: Path, known: None, monkeypatch: pytest.MonkeyPatch) -> PrepareJob:
     """Five takes, in the second of which somebody is frozen."""
     read = made.MadeReader.read
 
@@ -294,13 +296,13 @@ def order(tmp_path: Path, known: None, monkeypatch: pytest.MonkeyPatch) -> Order
         return replace(found, poses=poses, transl=transl)
 
     monkeypatch.setattr(made.MadeReader, "read", spoiled)
-    return Order(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), Steps())
+    return PrepareJob(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), CanonicalizeOptions())
 
 
 FOUND = "person 1: frozen while others move in frames 50 to 89 at 30 fps (1.67 to 3.00 s)"
 
 
-def test_check_and_info_name_the_take(order: Order, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_and_info_name_the_take(order: PrepareJob, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--root", order.root, "--out", str(tmp_path / "store"), "--body", order.body_file, "--workers", "1"]
     assert cli.main(["data", "prepare", made.NAME, *words]) == 0
     capsys.readouterr()
@@ -314,13 +316,13 @@ def test_check_and_info_name_the_take(order: Order, tmp_path: Path, capsys: pyte
 
 
 def test_a_store_of_before_these_checks_is_told_by_clip_person_and_frame(
-    order: Order, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    order: PrepareJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("frozen", "jumps"):
         monkeypatch.setattr(check_people, name, lambda *_, **__: [])
     prepare(order, tmp_path / "store")
     monkeypatch.undo()
-    problems = check_store(Folder(tmp_path / "store")).problems
+    problems = check_store(StoreReader(tmp_path / "store")).problems
     held, turned = problems
     assert held == f"clip take1 [0:90]: {FOUND}; prepare the store again"  # the end of the hold is a jump
     assert turned.startswith("clip take1 [90:160]: person 0: right_knee turns by") and "frame 29 to 30" in turned

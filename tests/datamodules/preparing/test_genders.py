@@ -14,14 +14,14 @@ import torch
 from magnet import cli
 from magnet.body import Body, load_body
 from magnet.body.shape import reshaped
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 from magnet.datamodules.fakes.body import arrays, write_body
 from magnet.datamodules.fakes.motion import people
-from magnet.datamodules.preparing.canonicalize import Steps, to_clips
-from magnet.datamodules.preparing.convert import Order, families_of
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
+from magnet.datamodules.preparing.convert import PrepareJob, families_of
 from magnet.datamodules.preparing.genders import find_bodies, one_body
 from magnet.datamodules.reading.recording import DataError, Recording
-from magnet.datamodules.store.reader import Folder
+from magnet.datamodules.store.reader import StoreReader
 from tests.body.pickled import write_smpl_pkl
 
 SHAPE = {"female": (-1.2, 0.4, 0.3), "male": (1.1, -0.5, -0.2)}
@@ -90,7 +90,7 @@ def test_joints_are_those_of_the_gendered_bodies_within_a_millimetre(bodies):
     assert set(found.notes) == {
         f"{gender} shapes expressed in body made-up-smplx: joints at rest within 1 mm" for gender in ("female", "male")
     }
-    outcome = to_clips(found, bodies["neutral"], "take", "made", "train")
+    outcome = canonicalize(found, bodies["neutral"], "take", "made", "train")
     clip = bodies["neutral"].joints(outcome.clips[0].scene)[0].double()
     moved = clip - true
     assert (moved - moved[:1, :1, :1]).norm(dim=-1).max() < 2e-3  # but for the floor and the origin
@@ -152,8 +152,8 @@ def test_bodies_are_told_apart_by_their_names(folder, tmp_path, names):
 
 @pytest.mark.parametrize("name", ["interx", "dd100", "hi4d"])
 def test_readers_say_who_is_what(name, tmp_path):
-    catalogue.find(name).load_fake()(tmp_path, takes=1, frames=60)
-    reader = catalogue.find(name).load_reader()(tmp_path)
+    registry.reader(name).write_fake(tmp_path, takes=1, frames=60)
+    reader = registry.reader(name)(tmp_path)
     assert sorted(reader.read(reader.takes()[0]).genders) == ["female", "male"]
 
 
@@ -171,7 +171,7 @@ def test_a_store_of_gendered_people_is_made_and_described_through_the_command_li
     assert cli.main(["data", "info", "store"]) == 0
     said = capsys.readouterr().out
     assert note in said and "from female ones" in said and "people: follower | leader (4 takes)" in said
-    manifest = Folder("store").manifest
+    manifest = StoreReader("store").manifest
     assert manifest["body"]["genders"].keys() == {"female", "male", "neutral"}
     assert not any("the shape is used with the body model given" in entry["note"] for entry in manifest["notes"])
 
@@ -194,14 +194,14 @@ def smpl_files(folder: Path) -> Path:
     return folder
 
 
-def order(name: str, folder: Path, body: str, bodies: tuple[str, ...] = ()) -> Order:
-    return Order(name, str(folder), {}, body, Steps(), bodies)
+def order(name: str, folder: Path, body: str, bodies: tuple[str, ...] = ()) -> PrepareJob:
+    return PrepareJob(name, str(folder), {}, body, CanonicalizeOptions(), bodies)
 
 
-@pytest.mark.parametrize("name", catalogue.NAMES)
+@pytest.mark.parametrize("name", registry.readers())
 def test_a_body_of_another_family_is_refused_by_its_tree(name, tmp_path):
     """SMPL's for SMPL-X's numbers and the other way round, whatever the files are called."""
-    kind = catalogue.find(name).load_reader()
+    kind = registry.reader(name)
     own, other = ("smpl", "smplx") if kind.family == "smpl" else ("smplx", "smpl")
     files = {one: str(write_body(tmp_path / f"{one}_is_here.npz", one)) for one in ("smpl", "smplx")}
     assert order(name, tmp_path, files[own]).body().family == own
@@ -249,7 +249,7 @@ def test_smpls_pickles_prepare_and_train_as_they_are_handed_out(name, tmp_path, 
     for out, file in (("pkl", body), ("npz", "dl/body.npz")):
         words = ("--root", "dl", "--out", out, "--workers", "1", "--body", file)
         assert cli.main(["data", "prepare", name, *words]) == 0
-        stores[out] = catalogue.find(name).load_data()(path=out, body_model=file)
+        stores[out] = registry.classes()[registry.data_of(registry.reader(name))](path=out, body_model=file)
     for split in ("train", "val", "test"):
         for one, other in zip(stores["pkl"].clips(split), stores["npz"].clips(split), strict=True):
             torch.testing.assert_close(one.scene.T_world_root, other.scene.T_world_root, rtol=0, atol=1e-5)
@@ -264,7 +264,7 @@ def test_smpl_and_its_genders_are_expressed_in_smplx(folder, tmp_path, monkeypat
     write_smpl_pkl(tmp_path / "SMPL_NEUTRAL.pkl")
     words = ("--root", "dl", "--out", "store", "--workers", "1", "--bodies", "SMPL_NEUTRAL.pkl")
     assert cli.main(["data", "prepare", "aioz", *words, "--body", str(folder / "SMPLX_NEUTRAL.npz")]) == 0
-    manifest = Folder("store").manifest
+    manifest = StoreReader("store").manifest
     assert manifest["skipped"] == [] and manifest["body"]["id"] == "made-up-smplx"
     assert manifest["body"]["genders"].keys() == {"neutral"}
     capsys.readouterr()

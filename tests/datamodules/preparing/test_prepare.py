@@ -11,22 +11,22 @@ from pathlib import Path
 
 import pytest
 
-from magnet.datamodules import catalogue
+from magnet.datamodules import registry
 from magnet.datamodules.preparing import pack as prepare_pack
-from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.check import check_store
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare, read_splits
 from magnet.datamodules.reading.recording import DataError
-from magnet.datamodules.store.reader import STATE, Folder
+from magnet.datamodules.store.reader import STATE, StoreReader
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
 
 
 @pytest.fixture
-def order(tmp_path) -> Order:
-    return Order(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), Steps())
+def order(tmp_path) -> PrepareJob:
+    return PrepareJob(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), CanonicalizeOptions())
 
 
 def content(store: Path) -> dict[str, bytes]:
@@ -35,11 +35,11 @@ def content(store: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def couples(tmp_path_factory) -> Order:
+def couples(tmp_path_factory) -> PrepareJob:
     """A fake that worker processes know, too."""
     root = tmp_path_factory.mktemp("couples")
-    catalogue.find("chi3d").load_fake()(root, takes=5, frames=60)
-    return Order("chi3d", str(root), {}, str(root / "body.npz"), Steps())
+    registry.reader("chi3d").write_fake(root, takes=5, frames=60)
+    return PrepareJob("chi3d", str(root), {}, str(root / "body.npz"), CanonicalizeOptions())
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def undisturbed(couples, tmp_path_factory) -> dict[str, bytes]:
     return content(out)
 
 
-def doomed(order: Order, out: Path, during: str, workers: int, reached: Path) -> None:
+def doomed(order: PrepareJob, out: Path, during: str, workers: int, reached: Path) -> None:
     """In a process that is going to be killed: stops after the first take, or half-way through the second file."""
 
     def stop() -> None:
@@ -72,7 +72,7 @@ def doomed(order: Order, out: Path, during: str, workers: int, reached: Path) ->
         return write(folder, name, begin if len(written) == 2 else put)
 
     prepare_pack.write_whole = half
-    prepare(order, out, workers=workers, shard_rows=200, tell=tell)
+    prepare(order, out, workers=workers, shard_rows=200, progress=tell)
 
 
 def children(pid: int) -> list[Path]:
@@ -104,7 +104,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp
     left = {path.name.split("-")[0] for path in out.iterdir()}
     assert left == ({STATE} if during == "conversion" else {STATE, "train", ".new"})
     with pytest.raises(ValueError, match="a prepare that has not finished lies there"):
-        Folder(out)
+        StoreReader(out)
     again = prepare(couples, out, shard_rows=200)
     takes = len(couples.reader().takes())
     assert again.kept == takes or (during == "conversion" and again.kept)
@@ -132,14 +132,16 @@ def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, tmp_pa
         prepare(order, tmp_path / "store", shard_rows=700)
     monkeypatch.undo()
     assert content(tmp_path / "store").items() >= before.items()
-    assert not check_store(Folder(tmp_path / "store")).problems
+    assert not check_store(StoreReader(tmp_path / "store")).problems
     prepare(order, tmp_path / "store", shard_rows=700)
     assert content(tmp_path / "store") == content(tmp_path / "new")
 
 
 def test_two_workers_write_the_bytes_of_one(couples, undisturbed, tmp_path):
     told: list[tuple[int, int]] = []
-    prepare(couples, tmp_path / "2", workers=2, shard_rows=200, tell=lambda _, done, total: told.append((done, total)))
+    prepare(
+        couples, tmp_path / "2", workers=2, shard_rows=200, progress=lambda _, done, total: told.append((done, total))
+    )
     assert content(tmp_path / "2") == undisturbed
     assert told == sorted(told) and told[-1][0] == told[-1][1] and len(told) == 1 + len(couples.reader().takes())
 
@@ -157,9 +159,9 @@ def test_only_what_changed_is_made_again(order, tmp_path):
     take.write_text(old)
     prepare(order, out)
     assert content(out) == first  # and nothing of the store in between is left
-    shorter = Order(order.name, order.root, {}, order.body_file, Steps(min_frames=31))
+    shorter = PrepareJob(order.name, order.root, {}, order.body_file, CanonicalizeOptions(min_frames=31))
     assert prepare(shorter, out).made == 5  # an option changed: all of them
-    with_fps = Order(order.name, order.root, {"fps": 31.0}, order.body_file, Steps())
+    with_fps = PrepareJob(order.name, order.root, {"fps": 31.0}, order.body_file, CanonicalizeOptions())
     assert prepare(with_fps, out).made == 5
 
 
@@ -253,7 +255,7 @@ def test_strangers_folders_are_left_alone(order, tmp_path):
 
 
 def test_shape_numbers_without_their_body_are_refused_with_where_to_get_it(order, tmp_path):
-    without = Order(order.name, order.root, {}, "open", Steps())
+    without = PrepareJob(order.name, order.root, {}, "open", CanonicalizeOptions())
     with pytest.raises(ValueError, match=r"--body FILE, from https://smpl-x\.is\.tue\.mpg\.de"):
         prepare(without, tmp_path / "store")
 

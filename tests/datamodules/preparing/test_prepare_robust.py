@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 
 from magnet import cli, files
-from magnet.datamodules.preparing.canonicalize import Steps
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.check import check_store
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
-from magnet.datamodules.store.reader import MANIFEST, STATE, Folder
+from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
@@ -29,8 +29,8 @@ BUSY = "another prepare is working in "
 
 
 @pytest.fixture
-def order(tmp_path: Path) -> Order:
-    return Order(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), Steps())
+def order(tmp_path: Path) -> PrepareJob:
+    return PrepareJob(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), CanonicalizeOptions())
 
 
 def content(store: Path) -> dict[str, bytes]:
@@ -38,7 +38,7 @@ def content(store: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def alone(order: Order, tmp_path: Path) -> dict[str, bytes]:
+def alone(order: PrepareJob, tmp_path: Path) -> dict[str, bytes]:
     """What one process makes of it."""
     prepare(order, tmp_path / "alone", shard_rows=700)
     return content(tmp_path / "alone")
@@ -47,11 +47,11 @@ def alone(order: Order, tmp_path: Path) -> dict[str, bytes]:
 # -- two at once -------------------------------------------------------------------------------
 
 
-def ended(order: Order, out: Path, outcome: Any, before: Callable[[], object], tell: Any = None) -> None:
+def ended(order: PrepareJob, out: Path, outcome: Any, before: Callable[[], object], tell: Any = None) -> None:
     """In a process of its own: how a prepare ended."""
     before()
     try:
-        report = prepare(order, out, shard_rows=700, tell=tell)
+        report = prepare(order, out, shard_rows=700, progress=tell)
     except OSError as error:
         outcome.put(str(error))
     else:
@@ -59,7 +59,7 @@ def ended(order: Order, out: Path, outcome: Any, before: Callable[[], object], t
 
 
 def test_a_second_prepare_says_that_another_works_there_and_the_first_ends_well(
-    order: Order, alone: dict[str, bytes], tmp_path: Path
+    order: PrepareJob, alone: dict[str, bytes], tmp_path: Path
 ) -> None:
     begun, go_on = FORK.Event(), FORK.Event()
 
@@ -86,7 +86,7 @@ def test_a_second_prepare_says_that_another_works_there_and_the_first_ends_well(
 
 @pytest.mark.parametrize("there", ["nothing", "a store", "another store"])
 def test_prepares_that_race_leave_the_store_of_one(
-    order: Order, alone: dict[str, bytes], tmp_path: Path, there: str
+    order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, there: str
 ) -> None:
     out, outcome = tmp_path / "store", FORK.SimpleQueue()
     if there != "nothing":
@@ -103,11 +103,11 @@ def test_prepares_that_race_leave_the_store_of_one(
     assert done and max(made for made, _ in done) == new  # whoever came after that kept all of it
     assert sum(made for made, _ in done) == new
     assert all(end.startswith(BUSY) for end in ends if isinstance(end, str))
-    assert content(out) == alone and not check_store(Folder(out)).problems
+    assert content(out) == alone and not check_store(StoreReader(out)).problems
 
 
 def test_a_store_made_while_another_was_about_to_begin_is_gone_on_from(
-    order: Order, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from magnet.datamodules.preparing import prepare as module
 
@@ -147,7 +147,7 @@ def full_after(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.45, 0.6, 0.8, 0.97, 0.999])
 def test_a_full_disk_is_told_with_what_to_do_and_the_same_command_goes_on(
-    order: Order, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+    order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
     out = tmp_path / "store"
     size = 2 * sum(map(len, alone.values()))  # parts, then the store
@@ -163,7 +163,7 @@ def test_a_full_disk_is_told_with_what_to_do_and_the_same_command_goes_on(
 
 
 def test_a_disk_that_fills_up_leaves_the_old_store_whole(
-    order: Order, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "store"
     prepare(order, out, shard_rows=700, limit=1)
@@ -173,13 +173,13 @@ def test_a_disk_that_fills_up_leaves_the_old_store_whole(
         with pytest.raises(OSError, match="the disk is full"):
             prepare(order, out, shard_rows=700)
         monkeypatch.undo()
-        assert content(out).items() >= before.items() and not check_store(Folder(out)).problems
+        assert content(out).items() >= before.items() and not check_store(StoreReader(out)).problems
     prepare(order, out, shard_rows=700)
     assert content(out) == alone
 
 
 def test_the_command_line_says_it_in_a_line(
-    order: Order, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    order: PrepareJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     full_after(monkeypatch, 50_000)
     words = ["--root", order.root, "--out", str(tmp_path / "store"), "--body", order.body_file, "--workers", "1"]
@@ -214,9 +214,9 @@ def step_down(folder: Path) -> None:
         os.seteuid(65534)
 
 
-def test_a_folder_that_may_not_be_written_to_is_named_and_what_to_do(order: Order, nobody: Path) -> None:
+def test_a_folder_that_may_not_be_written_to_is_named_and_what_to_do(order: PrepareJob, nobody: Path) -> None:
     shutil.copytree(order.root, nobody / "dl")
-    order = Order(order.name, str(nobody / "dl"), {}, str(nobody / "dl/body.npz"), Steps())
+    order = PrepareJob(order.name, str(nobody / "dl"), {}, str(nobody / "dl/body.npz"), CanonicalizeOptions())
     prepare(order, nobody / "store", shard_rows=700)
     before = content(nobody / "store")
     step_down(nobody)
@@ -224,14 +224,14 @@ def test_a_folder_that_may_not_be_written_to_is_named_and_what_to_do(order: Orde
         with pytest.raises(OSError, match=rf"^{out}: cannot be written \(.*\): .*choose another --out"):
             prepare(order, out, shard_rows=700)
     assert content(nobody / "store") == before
-    assert not check_store(Folder(nobody / "store")).problems  # it is read all the same
+    assert not check_store(StoreReader(nobody / "store")).problems  # it is read all the same
     batch = next(iter(made.data(nobody / "store").train_dataloader()))
     assert batch.T_world_root.isfinite().all()
 
 
-def test_a_download_that_may_not_be_written_to_is_prepared(order: Order, nobody: Path, tmp_path: Path) -> None:
+def test_a_download_that_may_not_be_written_to_is_prepared(order: PrepareJob, nobody: Path, tmp_path: Path) -> None:
     shutil.copytree(order.root, nobody / "dl")
-    order = Order(order.name, str(nobody / "dl"), {}, str(nobody / "dl/body.npz"), Steps())
+    order = PrepareJob(order.name, str(nobody / "dl"), {}, str(nobody / "dl/body.npz"), CanonicalizeOptions())
     out = Path(tempfile.mkdtemp(prefix="magnet-out-"))
     out.chmod(0o777)
     try:
@@ -246,7 +246,7 @@ def test_a_download_that_may_not_be_written_to_is_prepared(order: Order, nobody:
 # -- links -------------------------------------------------------------------------------------
 
 
-def test_links_in_a_download_are_followed_and_what_they_lead_to_decides(order: Order, tmp_path: Path) -> None:
+def test_links_in_a_download_are_followed_and_what_they_lead_to_decides(order: PrepareJob, tmp_path: Path) -> None:
     plain = prepare(order, tmp_path / "plain").folder
     (tmp_path / "dl").rename(tmp_path / "elsewhere")
     (tmp_path / "dl").mkdir()
@@ -262,7 +262,7 @@ def test_links_in_a_download_are_followed_and_what_they_lead_to_decides(order: O
     assert [entry["take"] for entry in report.folder.manifest["skipped"]] == ["take2"]
 
 
-def test_a_stores_manifest_does_not_lead_out_of_it(order: Order, tmp_path: Path) -> None:
+def test_a_stores_manifest_does_not_lead_out_of_it(order: PrepareJob, tmp_path: Path) -> None:
     out = tmp_path / "store"
     prepare(order, out)
     text = (out / MANIFEST).read_text()
@@ -271,6 +271,6 @@ def test_a_stores_manifest_does_not_lead_out_of_it(order: Order, tmp_path: Path)
         for name in ("../dl/take0.txt", str(tmp_path / "dl/take0.txt")):
             (out / MANIFEST).write_text(text.replace(place["file"], name))
             with pytest.raises(ValueError, match=r"manifest\.json: damaged .*its index names.*prepare the store again"):
-                Folder(out).files()
+                StoreReader(out).files()
             with pytest.raises(ValueError, match="its index names"):
-                Folder(out).clips("train")
+                StoreReader(out).clips("train")

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
-from magnet.datamodules.reading.asf_amc import Recording, _fast, _slow, read_amc, read_asf, together
+from magnet.datamodules.reading.asf_amc import AmcRecording, _fast, _slow, read_amc, read_asf, together
 from magnet.datamodules.reading.cmu_glitches import repaired, runs
 from tests.datamodules.slow_cmu import slow_ends
 
@@ -21,7 +21,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return write_asf(tmp_path / "60.asf"), write_amc(tmp_path / "60_01.amc", 90)
 
 
-def read(files: tuple[Path, Path], fps: float = 60.0) -> Recording:
+def read(files: tuple[Path, Path], fps: float = 60.0) -> AmcRecording:
     return read_amc(files[1], read_asf(files[0]), fps)
 
 
@@ -32,7 +32,7 @@ def changed(files: tuple[Path, Path], old: str, new: str, count: int = 1) -> tup
     return files
 
 
-def assert_ends_are_the_references(asf: Path, amc: Path, recording: Recording, frames: list[int]) -> None:
+def assert_ends_are_the_references(asf: Path, amc: Path, recording: AmcRecording, frames: list[int]) -> None:
     _, end = recording.world()
     for frame in frames:
         for name, place in slow_ends(asf, amc, frame).items():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magnet.datamodules.reading.own_files import Group, by_names, by_pattern, by_table, files_of
+from magnet.datamodules.reading.own_files import SceneFiles, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.reading.recording import DataError
 
 
@@ -17,8 +17,8 @@ def made(root: Path, *names: str) -> list[Path]:
     return files_of(root, (".bvh",))
 
 
-def told(groups: list[Group]) -> dict[str, list[str]]:
-    return {group.scene: [seat.person for seat in group.seats] for group in groups}
+def told(groups: list[SceneFiles]) -> dict[str, list[str]]:
+    return {group.scene: [person_file.person for person_file in group.people] for group in groups}
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_a_table_tells_people_roles_and_when_they_begin(tmp_path: Path) -> None:
     table = tmp_path / "mine.csv"
     table.write_text("Scene;file;Person;role;start\ntango;a.bvh;anna;leader;\ntango;sub/b.bvh;ben;follower;1.5\n\n")
     (group,) = by_table(tmp_path, table, (".bvh",))
-    assert [(seat.person, seat.file.name, seat.start) for seat in group.seats] == [
+    assert [(person_file.person, person_file.file.name, person_file.start) for person_file in group.people] == [
         ("anna leader", "a.bvh", 0.0),
         ("ben follower", "b.bvh", 1.5),
     ]

@@ -26,46 +26,46 @@ def closest(T_world_root: Tensor, ours: list[int], theirs: list[int]) -> float:
 def groups(generator: torch.Generator) -> tuple[Scene, Tensor, Tensor]:
     """200 scenes of couple and couple in four slots, how to place them, and who is second."""
     scene = random_scene(200, 64, 4, generator)
-    placing = torch.rand(200, 3, generator=generator) * torch.tensor([2 * math.pi, 2 * math.pi, 3.0])
+    relative_pose = torch.rand(200, 3, generator=generator) * torch.tensor([2 * math.pi, 2 * math.pi, 3.0])
     second = torch.tensor([False, True, False, True]).expand(200, 4)
-    return scene, placing, second
+    return scene, relative_pose, second
 
 
 def test_groups_never_come_closer_than_the_clearance(groups: tuple[Scene, Tensor, Tensor]) -> None:
-    scene, placing, second = groups
-    placed = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    scene, relative_pose, second = groups
+    placed = place_apart(scene.T_world_root, scene.present, second, relative_pose, CLEARANCE)
     distances = [closest(T, [0, 2], [1, 3]) for T in placed]
     assert min(distances) > CLEARANCE - 1e-4
     assert sum(d < CLEARANCE + 1e-3 for d in distances) > 20  # no further apart than needed
 
 
 def test_far_enough_groups_stand_as_far_apart_as_drawn(groups: tuple[Scene, Tensor, Tensor]) -> None:
-    scene, placing, second = groups
-    placing[:, 2] = 20.0
-    ground = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)[..., [0, 2], 3]
+    scene, relative_pose, second = groups
+    relative_pose[:, 2] = 20.0
+    ground = place_apart(scene.T_world_root, scene.present, second, relative_pose, CLEARANCE)[..., [0, 2], 3]
     between = ground[:, :, [1, 3]].mean(dim=(1, 2)) - ground[:, :, [0, 2]].mean(dim=(1, 2))
-    heading = torch.stack([placing[:, 1].sin(), placing[:, 1].cos()], dim=-1)
+    heading = torch.stack([relative_pose[:, 1].sin(), relative_pose[:, 1].cos()], dim=-1)
     torch.testing.assert_close(between, 20 * heading, atol=1e-4, rtol=0)
 
 
 def test_a_group_moves_as_one_on_the_floor(groups: tuple[Scene, Tensor, Tensor]) -> None:
-    scene, placing, second = groups
-    before, after = scene.T_world_root, place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    scene, relative_pose, second = groups
+    before, after = scene.T_world_root, place_apart(scene.T_world_root, scene.present, second, relative_pose, CLEARANCE)
     assert torch.equal(after[:, :, [0, 2]], before[:, :, [0, 2]])
     torch.testing.assert_close(after[..., 1, 3], before[..., 1, 3])
     motion = after[:, :, [1, 3]] @ inverse(before[:, :, [1, 3]])
     torch.testing.assert_close(motion, motion[:, :1, :1].expand_as(motion), atol=1e-4, rtol=0)
     yaw = torch.atan2(motion[:, 0, 0, 0, 2], motion[:, 0, 0, 0, 0])
-    torch.testing.assert_close((yaw - placing[:, 0]).cos(), torch.ones(200))
+    torch.testing.assert_close((yaw - relative_pose[:, 0]).cos(), torch.ones(200))
 
 
 def test_absent_agents_neither_push_nor_move(groups: tuple[Scene, Tensor, Tensor]) -> None:
-    scene, placing, second = groups
+    scene, relative_pose, second = groups
     scene = scene.slice(0).replace(present=torch.tensor([True, True, False, False]).expand(200, 4))
-    placed = place_apart(scene.T_world_root, scene.present, second, placing, CLEARANCE)
+    placed = place_apart(scene.T_world_root, scene.present, second, relative_pose, CLEARANCE)
     elsewhere = scene.T_world_root.clone()
     elsewhere[:, :, 2:, :3, 3] += 5.0
-    again = place_apart(elsewhere, scene.present, second, placing, CLEARANCE)
+    again = place_apart(elsewhere, scene.present, second, relative_pose, CLEARANCE)
     assert torch.equal(again[:, :, :2], placed[:, :, :2]) and torch.equal(again[:, :, 2:], elsewhere[:, :, 2:])
 
 

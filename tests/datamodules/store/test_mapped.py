@@ -12,8 +12,8 @@ import torch
 
 from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.store.mapped import MappedStore, Rows
-from magnet.datamodules.store.memory import Store
+from magnet.datamodules.store.mapped import MappedStore, RawBatch
+from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.reader import ROW, StoreError
 from magnet.datamodules.store.rows import CACHED, SCALE, _nine_at_once, matrices
 from tests.datamodules import made
@@ -26,7 +26,7 @@ BODY = made_up_body()
 def test_mapped_training_windows_are_those_from_memory(store):
     options = {"compose": 0.5, "drop_agent": 0.3, "max_agents": 4, "weights": {made.NAME: 1.0}}
     mapped, resident = data(store, **options), data(store, device_resident=True, **options)
-    assert isinstance(mapped.store("train"), MappedStore) and type(resident.store("train")) is Store
+    assert isinstance(mapped.store("train"), MappedStore) and type(resident.store("train")) is MemoryStore
     for ours, theirs in zip(mapped.train_dataloader(), resident.train_dataloader(), strict=True):
         assert ours.names == theirs.names and ours.body == theirs.body == BODY.id
         for name, value in theirs.tensors().items():
@@ -61,7 +61,7 @@ def test_what_goes_to_another_device_is_rows_as_they_lie_on_disk(store):
     draw = draws(0, 0, 8)
     elsewhere = mapped.to("meta")  # any device but the CPU
     rows = elsewhere.fetch(draw, 64)
-    assert isinstance(rows, Rows) and rows.raw.shape == (8, 64, 2, ROW.itemsize) and rows.raw.dtype == torch.uint8
+    assert isinstance(rows, RawBatch) and rows.raw.shape == (8, 64, 2, ROW.itemsize) and rows.raw.dtype == torch.uint8
     there, here = mapped.finish(rows), mapped.gather(draw, 64)
     assert there.names == here.names
     assert all(torch.equal(value, there.tensors()[name]) for name, value in here.tensors().items())

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order, convert, encode
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob, convert, encode
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import Recording
-from magnet.datamodules.store.reader import ROW, Folder, StoreError, decode
+from magnet.datamodules.store.reader import ROW, StoreError, StoreReader, decode
 from magnet.testing import random_scene
 from tests.datamodules import made
 from tests.datamodules.made import data
@@ -46,12 +46,12 @@ def test_prepare_then_read_gives_the_joints_of_the_recording_within_a_millimetre
     frames = int(2.2 * fps)
     body = made.write(folder / "dl", takes=1, frames=frames, persons=people, fps=fps)
     (folder / "dl/take0.txt").write_text(f"{frames} {people} {fps!r} {seed}")
-    order = Order(made.NAME, str(folder / "dl"), {}, str(body), Steps())
+    order = PrepareJob(made.NAME, str(folder / "dl"), {}, str(body), CanonicalizeOptions())
     (clip,) = prepare(order, folder / "st").folder.clips("train")
     reader = order.reader()
     recording = reader.read(reader.takes()[0])
     found = BODY.joints(clip.scene)[0].double()
-    # frames that fall together with the recording's, moved as one: independent of the common steps but for the shift
+    # frames that fall together with the recording's, moved as one: independent of `canonicalize` but for the shift
     true = body_joints(recording)
     time = np.arange(len(found)) / 30 * fps
     exact = np.flatnonzero(np.abs(time - time.round()) < 1e-6)
@@ -104,7 +104,7 @@ def test_what_is_no_store_is_refused_with_the_command(store, tmp_path):
     later = tmp_path / "manifest.json"
     later.write_text(json.dumps({**json.loads((store / "manifest.json").read_text()), "format": 99}))
     with pytest.raises(StoreError, match="store format 99, this version reads 1"):
-        Folder(tmp_path)
+        StoreReader(tmp_path)
 
 
 def test_any_store_can_be_read_without_its_own_class_but_not_by_anothers(store):
@@ -127,7 +127,9 @@ def test_a_group_larger_than_the_slots_is_refused(store):
 
 
 def test_a_reader_that_breaks_gives_its_own_take_up_alone(store, monkeypatch):
-    order = Order(made.NAME, str(store.parent / "dl"), {}, str(store.parent / "dl/body.npz"), Steps())
+    order = PrepareJob(
+        made.NAME, str(store.parent / "dl"), {}, str(store.parent / "dl/body.npz"), CanonicalizeOptions()
+    )
     reader = order.reader()
     take = reader.takes()[0]
 
@@ -135,5 +137,5 @@ def test_a_reader_that_breaks_gives_its_own_take_up_alone(store, monkeypatch):
         raise IndexError(f"list index out of range in {self.root}/take0.txt")
 
     monkeypatch.setattr(made.MadeReader, "read", broken)
-    part = convert(reader, take, BODY, Steps())
+    part = convert(reader, take, BODY, CanonicalizeOptions())
     assert part.error == "IndexError: list index out of range in take0.txt"

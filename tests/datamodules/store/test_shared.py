@@ -11,12 +11,12 @@ import torch
 
 from magnet.datamodules import Clip, Mixed
 from magnet.datamodules.fakes.motion import made_up_body
-from magnet.datamodules.preparing.canonicalize import Steps
-from magnet.datamodules.preparing.convert import Order
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
-from magnet.datamodules.store.draws import Augmentation, RandomDraws
-from magnet.datamodules.store.mapped import MappedStore, Piece
-from magnet.datamodules.store.reader import ROW, Folder
+from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.reader import ROW, StoreReader
+from magnet.datamodules.store.windows import Augmentation, RandomWindows
 from tests.datamodules import made
 from tests.datamodules.fakes import PLAIN, FakeData, FakeTrainer, random_clip
 from tests.datamodules.made import data
@@ -36,7 +36,7 @@ def with_roles(known, tmp_path_factory) -> Path:
 
     made.MadeReader.read = named  # type: ignore[method-assign]
     try:
-        order = Order(made.NAME, str(folder / "dl"), {}, str(body), Steps())
+        order = PrepareJob(made.NAME, str(folder / "dl"), {}, str(body), CanonicalizeOptions())
         prepare(order, folder / "store")
     finally:
         made.MadeReader.read = read  # type: ignore[method-assign]
@@ -45,7 +45,7 @@ def with_roles(known, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("resident", [False, True])
 def test_people_stand_in_the_order_of_roles(with_roles, resident):
-    folder = Folder(with_roles)
+    folder = StoreReader(with_roles)
     assert {tuple(entry["persons"]): entry["takes"] for entry in folder.manifest["persons"]} == {
         ("P1, leader", "P2, follower"): ["take0", "take2", "take4"],
         ("P2, follower", "P1, leader"): ["take1", "take3", "take5"],
@@ -70,7 +70,7 @@ def test_mixed_reads_stores_by_memory_map_and_no_clip_whole(store, with_roles, m
     parts = [made.Made(body_model=path, **kind) for kind in kinds]
     loaded = [made.Made(body_model=path, device_resident=True, **kind) for kind in kinds]
     options = {"batch_size": 16, "epoch_size": 64, "body_model": path, "compose": 0.5, "max_agents": 4}
-    monkeypatch.setattr(Folder, "clips", None)  # would load them all
+    monkeypatch.setattr(StoreReader, "clips", None)  # would load them all
     copied = []
     read = MappedStore.read
     monkeypatch.setattr(MappedStore, "read", lambda self, *a: copied.append(rows := read(self, *a)) or rows)
@@ -152,7 +152,7 @@ def test_mixed_gives_each_process_a_length_of_every_source(store, spread):
 
 def test_shares_are_a_function_of_seed_epoch_sample_rank_and_world(store):
     mapped = data(store).store("train")
-    make = lambda rank, world, seed=1: RandomDraws(mapped, 64, None, Augmentation(), seed, rank, world)  # noqa: E731
+    make = lambda rank, world, seed=1: RandomWindows(mapped, 64, None, Augmentation(), seed, rank, world)  # noqa: E731
     first, again = make(1, 4), make(1, 4)
     assert first.shared and not make(0, 1).shared
     whole, parts = first(2, 0, 12), [again(2, 0, 5), again(2, 5, 7)]
@@ -165,7 +165,7 @@ def test_shares_are_a_function_of_seed_epoch_sample_rank_and_world(store):
 def test_too_few_clips_are_drawn_from_by_everybody(store):
     mapped = data(store).store("train")
     assert mapped.owners(np.ones(len(mapped.names)), 100) is None
-    alone = MappedStore(Piece.stored(Folder(store), "train"), 2, spread=False)
+    alone = MappedStore(SplitData.stored(StoreReader(store), "train"), 2, spread=False)
     assert alone.owners(np.ones(len(mapped.names)), 2) is None
     owners = mapped.owners(mapped.length / mapped.length.sum(), 2)
     assert owners is not None and owners.tolist() == [0] * 6 + [1] * 6

@@ -9,7 +9,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from magnet.datamodules.store.draws import uniforms
+from magnet.datamodules.store.windows import uniforms
 from magnet.motion.scene import concatenate
 from tests.datamodules.fakes import FakeData, FakeTrainer, Recorder, couples_and_singles, one_epoch, quiet, same
 

@@ -1,4 +1,4 @@
-"""Data sets of other packages, and of modules in the working directory."""
+"""Which data sets there are: ours, of other packages, and of modules in the working directory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import pytest
 import yaml
 
 from magnet import cli
-from magnet.datamodules import Synthetic, plugins
+from magnet.datamodules import Synthetic, registry
+from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.reading.recording import Reader, Recording, Take
 from magnet.denoiser.module import Denoiser
 
 MINE = """
@@ -49,10 +51,14 @@ class Point:
 @pytest.fixture
 def offered(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Point]]:
     points: list[Point] = []
-    monkeypatch.setattr(plugins, "entry_points", lambda group: points if group == plugins.GROUP else [])
-    plugins.discover.cache_clear()
+    before = {entry.name for entry in registry.entries()}
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == registry.GROUP else [])
     yield points
-    plugins.discover.cache_clear()
+    for entry in registry.entries():
+        if entry.name not in before:
+            registry.unregister(entry.data)
+    monkeypatch.undo()
+    registry.discover(again=True)
 
 
 @pytest.fixture
@@ -65,23 +71,48 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         del sys.modules[name]
 
 
-def test_packages_are_listed_and_one_that_fails_hides_no_other(offered: list[Point], capsys) -> None:
+def test_packages_are_listed_and_one_that_fails_hides_no_other(offered: list[Point], tmp_path: Path, capsys) -> None:
     class Strolls(Synthetic):
         """People who stroll."""
+
+    class WalksReader(Reader):
+        """Walks."""
+
+        name, title, source, licence = "walks", "Walks of theirs", "https://example.org", "free"
+
+        def found(self) -> list[Take]:
+            return []
+
+        def read(self, take: Take) -> Recording:
+            raise NotImplementedError
+
+    class Walks(Prepared):
+        """People who walk."""
+
+        reader = WalksReader
 
     offered += [
         Point("Strolls", "theirs:Strolls", Strolls),
         Point("Broken", "theirs:Broken", ImportError("no module named shoes")),
         Point("Model", "theirs:Denoiser", Denoiser),
         Point("walks", "theirs:Strolls", Strolls),
+        Point("Walks", "theirs:Walks", Walks),
     ]
+    registry.discover(again=True)
     assert cli.main(["data", "list"]) == 0
     said = capsys.readouterr().out
     assert "Strolls  of theirs:Strolls" in said and "People who stroll." in said and "--data Strolls" in said
     assert re.search(r"failed to load +ImportError: no module named shoes", said)
-    assert re.search(r"failed to load +TypeError: theirs:Denoiser is no LightningDataModule", said)
+    assert re.search(r"failed to load +TypeError: .*Denoiser.> is no LightningDataModule", said)
     assert "call the entry point Strolls, too" in said
-    assert "cmu" in said and "DuoBox" in said
+    assert "CMU" in said and "DuoBox" in said
+    assert "walks  Walks of theirs" in said and "--data Walks --data.path STORE" in said
+    assert cli.main(["data", "fake", "walks", str(tmp_path / "new")]) == 2
+    assert (
+        "Walks of theirs brings no made-up download; ask for the data at https://example.org" in capsys.readouterr().err
+    )
+    with pytest.raises(ValueError, match="data set Broken failed to load: ImportError"):
+        registry.reader("Broken")
 
 
 def printed(capsys, *words: str) -> dict[str, Any]:
@@ -131,3 +162,40 @@ def test_a_module_that_is_wrong_is_told_from_one_that_is_not_there(text: str, me
     sys.modules.pop("mine_of_mine", None)
     assert cli.main(words) == 2
     assert "no module mine_of_mine, neither installed nor in the working directory" in capsys.readouterr().err
+
+
+# -- ours --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", registry.readers())
+def test_a_reader_has_all_its_parts(name: str) -> None:
+    kind = registry.reader(name)
+    data = registry.classes()[registry.data_of(kind)]
+    assert issubclass(kind, Reader) and kind.name == name and kind.fake
+    assert kind.source and kind.licence and issubclass(data, Prepared)
+    if kind.own:  # any store's module trains on it
+        assert data is Prepared
+    else:
+        assert re.match(r"https?://", kind.source) and data.reader is kind
+
+
+def test_every_module_of_the_list_registers_something_and_no_name_is_taken_twice() -> None:
+    modules = {kind.__module__ for kind in (*registry.classes().values(), *registry.readers().values())}
+    assert modules >= {f"magnet.datamodules.{module}" for module in registry.BUILT_IN}
+    assert registry.default_path() == "magnet.datamodules.synthetic.Synthetic"
+    other = type("Synthetic", (Synthetic,), {})
+    with pytest.raises(ValueError, match=r"Synthetic is taken by magnet\.datamodules\.synthetic"):
+        registry.register_data("theirs")(other)
+    with pytest.raises(TypeError, match="is no LightningDataModule"):
+        registry.register_data()(dict)  # type: ignore[type-var]
+    with pytest.raises(TypeError, match="is no Reader"):
+        registry.register_reader(dict)  # type: ignore[type-var]
+    with pytest.raises(ValueError, match=r"reader name dd100 is taken by magnet\.datamodules\.dd100"):
+        registry.register_reader(type("Mine", (registry.reader("dd100"),), {}))
+
+
+def test_a_wrong_name_suggests_the_closest_and_synthetic_needs_no_preparing() -> None:
+    with pytest.raises(ValueError, match="no data set 'interX'; did you mean interx"):
+        registry.reader("interX")
+    with pytest.raises(ValueError, match=r"synthetic has no files to prepare: magnet fit .* --data Synthetic trains"):
+        registry.reader("synthetic")

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from magnet.checks import require_whole
 from magnet.datamodules.clip import Ints
-from magnet.datamodules.store.memory import Draw, Store, all_starts, spaced_starts
+from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.window_index import WindowIndex, all_starts, spaced_starts
 from magnet.seeding import derive
 
 Floats = NDArray[np.float64]
@@ -46,7 +47,7 @@ def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Flo
     return np.random.Generator(philox).random((count, 4 * blocks))[:, :columns]
 
 
-class RandomDraws:
+class RandomWindows:
     """Training windows: sample i of epoch e depends only on (seed, e, i) and the clips.
 
     Where the store divides its clips among processes, a process draws from its own alone. Sample k of process r is
@@ -69,7 +70,7 @@ class RandomDraws:
 
     def __init__(
         self,
-        store: Store,
+        store: MemoryStore,
         frames: int,
         weights: Mapping[str, float] | None,
         augmentation: Augmentation,
@@ -114,7 +115,7 @@ class RandomDraws:
         windows = {s: self.count[source == s].sum() for s in weights}
         return np.array([weights.get(s, 0.0) / max(windows.get(s, 1), 1) for s in source])
 
-    def __call__(self, epoch: int, first: int, count: int) -> Draw:
+    def __call__(self, epoch: int, first: int, count: int) -> WindowIndex:
         """Samples `first` to `first + count` of an epoch; of this process's share, if there are shares."""
         slots = self.store.max_agents
         u = uniforms(self.seed, epoch, first, count, self.COLUMNS + slots)
@@ -124,7 +125,7 @@ class RandomDraws:
         people = self.store.people
         joining = np.where((u[:, 4] < augment.compose) & (a != b), np.minimum(people[b], slots - people[a]), 0)
         joining[people[a] + joining < 3] = 0
-        members, groups = seat(people[a], joining, people[b], (u[:, 5] * people[b]).astype(np.int64), slots)
+        members, groups = slot_assignment(people[a], joining, people[b], (u[:, 5] * people[b]).astype(np.int64), slots)
 
         total = people[a] + joining
         for scene in np.flatnonzero((u[:, 6] < augment.drop) & (total >= 2)):
@@ -136,9 +137,11 @@ class RandomDraws:
 
         clips = np.stack([a, np.where(joining > 0, b, -1)], axis=1)
         low, high = augment.apart
-        placing = np.stack([u[:, 8] * 2 * np.pi, u[:, 9] * 2 * np.pi, low + u[:, 10] * (high - low)], axis=1)
-        draw = Draw(clips, np.stack([start_a, start_b], axis=1), members, groups, u[:, 11] < augment.mirror, placing)
-        return without_empty_groups(draw)
+        relative_pose = np.stack([u[:, 8] * 2 * np.pi, u[:, 9] * 2 * np.pi, low + u[:, 10] * (high - low)], axis=1)
+        windows = WindowIndex(
+            clips, np.stack([start_a, start_b], axis=1), members, groups, u[:, 11] < augment.mirror, relative_pose
+        )
+        return without_empty_groups(windows)
 
     def _window(self, u: Floats, v: Floats) -> tuple[Ints, Ints]:
         clip = np.minimum(np.searchsorted(self.cdf, u, side="right"), len(self.cdf) - 1)
@@ -148,7 +151,7 @@ class RandomDraws:
         return clip, start
 
 
-def seat(first: Ints, joining: Ints, second: Ints, turn: Ints, slots: int) -> tuple[Ints, Ints]:
+def slot_assignment(first: Ints, joining: Ints, second: Ints, turn: Ints, slots: int) -> tuple[Ints, Ints]:
     """Slots in order: all `first` people, then `joining` of the `second` ones, from person `turn` on. -> (B, P) x 2"""
     slot = np.arange(slots)
     later = slot - first[:, None]
@@ -167,18 +170,18 @@ def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
     return list(groups[int(which * len(groups))])
 
 
-def without_empty_groups(draw: Draw) -> Draw:
+def without_empty_groups(windows: WindowIndex) -> WindowIndex:
     """A scene of which one group has been dropped altogether is a scene of the other."""
     for group in (0, 1):
-        gone = (draw.clips[:, 1] >= 0) & ~((draw.members >= 0) & (draw.groups == group)).any(axis=1)
+        gone = (windows.clips[:, 1] >= 0) & ~((windows.members >= 0) & (windows.groups == group)).any(axis=1)
         if group == 0:
-            draw.clips[gone, 0], draw.starts[gone, 0] = draw.clips[gone, 1], draw.starts[gone, 1]
-            draw.groups[gone] = 0
-        draw.clips[gone, 1] = -1
-    return draw
+            windows.clips[gone, 0], windows.starts[gone, 0] = windows.clips[gone, 1], windows.starts[gone, 1]
+            windows.groups[gone] = 0
+        windows.clips[gone, 1] = -1
+    return windows
 
 
-def fixed_draws(store: Store, frames: int, stride: int, pad: bool = False) -> Draw:
+def fixed_windows(store: MemoryStore, frames: int, stride: int, pad: bool = False) -> WindowIndex:
     """Clean windows of every clip in order, `stride` apart.
 
     Args:
@@ -192,27 +195,29 @@ def fixed_draws(store: Store, frames: int, stride: int, pad: bool = False) -> Dr
         good = store.good(c)
         starts = all_starts(good, frames) if pad and len(good) < frames else spaced_starts(good, frames, stride)
         pairs += [(c, int(start)) for start in starts]
-    return whole_clips(store, pairs)
+    return recorded_windows(store, pairs)
 
 
-def whole_clips(store: Store, windows: Sequence[tuple[int, int]]) -> Draw:
+def recorded_windows(store: MemoryStore, pairs: Sequence[tuple[int, int]]) -> WindowIndex:
     """Windows (clip, start) as recorded, everybody in the first slots."""
-    array = np.array(windows, dtype=np.int64).reshape(-1, 2)
+    array = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     people = store.people[array[:, 0]]
     none = np.zeros_like(people)
-    members, groups = seat(people, none, none + 1, none, store.max_agents)
+    members, groups = slot_assignment(people, none, none + 1, none, store.max_agents)
     nowhere = np.full_like(people, -1)
-    return Draw(
+    return WindowIndex(
         clips=np.stack([array[:, 0], nowhere], axis=1),
         starts=np.stack([array[:, 1], none], axis=1),
         members=members,
         groups=groups,
         mirrored=np.zeros(len(array), dtype=bool),
-        placing=np.zeros((len(array), 3)),
+        relative_pose=np.zeros((len(array), 3)),
     )
 
 
-def composed_draws(store: Store, plain: Draw, count: int, apart: tuple[float, float], seed: int) -> Draw:
+def composed_windows(
+    store: MemoryStore, plain: WindowIndex, count: int, apart: tuple[float, float], seed: int
+) -> WindowIndex:
     """Scenes of three and four people in turn, each made of two of the plain windows of different clips.
 
     Where the second clip has more people than the scene still needs, some of them are left out.
@@ -244,13 +249,13 @@ def composed_draws(store: Store, plain: Draw, count: int, apart: tuple[float, fl
     first, second = np.array(rows, dtype=np.int64).T
     wanted = np.array([sizes[k % len(sizes)] for k in range(count)], dtype=np.int64)
     turn = (u[:, 1] * people[second]).astype(np.int64)
-    members, groups = seat(people[first], wanted - people[first], people[second], turn, store.max_agents)
+    members, groups = slot_assignment(people[first], wanted - people[first], people[second], turn, store.max_agents)
     low, high = apart
-    return Draw(
+    return WindowIndex(
         clips=np.stack([plain.clips[first, 0], plain.clips[second, 0]], axis=1),
         starts=np.stack([plain.starts[first, 0], plain.starts[second, 0]], axis=1),
         members=members,
         groups=groups,
         mirrored=np.zeros(count, dtype=bool),
-        placing=np.stack([u[:, 2] * 2 * np.pi, u[:, 3] * 2 * np.pi, low + u[:, 4] * (high - low)], axis=1),
+        relative_pose=np.stack([u[:, 2] * 2 * np.pi, u[:, 3] * 2 * np.pi, low + u[:, 4] * (high - low)], axis=1),
     )
