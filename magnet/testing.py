@@ -144,7 +144,7 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
             continue
         _check_plan(task, grid, schedule)
         _check_samples(task, grid, schedule)
-        _check_hidden(task, grid, schedule)
+        check_hidden(task, grid, schedule)
         if grids is not None or len(checked) < POSED:
             pose_law(task, grid)
         if nameless:
@@ -249,7 +249,7 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     _require(same, f"{place}: scenes in a batch are sampled otherwise than alone")
 
 
-def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
+def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
     """Change what a stage hides from an agent, on the canvas, in all that the model says of it, and in what it said."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)

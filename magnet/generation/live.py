@@ -138,7 +138,7 @@ class Live:
         if not 1 <= people <= slots:
             raise ValueError(f"people: got {people}, expected 1 to {slots}, the slots that the model has")
         empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
-        made = self._sample(empty, Generation(), 0, FIRST)
+        made = self.sample(empty, Generation(), 0, FIRST)
         return made.replace(given=torch.zeros(1, FIRST, people, dtype=torch.bool))
 
     def _check(self, start: Scene) -> None:
@@ -213,7 +213,7 @@ class Live:
                 "try joint_future, motion_control or inbetweening"
             )
         given = self._future(past, scene.frames, known, frames)
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        piece = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return self._append(scene, piece, version, begun)
 
     def between(self) -> Piece:
@@ -231,7 +231,7 @@ class Live:
         shifted = [dataclasses.replace(key, frame=key.frame - start + CONTEXT) for key in keys]
         given = with_keyframes(self._held(scene.slice(start - CONTEXT), frames), shifted)
         task = Inbetweening(pairs=tuple((key.agent, key.frame // STRIDE) for key in shifted))
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        piece = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return dataclasses.replace(self._append(scene, piece, version, begun, anew=True), between=True)
 
     def between_from(self) -> int:
@@ -261,7 +261,7 @@ class Live:
             self.made, self.spent = self.made + piece.frames, self.spent + took
             return Piece(scene.frames, piece.frames, took)
 
-    def _sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
+    def sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
         # A piece fits into the window, so denoising it all at once costs the fewest steps.
         # What it has made itself is not asked where its floor is.
         settings = self.settings
@@ -314,7 +314,7 @@ class Live:
                 last = CONTEXT + REACH - STRIDE
                 task = Inbetweening(pairs=tuple((agent, last // STRIDE) for agent in steered))
                 goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
-            made = self._sample(goals, task, CONTEXT, length).replace(given=goals.given)
+            made = self.sample(goals, task, CONTEXT, length).replace(given=goals.given)
             source = made.slice(0, CONTEXT + frames)
         chosen = agents[None, None, :, None, None]
         assert scene.given is not None and source.given is not None

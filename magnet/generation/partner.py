@@ -52,12 +52,12 @@ class Partner:
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present = past.present
         whole = past.slice(past.frames % STRIDE).replace(valid=None, given=None)
-        self._stream = FedStream(denoiser, whole, self.task, self.options, generator)
+        self.stream = FedStream(denoiser, whole, self.task, self.options, generator)
 
     @property
     def past(self) -> Scene:
         """The last frames of everybody, given and answered, as far back as the model or its decoder still looks."""
-        canvas = self._stream.canvas
+        canvas = self.stream.canvas
         held = canvas.given.slice(0, canvas.shown * STRIDE)
         return held.permute_agents(torch.arange(self._present.shape[1]))
 
@@ -81,6 +81,6 @@ class Partner:
         if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
         # Block by block: what has been fed beyond a block is not to be read in it.
-        answers = [self._stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        answers = [self.stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
         answer = cat_time(answers).replace(names=frames.names)
         return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))

@@ -241,14 +241,14 @@ def test_what_was_asked_for_is_made_while_the_worker_rests(live: Live) -> None:
 
 
 def test_a_piece_that_went_on_from_a_forgotten_past_is_dropped(live: Live, monkeypatch) -> None:
-    sample = live._sample
+    sample = live.sample
 
     def restarted_meanwhile(*arguments):
         done = sample(*arguments)
         live.restart(40)
         return done
 
-    monkeypatch.setattr(live, "_sample", restarted_meanwhile)
+    monkeypatch.setattr(live, "sample", restarted_meanwhile)
     assert live.advance().frames == 0
     assert live.scene.frames == 40
 

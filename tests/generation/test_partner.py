@@ -131,7 +131,7 @@ def test_memory_does_not_grow(denoiser, duet):
     held = []
     for _ in range(60):
         partner.answer(duet.slice(16, 20))
-        stream = partner._stream
+        stream = partner.stream
         held.append((partner.past.frames, stream.scene.frames, stream.tokens.shape[1], stream.mask_noise.shape[1]))
     assert held[-1] == held[-20] and max(held[-1]) < 100
     assert torch.equal(partner.past.T_world_root[:, -4:, 1], duet.T_world_root[:, 16:20, 1])
