@@ -250,18 +250,18 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 
 def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
-    """Change what a stage hides from an agent, on the canvas, in all that the model says of it, and in what it said."""
+    """Change what a stage hides from an agent, in the tokens, in all that the model says of it, and in what it said."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
     tokens, noise, mask_noise, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
-    canvas = begin(tokens, noise, schedule.known, layout)
-    history = History.empty(canvas)
+    tokens = begin(tokens, noise, schedule.known, layout)
+    history = History.empty(tokens)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
-        before, past = canvas, history.copy()
-        canvas = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
+        before, past = tokens, history.copy()
+        tokens = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
         if stage.hidden is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -281,7 +281,7 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
             after = run_stages(
                 model, [stage], changed, mask_noise, present, layout, guidance=guidance, history=remembered
             )
-            same = ((after == canvas)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
+            same = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
                 _require(same[agent], f"{_place(task, grid)}: {message}")
@@ -336,8 +336,8 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
         latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
         return layout.pack(latent, steps, torch.tanh(pairs + steps.mean(dim=(-1, -2))[..., None, None, None]))
 
-    canvas = begin(tokens, noise, schedule.known, layout)
-    return run_stages(blind, schedule.stages, canvas, mask_noise, there.expand(len(tokens), P), layout)
+    tokens = begin(tokens, noise, schedule.known, layout)
+    return run_stages(blind, schedule.stages, tokens, mask_noise, there.expand(len(tokens), P), layout)
 
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:

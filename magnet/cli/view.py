@@ -188,7 +188,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
 
     from magnet.cli import checkpoint_config
     from magnet.denoiser.module import Denoiser
-    from magnet.generation.recording import record
+    from magnet.generation.trace import record
     from magnet.tasks import registry
 
     task = registry.get(options.task)()

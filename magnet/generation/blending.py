@@ -10,8 +10,8 @@ from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, t
 from magnet.motion.scene import Scene, cat_time
 
 SPRING = 2.5
-"""How fast `go_on` fades, against the frames over which a seam is to: the slower, the smoother, and the longer feet
-slide that the decoder had put elsewhere. With `blend` 10 a difference is halved in 7 frames."""
+"""Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
+put elsewhere slide for longer. With `blend` 10 a difference is halved in 7 frames."""
 
 
 def smoothstep(ramp: Tensor) -> Tensor:
@@ -29,7 +29,7 @@ def step_between(T_world_can: Tensor, key_step: Tensor) -> Tensor:
     return from_planar((yaw + key_yaw) / 2, (ground + key_ground) / 2)
 
 
-def arrive(T_world_can: Tensor, T_world_key: Tensor, key_step: Tensor) -> Tensor:
+def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_step: Tensor) -> Tensor:
     """Bend a path so that it leads to a known frame: first the turns, then, with steps as long as before, the way.
 
     Args:
@@ -133,7 +133,7 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
     return torch.where(after, stays, 0.0), torch.where(grows, since * left, 0.0)
 
 
-def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
+def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Put given frames back, and go on from them smoothly into what is decoded; nothing in front of a seam changes.
 
     Unlike with `crossfade_given`, poses go on as fast as they were moving: each block of a causal plan has a seam, and
@@ -171,7 +171,7 @@ def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend
     )
 
 
-def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
+def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
     """Agents that are neither given nor generated from some time on stand still from there.
 
     there (T, P) bool; `before` is the frame in front of the scene's first, if there is one.
@@ -180,6 +180,6 @@ def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
         return scene
     if before is not None:
         whole = cat_time([before, scene])
-        return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).slice(1)
+        return freeze_after(whole, torch.cat([torch.ones_like(there[:1]), there])).slice(1)
     last, agents = last_known(there), torch.arange(there.shape[1], device=there.device)
     return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.blending import arrive, crossfade_given, hold, step_between
-from magnet.generation.conditioning import reach, sight
-from magnet.generation.showing import seen
+from magnet.generation.blending import crossfade_given, freeze_after, step_between, warp_to_keyframe
+from magnet.generation.causal_bodies import finalized_bodies
+from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.motion.frames import (
     Placement,
     canonical_frame,
@@ -90,7 +90,7 @@ class SamplingStats:
         self.pairwise_drifts += len(away)
 
 
-class Canvas:
+class WorldState:
     """World poses of the scene while it is being generated.
 
     After each stage the new tokens are made self-consistent before the model sees them again: codes
@@ -99,7 +99,7 @@ class Canvas:
 
     Args:
         model: whose tokens these are.
-        given: (B, T) what is known of the scene, the rest scrubbed; or of its first rows, see `extend`.
+        given: (B, T) what is known of the scene, the rest masked; or of its first rows, see `extend`.
         schedule: the plan of the whole scene; only what it knows is read.
         options: how to sample.
         samples: scenes drawn for each of B.
@@ -125,8 +125,8 @@ class Canvas:
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
-        self.causal, self._sight, self.released = schedule.causal, sight(schedule), 0
-        self.shown = 0  # rows of a causal plan whose bodies are final, and given from then on
+        self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
+        self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
 
     def extend(self, given: Scene, known: Tensor) -> None:
         """Take in more rows at the end. given (B, 4 n), known (n, P)"""
@@ -140,14 +140,14 @@ class Canvas:
         change must stay."""
         frames = rows * STRIDE
         self.rooted |= bool(self.known[:rows].any())
-        self.shown, self.released = max(self.shown - rows, 0), self.released + rows
+        self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
         self.T_world_can = self.T_world_can[:, frames:].clone()
         kept = self.given.slice(frames)
         self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
-    def make_consistent(self, canvas: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
-        """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
+    def make_consistent(self, tokens: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
+        """Make the tokens that a stage finished self-consistent, in place. tokens (B, N, P, D), finished (N, P) bool
 
         Of known tokens nothing changes but the step that leads into them, once it is known where from. `decentralized`:
         some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
@@ -155,12 +155,12 @@ class Canvas:
         """
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
-            return canvas
+            return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        latent, steps, pairs = layout.unpack(normalizer.denormalize(canvas[:, first:stop]))
+        latent, steps, pairs = layout.unpack(normalizer.denormalize(tokens[:, first:stop]))
         if self.model.quantized if self.options.requantize is None else self.options.requantize:
-            new = finished[first:stop].to(canvas.device)
+            new = finished[first:stop].to(tokens.device)
             code = self.model.tokenizer.requantize(latent)
             self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
@@ -168,21 +168,21 @@ class Canvas:
         moved = self._place_all(steps, pairs if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
-            earlier = layout.unpack(normalizer.denormalize(canvas[:, begin:first]))[0]
+            earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
         true_steps = self._steps(begin, stop)
         implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
         settled = layout.pack(latent, true_steps, implied)
-        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
+        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
         if layout.slots:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
             if decentralized:
-                new = finished[first:stop].to(canvas.device)
-                together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
+                new = finished[first:stop].to(tokens.device)
+                together &= ~(new[:, :, None] & new[:, partners(layout.agents, tokens.device)])
             self.stats.add_pairwise_drift(pairs, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
-        canvas[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), canvas[:, begin:stop])
-        return self._enter(canvas, begin, stop)
+        tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
+        return self._enter(tokens, begin, stop)
 
     def _steps(self, first: int, stop: int) -> Tensor:
         """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
@@ -194,21 +194,21 @@ class Canvas:
         steps[:, :, :, 0] = torch.where(before[..., None], steps[:, :, :, 0], to_9d(torch.eye(4)).to(steps))
         return steps
 
-    def _enter(self, canvas: Tensor, first: int, stop: int) -> Tensor:
+    def _enter(self, tokens: Tensor, first: int, stop: int) -> Tensor:
         """Write the true step into known tokens that a gap has just been closed in front of."""
         until = min(stop + 1, len(self.known))
         before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
-        entered = (self.known[first:until] & ~before).to(canvas.device)
+        entered = (self.known[first:until] & ~before).to(tokens.device)
         entered[0] = False  # nothing in front of these rows has moved
         if not bool(entered.any()):
-            return canvas
+            return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
-        latent, _, pairs = layout.unpack(canvas[:, first:until])
+        latent, _, pairs = layout.unpack(tokens[:, first:until])
         true = normalizer.normalize(layout.pack(latent, self._steps(first, until), pairs))
-        number = torch.arange(layout.width, device=canvas.device)
+        number = torch.arange(layout.width, device=tokens.device)
         step = (number >= layout.latent) & (number < layout.latent + 9)
-        canvas[:, first:until] = torch.where(entered[..., None] & step, true, canvas[:, first:until])
-        return canvas
+        tokens[:, first:until] = torch.where(entered[..., None] & step, true, tokens[:, first:until])
+        return tokens
 
     def _ready(self, first: int, stop: int) -> Tensor:
         """Which groups of tokens speak only of agents that are placed. -> (n, P, 1 + slots) bool"""
@@ -242,7 +242,7 @@ class Canvas:
             near = None if pairs is None else pairs[:, part]
             self._place(steps[:, part], near, start, end, new, placement)
             self.placed[start:end] |= new
-            moved |= self._arrive(end, new)
+            moved |= self._warp_to_keyframe(end, new)
         return moved
 
     def _place(
@@ -301,7 +301,7 @@ class Canvas:
             starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
         return starts
 
-    def _arrive(self, row: int, new: Tensor) -> Tensor:
+    def _warp_to_keyframe(self, row: int, new: Tensor) -> Tensor:
         """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
 
         Each agent's misfit is spread over its whole gap, or as much of it as has not been shown. Where nothing was
@@ -312,28 +312,28 @@ class Canvas:
         if not bool(arriving.any()):
             return moved
         key = row * STRIDE
-        if not self.rooted and not self.shown and not bool(self.known[:row].any()):
+        if not self.rooted and not self.finalized and not bool(self.known[:row].any()):
             self._root(key, arriving)
             moved[:row] |= self.placed[:row]
         for agent in arriving.nonzero()[:, 0].tolist():
             T_world_key = self.T_world_can[:, key, agent]
             key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
             gap = (self.placed & ~self.known)[:row, agent]
-            gap[: self.shown] = False  # too late to move
+            gap[: self.finalized] = False  # too late to move
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
             path = self.T_world_can[:, start * STRIDE - left : key, agent]
-            self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
+            self.T_world_can[:, start * STRIDE : key, agent] = warp_to_keyframe(path, T_world_key, key_step)[:, left:]
             moved[start:row, agent] = True
         return moved
 
     def _late(self, row: int) -> Tensor:
         """Who is told of a known token only when the one before has been shown. -> (P,) bool"""
         row += self.released
-        if not self.causal or not 0 < row < len(self._sight):
+        if not self.causal or not 0 < row < len(self._lookahead_limit):
             return torch.zeros_like(self.known[0])
-        return self._sight[row - 1] <= row
+        return self._lookahead_limit[row - 1] <= row
 
     def _root(self, key: int, arriving: Tensor) -> None:
         """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
@@ -348,21 +348,21 @@ class Canvas:
         now = self.T_world_can[:, :key]
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
-    def scene(self, canvas: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
-        """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
+    def scene(self, tokens: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
+        """Rows [first, stop) of the finished tokens as bodies in the world; by default all rows.
 
         `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
         Poses depend on as many neighbouring rows as the decoder and the seams reach; those of causal plans on earlier
-        rows alone (`magnet.generation.showing`).
+        rows alone (`magnet.generation.causal_bodies`).
         """
         if self.causal:
-            return seen(self, canvas, first, len(self.known) if stop is None else stop)
+            return finalized_bodies(self, tokens, first, len(self.known) if stop is None else stop)
         layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.keep_given else 0
         stop = len(self.known) if stop is None else stop
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
-        behind, ahead = reach(self.model)
+        behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
-        latent, steps, _ = layout.unpack(self.model.normalizer.denormalize(canvas[:, near]))
+        latent, steps, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
         features = self.model.tokenizer.decode(latent, self.given.betas, steps)
         frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
         given = self.given.slice(low * STRIDE, high * STRIDE)
@@ -373,7 +373,7 @@ class Canvas:
                 decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
             )
         decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
-        return hold(decoded, self.by_frame(self.placed[first:stop]), before)
+        return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:
         """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""

@@ -145,7 +145,7 @@ class Tokenizer(L.LightningModule):
         """
         if window is None or latent.shape[1] <= window:
             return self._reconstruct(latent, betas, steps)
-        before, after = self.vqvae.decoder.reach
+        before, after = self.vqvae.decoder.receptive_field
         parts = []
         for start in range(0, latent.shape[1], window):
             first = max(start - before, 0)
