@@ -328,13 +328,13 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
 
     def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Tokens of an agent from its own, its pairs and everybody's, all slots alike."""
-        latent, steps, pairs = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
-        own = torch.cat([latent, steps.flatten(-2)], dim=-1) * there[:, None]
+        latent, deltas, pairs = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
+        own = torch.cat([latent, deltas.flatten(-2)], dim=-1) * there[:, None]
         pairs = pairs * both[..., None, None]
         everybody = own.sum(dim=2, keepdim=True).mean(dim=1, keepdim=True) / there.sum()
         own = torch.tanh(own.roll(1, dims=1) + everybody + pairs.flatten(3).sum(dim=-1, keepdim=True))
-        latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
-        return layout.pack(latent, steps, torch.tanh(pairs + steps.mean(dim=(-1, -2))[..., None, None, None]))
+        latent, deltas = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, deltas.shape[-2:])
+        return layout.pack(latent, deltas, torch.tanh(pairs + deltas.mean(dim=(-1, -2))[..., None, None, None]))
 
     tokens = begin(tokens, noise, schedule.known, layout)
     return run_stages(blind, schedule.stages, tokens, mask_noise, there.expand(len(tokens), P), layout)
@@ -342,14 +342,14 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:
     """Tokens of the same people in other slots: agent p becomes what agent order[p] was. (B, N, P, D) -> same"""
-    latent, steps, pairs = layout.unpack(tokens)
+    latent, deltas, pairs = layout.unpack(tokens)
     P = layout.agents
     whole = pairs.new_zeros(*pairs.shape[:2], P, P, *pairs.shape[4:])
     rows, columns = torch.arange(P)[:, None], partners(P)
     if layout.slots:
         whole[:, :, rows, columns] = pairs
         pairs = whole[:, :, order][:, :, :, order][:, :, rows, columns]
-    return layout.pack(latent[:, :, order], steps[:, :, order], pairs)
+    return layout.pack(latent[:, :, order], deltas[:, :, order], pairs)
 
 
 def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:

@@ -114,12 +114,12 @@ def decode_bodies(
     model, options = world.model, world.options
     lead = LEAD if first else 0
     low = max(first - bool(first) - receptive_field(model)[0], 0)
-    latent, steps, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
+    latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
     if expected is not None:
-        later, ways = continuation(world, latent, steps, expected)
-        latent, steps = torch.cat([latent, later], dim=1), torch.cat([steps, ways], dim=1)
+        later, ways = continuation(world, latent, deltas, expected)
+        latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * STRIDE - lead, stop * STRIDE)
-    features = model.tokenizer.decode(latent, world.given.betas, steps)
+    features = model.tokenizer.decode(latent, world.given.betas, deltas)
     features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
@@ -131,12 +131,12 @@ def decode_bodies(
 
 
 def continuation(
-    world: WorldState, latent: Tensor, steps: Tensor, expected: tuple[Tensor, Tensor]
+    world: WorldState, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Latents and steps to decode behind the last ones; whoever nothing is expected of goes on as in the last token."""
+    """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
     tokens, told = expected
     told = told.to(latent.device)
     later, ways, _ = world.model.layout.unpack(world.model.normalizer.denormalize(tokens))
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])
-    return later, torch.where(told[:, None, None], ways, steps[:, -1:])
+    return later, torch.where(told[:, None, None], ways, deltas[:, -1:])

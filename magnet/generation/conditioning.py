@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_choice, require_number, require_whole
-from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
+from magnet.motion.frames import Placement, canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import STRIDE, by_token, pairwise_by_token
 from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
@@ -41,10 +41,10 @@ class SamplerOptions:
             8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
             that can roll do, with half of the window half denoised; those whose agents take turns or that look
             ahead to keyframes go in strides.
-        placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
+        placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        pairwise_weight: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
-            (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
+        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
+            (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
         requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
             does. None: if codes are what the model was trained to generate (`target` of the denoiser).
         keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
@@ -219,25 +219,25 @@ def known_tokens(
 
     Each agent's known segments are encoded one by one: an encoder that looks ahead must not see beyond a segment, nor
     beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are
-    those of `related`, by default the same scene. The step into a segment from an unknown frame is unknown too: the
-    segment's next step stands in for it, which leaves a smaller error at keyframes than a step of zero. The first
+    those of `related`, by default the same scene. The delta into a segment from an unknown frame is unknown too: the
+    segment's next delta stands in for it, which leaves a smaller error at keyframes than a delta of zero. The first
     step of a scene is zero.
     """
     N, P = known.shape
     like = given.T_world_root
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
-    steps = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
+    deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
     for start, stop, agents in segments(known):
         part = given.slice(start * STRIDE, stop * STRIDE).permute_agents(torch.tensor(agents, device=like.device))
         for low, first, last, limit, those in encodings(start, stop, agents, limits, receptive_field(model)[0]):
             seen = given.slice(low * STRIDE, limit * STRIDE).permute_agents(torch.tensor(those, device=like.device))
             latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
-        own = by_token(to_9d(canonical_steps(canonical_frame(part.T_world_root))))
+        own = by_token(to_9d(canonical_deltas(canonical_frame(part.T_world_root))))
         if start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
-        steps[:, start:stop, agents] = own
+        deltas[:, start:stop, agents] = own
     pairs = pairwise_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
-    return model.normalizer.normalize(model.layout.pack(latent, steps, pairs))
+    return model.normalizer.normalize(model.layout.pack(latent, deltas, pairs))
 
 
 def encodings(

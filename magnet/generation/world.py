@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.blending import crossfade_given, freeze_after, step_between, warp_to_keyframe
+from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
 from magnet.generation.causal_bodies import finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.motion.frames import (
     Placement,
+    align_planar,
+    canonical_deltas,
     canonical_frame,
-    canonical_steps,
     from_9d,
     inverse,
     pairwise,
@@ -23,7 +24,6 @@ from magnet.motion.frames import (
     place,
     posed,
     project_se2,
-    shift_onto,
     to_9d,
 )
 from magnet.motion.scene import Scene, cat_time
@@ -149,30 +149,30 @@ class WorldState:
     def make_consistent(self, tokens: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
         """Make the tokens that a stage finished self-consistent, in place. tokens (B, N, P, D), finished (N, P) bool
 
-        Of known tokens nothing changes but the step that leads into them, once it is known where from. `decentralized`:
-        some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
-        would tie together who decided alone, so everybody is placed by the own steps, whatever the options say.
+        Known tokens keep everything but the delta that leads into them, which is written once the agent before them is
+        placed. `decentralized`: some agents did not see what others did in this stage. Their pairwise transforms are
+        noise then, so everybody is placed by the own deltas alone, whatever the options say.
         """
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
             return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        latent, steps, pairs = layout.unpack(normalizer.denormalize(tokens[:, first:stop]))
+        latent, deltas, pairs = layout.unpack(normalizer.denormalize(tokens[:, first:stop]))
         if self.model.quantized if self.options.requantize is None else self.options.requantize:
             new = finished[first:stop].to(tokens.device)
             code = self.model.tokenizer.requantize(latent)
             self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
-        moved = self._place_all(steps, pairs if layout.slots else None, finished, first, stop, placement)
+        moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
-        true_steps = self._steps(begin, stop)
+        true_deltas = self._deltas(begin, stop)
         implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
-        settled = layout.pack(latent, true_steps, implied)
+        settled = layout.pack(latent, true_deltas, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
         if layout.slots:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
@@ -184,18 +184,18 @@ class WorldState:
         tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
         return self._enter(tokens, begin, stop)
 
-    def _steps(self, first: int, stop: int) -> Tensor:
+    def _deltas(self, first: int, stop: int) -> Tensor:
         """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
-        # One frame more in front, so that the first step leads in from where each agent stood.
+        # One frame more in front, so that the first delta leads in from where each agent stood.
         lead = min(1, first)
-        steps = canonical_steps(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
-        steps = by_token(to_9d(steps))
-        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(steps.device)
-        steps[:, :, :, 0] = torch.where(before[..., None], steps[:, :, :, 0], to_9d(torch.eye(4)).to(steps))
-        return steps
+        deltas = canonical_deltas(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
+        deltas = by_token(to_9d(deltas))
+        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(deltas.device)
+        deltas[:, :, :, 0] = torch.where(before[..., None], deltas[:, :, :, 0], to_9d(torch.eye(4)).to(deltas))
+        return deltas
 
     def _enter(self, tokens: Tensor, first: int, stop: int) -> Tensor:
-        """Write the true step into known tokens that a gap has just been closed in front of."""
+        """Write the true delta into known tokens that a gap has just been closed in front of."""
         until = min(stop + 1, len(self.known))
         before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
         entered = (self.known[first:until] & ~before).to(tokens.device)
@@ -204,10 +204,10 @@ class WorldState:
             return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
         latent, _, pairs = layout.unpack(tokens[:, first:until])
-        true = normalizer.normalize(layout.pack(latent, self._steps(first, until), pairs))
+        true = normalizer.normalize(layout.pack(latent, self._deltas(first, until), pairs))
         number = torch.arange(layout.width, device=tokens.device)
-        step = (number >= layout.latent) & (number < layout.latent + 9)
-        tokens[:, first:until] = torch.where(entered[..., None] & step, true, tokens[:, first:until])
+        delta = (number >= layout.latent) & (number < layout.latent + 9)
+        tokens[:, first:until] = torch.where(entered[..., None] & delta, true, tokens[:, first:until])
         return tokens
 
     def _ready(self, first: int, stop: int) -> Tensor:
@@ -227,7 +227,7 @@ class WorldState:
 
     def _place_all(
         self,
-        steps: Tensor,
+        deltas: Tensor,
         pairs: Tensor | None,
         finished: Tensor,
         first: int,
@@ -240,19 +240,19 @@ class WorldState:
             part = slice(start - first, end - first)
             new = finished[start]
             near = None if pairs is None else pairs[:, part]
-            self._place(steps[:, part], near, start, end, new, placement)
+            self._place(deltas[:, part], near, start, end, new, placement)
             self.placed[start:end] |= new
             moved |= self._warp_to_keyframe(end, new)
         return moved
 
     def _place(
-        self, steps: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
+        self, deltas: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
     ) -> None:
-        """Put newly generated agents into the world from their predicted steps and pairs. new (P,) bool"""
-        new = new.to(steps.device)
-        known = self.placed[first].to(steps.device)
-        true_steps = from_9d(by_frame(self._steps(first, stop)))
-        T_prev_can = torch.where(known[:, None, None], true_steps, project_se2(from_9d(by_frame(steps))))
+        """Put newly generated agents into the world from their predicted deltas and pairs. new (P,) bool"""
+        new = new.to(deltas.device)
+        known = self.placed[first].to(deltas.device)
+        true_deltas = from_9d(by_frame(self._deltas(first, stop)))
+        T_prev_can = torch.where(known[:, None, None], true_deltas, project_se2(from_9d(by_frame(deltas))))
         T_self_partner = None
         if pairs is not None:
             T_self_partner = from_9d(pairwise_by_frame(pairs))
@@ -271,7 +271,7 @@ class WorldState:
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
-        """Canonical frames just before token `first`, such that the first step leads to the right place.
+        """Canonical frames just before token `first`, such that the first delta leads to the right place.
 
         Whoever was there before goes on from there. A newcomer's whole way hangs by the pairwise transforms, as
         nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
@@ -297,7 +297,7 @@ class WorldState:
         for agent in (~there & ~now).nonzero()[:, 0].tolist():
             slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
             hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
-            shift = shift_onto(ways[:, :, agent], hung)
+            shift = align_planar(ways[:, :, agent], hung)
             starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
         return starts
 
@@ -317,14 +317,14 @@ class WorldState:
             moved[:row] |= self.placed[:row]
         for agent in arriving.nonzero()[:, 0].tolist():
             T_world_key = self.T_world_can[:, key, agent]
-            key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
+            key_delta = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
             gap = (self.placed & ~self.known)[:row, agent]
             gap[: self.finalized] = False  # too late to move
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
             path = self.T_world_can[:, start * STRIDE - left : key, agent]
-            self.T_world_can[:, start * STRIDE : key, agent] = warp_to_keyframe(path, T_world_key, key_step)[:, left:]
+            self.T_world_can[:, start * STRIDE : key, agent] = warp_to_keyframe(path, T_world_key, key_delta)[:, left:]
             moved[start:row, agent] = True
         return moved
 
@@ -340,9 +340,9 @@ class WorldState:
         there = self.given.present & arriving.to(self.given.device)
         scene, lead = torch.arange(len(there), device=there.device), first_of(there)
         T_world_key = self.T_world_can[scene, key, lead]
-        key_step = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
+        key_delta = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
         path = self.T_world_can[scene, :key, lead]
-        shift = T_world_key @ inverse(path[:, -1] @ step_between(path, key_step))
+        shift = T_world_key @ inverse(path[:, -1] @ delta_between(path, key_delta))
         shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
         placed = self.by_frame(self.placed[: key // STRIDE])[..., None, None]
         now = self.T_world_can[:, :key]
@@ -362,8 +362,8 @@ class WorldState:
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
         behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
-        latent, steps, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
-        features = self.model.tokenizer.decode(latent, self.given.betas, steps)
+        latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
+        features = self.model.tokenizer.decode(latent, self.given.betas, deltas)
         frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
         given = self.given.slice(low * STRIDE, high * STRIDE)
         T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]

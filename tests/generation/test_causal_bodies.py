@@ -47,8 +47,8 @@ def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
     """As if the clip ended there."""
     world, tokens = finished(model, scene, BARE)
     made = decode_bodies(world, tokens, 6, 8, 8)
-    latent, steps, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, :8]))
-    clip = posed(model.tokenizer.decode(latent, scene.betas, steps), world.T_world_can[:, :32], scene.slice(0, 32))
+    latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, :8]))
+    clip = posed(model.tokenizer.decode(latent, scene.betas, deltas), world.T_world_can[:, :32], scene.slice(0, 32))
     assert torch.allclose(made.body_rot, clip.body_rot[:, 24:], atol=1e-5)
     assert torch.allclose(made.T_world_root, clip.T_world_root[:, 24:], atol=1e-5)
 

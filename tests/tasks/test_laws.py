@@ -173,8 +173,8 @@ def in_more_slots(people: Tensor, slots: Tensor, small: TokenLayout, large: Toke
     """People's tokens in the first of more slots, the rest as it is in `slots`."""
     P = small.agents
     whole = [part.clone() for part in large.unpack(slots)]
-    latent, steps, pairs = small.unpack(people)
-    whole[0][:, :, :P], whole[1][:, :, :P], whole[2][:, :, :P, : P - 1] = latent, steps, pairs
+    latent, deltas, pairs = small.unpack(people)
+    whole[0][:, :, :P], whole[1][:, :, :P], whole[2][:, :, :P, : P - 1] = latent, deltas, pairs
     return large.pack(*whole)
 
 

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from magnet.body import load_body
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene, concatenate
-from magnet.motion.tokens import by_token, scene_steps
+from magnet.motion.tokens import by_token, scene_deltas
 from magnet.testing import random_scene, tiny_denoiser, without_absent
 from magnet.tokenizer import RawPose, Tokenizer
 from magnet.tokenizer.features import features
@@ -34,7 +34,7 @@ def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
 
 
 def conditions(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
-    return scene.betas, by_token(scene_steps(scene))
+    return scene.betas, by_token(scene_deltas(scene))
 
 
 class Scenes(L.LightningDataModule):
@@ -68,7 +68,7 @@ def test_encode_and_decode_keep_the_shapes(scene: Scene) -> None:
     tokenizer = tiny(scene).eval()
     latent = tokenizer.encode_scene(scene)
     assert latent.shape == (2, 16, 3, 16)
-    assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene)))
+    assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_deltas(scene)))
     pose = tokenizer.decode(latent, *conditions(scene))
     assert pose.shape == (2, 64, 3, 135)
     assert torch.equal(tokenizer.requantize(latent), latent)
@@ -83,7 +83,7 @@ def test_every_latent_is_a_code(scene: Scene) -> None:
 
 def test_a_part_of_a_token_is_refused(scene: Scene) -> None:
     with pytest.raises(ValueError, match="63 frames"):
-        tiny().encode(pose_features(scene)[:, :63], scene.betas, scene_steps(scene)[:, :63])
+        tiny().encode(pose_features(scene)[:, :63], scene.betas, scene_deltas(scene)[:, :63])
 
 
 def test_agents_do_not_see_each_other(scene: Scene) -> None:
