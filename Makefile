@@ -2,8 +2,11 @@
 PYTHON ?=
 VENV ?= .venv
 PIP_ARGS ?=
+WORKERS ?= auto
 
 PY := $(VENV)/bin/python
+# Files are dealt out to a process a core; what a file's tests share is made once.
+PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -14,7 +17,8 @@ help:  ## list what make can do
 	@echo
 	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-18s %s\n", $$1, $$2 }'
 	@echo
-	@echo "  PYTHON=python3.12 picks the interpreter, VENV=DIR the environment, PIP_ARGS='...' is handed to pip."
+	@echo "  PYTHON=python3.12 picks the interpreter, VENV=DIR the environment, PIP_ARGS='...' is handed to pip,"
+	@echo "  WORKERS=1 runs the tests in one process."
 
 # The first Python of a version that works; a message that says what to do when there is none.
 $(PY):
@@ -47,11 +51,11 @@ train-duet: $(READY)  ## the shipped model from recordings (MAGNET_CMU) to weigh
 
 test: $(READY)  ## run the tests, without the slow ones
 	@echo "test: pytest, without the slow tests"
-	@$(PY) -m pytest -q -m 'not slow'
+	@$(PYTEST) -m 'not slow'
 
 test-slow: $(READY)  ## run the slow tests only
 	@echo "test-slow: pytest, the slow tests"
-	@$(PY) -m pytest -q -m slow
+	@$(PYTEST) -m slow
 
 test-browser: $(READY)  ## the viewer in a real headless Chromium, installed from Debian if absent
 	@echo "test-browser: pytest, the viewer in Chromium"
@@ -66,7 +70,7 @@ test-blender: $(READY)  ## our files in Blender, whose bpy gets an environment o
 
 test-all: $(READY)  ## run every test
 	@echo "test-all: pytest, everything"
-	@$(PY) -m pytest -q
+	@$(PYTEST)
 
 check: lint type  ## style and types
 

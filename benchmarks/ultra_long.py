@@ -4,7 +4,7 @@
     python benchmarks/ultra_long.py --model duet --frames 1800       # the model that comes with the package
 
 Each line is a run in a process of its own. `grown` is by how much the process was at most larger than after its
-first piece of frames: it says whether a longer scene needs more memory. `plan` is what came before that.
+first chunk of frames: it says whether a longer scene needs more memory. `plan` is what came before that.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def measure(options: argparse.Namespace) -> None:
     scene = recorded(options, frames if given_later(task, context) else context)
     empty = resident()
     began = time.perf_counter()
-    pieces = model.stream(
+    chunks = model.stream(
         scene,
         task,
         context,
@@ -82,15 +82,15 @@ def measure(options: argparse.Namespace) -> None:
         generator=torch.Generator().manual_seed(options.seed),
         stats=stats,
     )
-    first = last = next(pieces)
+    first = last = next(chunks)
     kept: list[Scene] = [first]
     planned = most = resident()
     seen, finite = first.frames, True
-    for piece in pieces:
-        most, seen, last = max(most, resident()), seen + piece.frames, piece
+    for chunk in chunks:
+        most, seen, last = max(most, resident()), seen + chunk.frames, chunk
         if options.save:
-            kept.append(piece)
-        finite &= bool(piece.T_world_root.isfinite().all() and piece.body_rot.isfinite().all())
+            kept.append(chunk)
+        finite &= bool(chunk.T_world_root.isfinite().all() and chunk.body_rot.isfinite().all())
     seconds = time.perf_counter() - began
     assert seen == frames, f"{seen} frames instead of {frames}"
     print(
@@ -98,8 +98,8 @@ def measure(options: argparse.Namespace) -> None:
         f"plan {(planned - empty) / MIB:.0f} MiB, grown {(most - planned) / MIB:.0f} MiB, "
         f"peak {peak() / MIB:.0f} MiB, finite {finite}, {stats.means()}"
     )
-    for name, piece in (("first", first.slice(context)), ("last", last)):
-        print(f"  {name} piece: {looks(piece)}")
+    for name, chunk in (("first", first.slice(context)), ("last", last)):
+        print(f"  {name} chunk: {looks(chunk)}")
     if options.save:
         print(f"  saved: {cat_time(kept).save(options.save)}")
 

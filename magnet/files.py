@@ -76,7 +76,7 @@ def _space(path: Path) -> str:
         return ""
 
 
-class _Hashed:
+class HashedFile:
     """A file that is hashed while it is written, and remembers an error that a library may hide behind its own."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -119,7 +119,7 @@ def write_whole(
     try:
         with writing(folder, advice):
             with os.fdopen(handle, "wb") as file:
-                hashed = _Hashed(file)
+                hashed = HashedFile(file)
                 try:
                     write(hashed)
                 except Exception as error:

@@ -144,7 +144,7 @@ def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = 
             continue
         _check_plan(task, grid, schedule)
         _check_samples(task, grid, schedule)
-        _check_hidden(task, grid, schedule)
+        check_hidden(task, grid, schedule)
         if grids is not None or len(checked) < POSED:
             pose_law(task, grid)
         if nameless:
@@ -249,19 +249,19 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     _require(same, f"{place}: scenes in a batch are sampled otherwise than alone")
 
 
-def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
-    """Change what a stage hides from an agent, on the canvas, in all that the model says of it, and in what it said."""
+def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
+    """Change what a stage hides from an agent, in the tokens, in all that the model says of it, and in what it said."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
     tokens, noise, mask_noise, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
-    canvas = begin(tokens, noise, schedule.known, layout)
-    history = History.empty(canvas)
+    tokens = begin(tokens, noise, schedule.known, layout)
+    history = History.empty(tokens)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
-        before, past = canvas, history.copy()
-        canvas = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
+        before, past = tokens, history.copy()
+        tokens = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
         if stage.hidden is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -281,7 +281,7 @@ def _check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guid
             after = run_stages(
                 model, [stage], changed, mask_noise, present, layout, guidance=guidance, history=remembered
             )
-            same = ((after == canvas)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
+            same = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
                 _require(same[agent], f"{_place(task, grid)}: {message}")
@@ -328,28 +328,28 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
 
     def blind(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Tokens of an agent from its own, its pairs and everybody's, all slots alike."""
-        latent, steps, pairs = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
-        own = torch.cat([latent, steps.flatten(-2)], dim=-1) * there[:, None]
+        latent, deltas, pairs = layout.unpack(noisy * (1 + levels[..., None] / LEVELS))
+        own = torch.cat([latent, deltas.flatten(-2)], dim=-1) * there[:, None]
         pairs = pairs * both[..., None, None]
         everybody = own.sum(dim=2, keepdim=True).mean(dim=1, keepdim=True) / there.sum()
         own = torch.tanh(own.roll(1, dims=1) + everybody + pairs.flatten(3).sum(dim=-1, keepdim=True))
-        latent, steps = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, steps.shape[-2:])
-        return layout.pack(latent, steps, torch.tanh(pairs + steps.mean(dim=(-1, -2))[..., None, None, None]))
+        latent, deltas = own[..., : layout.latent], own[..., layout.latent :].unflatten(-1, deltas.shape[-2:])
+        return layout.pack(latent, deltas, torch.tanh(pairs + deltas.mean(dim=(-1, -2))[..., None, None, None]))
 
-    canvas = begin(tokens, noise, schedule.known, layout)
-    return run_stages(blind, schedule.stages, canvas, mask_noise, there.expand(len(tokens), P), layout)
+    tokens = begin(tokens, noise, schedule.known, layout)
+    return run_stages(blind, schedule.stages, tokens, mask_noise, there.expand(len(tokens), P), layout)
 
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:
     """Tokens of the same people in other slots: agent p becomes what agent order[p] was. (B, N, P, D) -> same"""
-    latent, steps, pairs = layout.unpack(tokens)
+    latent, deltas, pairs = layout.unpack(tokens)
     P = layout.agents
     whole = pairs.new_zeros(*pairs.shape[:2], P, P, *pairs.shape[4:])
     rows, columns = torch.arange(P)[:, None], partners(P)
     if layout.slots:
         whole[:, :, rows, columns] = pairs
         pairs = whole[:, :, order][:, :, :, order][:, :, rows, columns]
-    return layout.pack(latent[:, :, order], steps[:, :, order], pairs)
+    return layout.pack(latent[:, :, order], deltas[:, :, order], pairs)
 
 
 def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions, task_sight
-from magnet.generation.rollout import Stream
+from magnet.generation.conditioning import SamplerOptions, task_lookahead_limit
+from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
@@ -60,12 +60,12 @@ def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> l
     }
     options = dataclasses.replace(options or SamplerOptions(), **{name: getattr(grid, name) for name in sorted(sizes)})
     run = Run(small_model(grid.agents, grid.window), task, grid, options)
-    sight = task_sight(task, grid)
+    limit = task_lookahead_limit(task, grid)
     blocks = list(blocks_of(schedule))
     chosen = {0, next((n for n, (_, end) in enumerate(blocks) if end > grid.window), len(blocks) - 1)}
     plain = run(scene, max(blocks[number][1] for number in chosen))
     for stages, end in (blocks[number] for number in sorted(chosen)):
-        late = schedule.known & (torch.arange(grid.tokens)[:, None] >= sight[end - 1].clamp_min(end))
+        late = schedule.known & (torch.arange(grid.tokens)[:, None] >= limit[end - 1].clamp_min(end))
         unseen = never_shown(schedule, stages)
         for secret in unseen.unique(dim=0):
             changed = run(replaced(scene, other, late), end, secret & ~schedule.known)
@@ -132,10 +132,10 @@ class Run:
         """The first rows, and some more. other (N, P) bool, tokens whose noise is another one"""
         context, frames = self.grid.context * STRIDE, (self.grid.tokens - self.grid.context) * STRIDE
         generator = torch.Generator().manual_seed(4)
-        stream = Stream(self.model, scene, self.task, context, frames, 1, self.options, generator, None, None, piece=1)
+        stream = Rollout(self.model, scene, self.task, context, frames, 1, self.options, generator, None, None, chunk=1)
         if other is not None:
             stream.noise = OtherNoise(stream.noise, other)
-        return cat_time(list(itertools.islice(stream.pieces(), min(rows + AFTER, self.grid.tokens))))
+        return cat_time(list(itertools.islice(stream.chunks(), min(rows + AFTER, self.grid.tokens))))
 
 
 def replaced(scene: Scene, other: Scene, tokens: Tensor) -> Scene:

@@ -58,7 +58,7 @@ def test_nothing_is_left_of_a_file_that_did_not_fit_and_the_old_one_stays(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def hidden(out: files._Hashed) -> None:  # as torch does, which raises an error of its own
+    def hidden(out: files.HashedFile) -> None:  # as torch does, which raises an error of its own
         try:
             out.write(b"new")
         except OSError:
@@ -69,14 +69,14 @@ def test_nothing_is_left_of_a_file_that_did_not_fit_and_the_old_one_stays(
         with pytest.raises(CannotWrite, match="the disk is full"):
             write_whole(tmp_path, lambda _: "a", lambda out: out.write(b"new"))
         monkeypatch.undo()
-    monkeypatch.setattr(files._Hashed, "write", _failing(files._Hashed.write))
+    monkeypatch.setattr(files.HashedFile, "write", _failing(files.HashedFile.write))
     with pytest.raises(CannotWrite, match="the disk is full"):
         write_whole(tmp_path, lambda _: "a", hidden)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"old"}
 
 
 def _failing(write):  # type: ignore[no-untyped-def]
-    def begin(self: files._Hashed, data: bytes) -> int:
+    def begin(self: files.HashedFile, data: bytes) -> int:
         os.dup2(os.open("/dev/full", os.O_WRONLY), self.file.fileno())
         self.file = self.file.raw  # type: ignore[attr-defined]
         return write(self, data)

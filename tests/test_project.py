@@ -8,8 +8,6 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-import pytest
-
 from magnet import __version__
 
 ROOT = Path(__file__).parents[1]
@@ -85,7 +83,8 @@ def test_the_check_of_changes_runs_the_tests() -> None:
     assert "make test" in script.read_text()
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_file_knows_the_machine_that_it_was_written_on(path: Path) -> None:
-    found = re.findall(r"(?<![\w.<>-])/(?:work|tmp|root|home|opt)/[\w.-]+", path.read_text(encoding="utf-8"))
-    assert not found
+def test_no_file_knows_the_machine_that_it_was_written_on() -> None:
+    places = re.compile(r"(?<![\w.<>-])/(?:work|tmp|root|home|opt)/[\w.-]+")
+    found = {str(path.relative_to(ROOT)): places.findall(path.read_text(encoding="utf-8")) for path in SOURCES}
+    assert len(found) > 200
+    assert not {path: names for path, names in found.items() if names}

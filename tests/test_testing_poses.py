@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from magnet.generation import showing
+from magnet.generation import causal_bodies
 from magnet.generation.conditioning import SamplerOptions
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
@@ -121,19 +121,19 @@ def test_a_plan_that_hides_something_anywhere_is_shown_block_by_block():
 
 def breaking(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let poses look ahead in one way or another."""
-    made, kept = showing.bodies, showing.Expected.keep
+    made, kept = causal_bodies.decode_bodies, causal_bodies.Expected.keep
 
-    def looking_ahead(canvas: Any, tokens: Any, first: int, stop: int, near: int, expected: Any = None) -> Any:
-        return made(canvas, tokens, first, stop, min(near + 2, tokens.shape[1]))
+    def looking_ahead(world: Any, tokens: Any, first: int, stop: int, near: int, expected: Any = None) -> Any:
+        return made(world, tokens, first, stop, min(near + 2, tokens.shape[1]))
 
     def last_word(self: Any, *said: Any) -> None:
         self.row = -1
         kept(self, *said)
 
     if how == "decoder":
-        monkeypatch.setattr(showing, "bodies", looking_ahead)
+        monkeypatch.setattr(causal_bodies, "decode_bodies", looking_ahead)
     else:
-        monkeypatch.setattr(showing.Expected, "keep", last_word)
+        monkeypatch.setattr(causal_bodies.Expected, "keep", last_word)
 
 
 def test_a_decoder_that_looks_ahead_is_found(monkeypatch: pytest.MonkeyPatch):

@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar, turn
+from magnet.motion.frames import canonical_frame, from_planar, inverse, rotate_ground, to_planar
 from magnet.motion.scene import Scene
 
 MAX_ORDERED = 4
@@ -140,7 +140,7 @@ def best_move(T_world_from: Tensor, T_world_to: Tensor, present: Tensor) -> Tens
     cos = from_z * to_z + from_x * to_x + LEVER**2 * turned.cos()
     sin = from_z * to_x - from_x * to_z + LEVER**2 * turned.sin()
     yaw = torch.atan2((weight * sin).sum(dim=-1), (weight * cos).sum(dim=-1))
-    return from_planar(yaw, mean_to - turn(yaw, mean_from))
+    return from_planar(yaw, mean_to - rotate_ground(yaw, mean_from))
 
 
 def misfit(T_world_a: Tensor, T_world_b: Tensor) -> Tensor:

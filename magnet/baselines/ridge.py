@@ -117,7 +117,7 @@ class RidgeRegression:
                 f"the context has {people} people, training windows have {have}; "
                 "use data that has such groups too (composed scenes will do)"
             )
-        folds = self._folds(windows)
+        folds = self.fold_numbers(windows)
         asked = torch.arange(min(EVERY // 2, horizon - 1), horizon, EVERY)
         parts = [self._sums(windows[folds == f], people, asked) for f in range(int(folds.max()) + 1)]
         best = torch.full((len(asked),), len(PENALTIES) - 1)
@@ -133,7 +133,7 @@ class RidgeRegression:
         weights = everything.spectrum().weights(penalty.repeat_interleave(everything.xy.shape[1] // horizon))
         return Fit(everything.mean_x, everything.mean_y, weights, penalty)
 
-    def _folds(self, windows: Tensor) -> Tensor:
+    def fold_numbers(self, windows: Tensor) -> Tensor:
         """Which fold each window is left out in: by recording, or runs of windows of the only one. (m,) int"""
         names = [self.train.recordings[k] for k in windows.tolist()]
         order = {name: number for number, name in enumerate(dict.fromkeys(names))}

@@ -114,7 +114,7 @@ class Body(nn.Module):
 
         Leading dimensions broadcast. Differentiable in all three.
         """
-        return self._chain(body_rot, T_world_root, self.rest_joints(betas))[1]
+        return self.bone_chain(body_rot, T_world_root, self.rest_joints(betas))[1]
 
     def joints(self, scene: Scene) -> Tensor:
         """World joints of everybody in a scene. -> (B, T, P, 22, 3) metres; absent agents stand at the origin.
@@ -133,7 +133,7 @@ class Body(nn.Module):
         """
         self._check(scene)
         rest_joints = self.rest_joints(scene.betas[:, None])
-        R, t = self._chain(scene.body_rot, scene.T_world_root, rest_joints)
+        R, t = self.bone_chain(scene.body_rot, scene.T_world_root, rest_joints)
         rest = self.v_template.to(rest_joints) + _blend(self.shapedirs, scene.betas[:, None].to(rest_joints))
         with _exact(R):
             if self.posedirs is not None:
@@ -154,7 +154,7 @@ class Body(nn.Module):
                 f"scene's own body with load_body, or fit this one to the scene's joints with fit_body"
             )
 
-    def _chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
+    def bone_chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
         """World rotations (..., 22, 3, 3) and positions (..., 22, 3): one batch of products a level of the tree."""
         body_rot, T_world_root = _wide(body_rot), _wide(T_world_root)
         parents = list(PARENTS[1:])
@@ -206,12 +206,12 @@ def load_body(which: str | Path = "open") -> Body:
         ValueError: the file is damaged, lacks a key, or a shape does not fit; says which.
     """
     if str(which) == "open":
-        return Body(**_open_body())
+        return Body(**open_body_arrays())
     return Body(**_read(Path(which)))  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=1)
-def _open_body() -> dict:
+def open_body_arrays() -> dict:
     # Lightning tests in inference mode, whose tensors no later fit could take a gradient through.
     with torch.inference_mode(False), resources.as_file(resources.files("magnet.body") / "open_body.npz") as path:
         return _read(path)

@@ -29,7 +29,7 @@ def lowest(scene: Scene, body: Body | None = None) -> Tensor:
 
     body: whose shapes the scene has; None: the open body, of average shape where the scene has another's.
     """
-    body = _open_body() if body is None else body
+    body = open_body() if body is None else body
     betas = scene.betas.float() if scene.body == body.id else torch.zeros_like(scene.betas, dtype=torch.float32)
     betas = betas.to(body.J_template.device)
     joints = body.forward_kinematics(scene.body_rot.to(betas), scene.T_world_root.to(betas), betas[:, None])
@@ -96,6 +96,6 @@ def level(scene: Scene, body: Body | None = None) -> float:
 
 
 @functools.cache
-def _open_body() -> Body:
+def open_body() -> Body:
     with torch.inference_mode(False):
         return load_body("open")

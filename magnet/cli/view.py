@@ -188,18 +188,18 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
 
     from magnet.cli import checkpoint_config
     from magnet.denoiser.module import Denoiser
-    from magnet.generation.recording import record
+    from magnet.generation.trace import record
     from magnet.tasks import registry
 
     task = registry.get(options.task)()
     model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
     generator = torch.Generator().manual_seed(options.seed)
-    sampler = _sampler(options)
+    sampler = sampler_options(options)
     recording = record(model, scene, task, options.context, options.frames, sampler, generator)
     print(f"written: {recording.save(options.record)}")
 
 
-def _sampler(options: argparse.Namespace) -> Any:
+def sampler_options(options: argparse.Namespace) -> Any:
     """How to sample, as --sampler and --steps say."""
     from magnet.generation.conditioning import SamplerOptions
 
@@ -230,7 +230,7 @@ def _live(options: argparse.Namespace) -> Any:
         start = takes[0].scene
     model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
     live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
-    live.settings.task, live.settings.sampler = options.task, _sampler(options)
+    live.settings.task, live.settings.sampler = options.task, sampler_options(options)
     live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
     look = Look(style=options.style or "body", shadows=not options.no_shadows)
     return Playground(live, body, options.host, options.port, look)

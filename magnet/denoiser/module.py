@@ -324,7 +324,7 @@ class Denoiser(L.LightningModule):
         generator = step_generator(
             self.device, self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank
         )
-        losses = self._losses(batch, generator)
+        losses = self.losses(batch, generator)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True)
         return losses["loss"]
@@ -333,11 +333,11 @@ class Denoiser(L.LightningModule):
         # The same noise at every validation, so that epochs can be compared.
         seed = derive(self.hparams["seed"], "validation", batch_idx, self.global_rank)
         generator = torch.Generator(device=self.device).manual_seed(seed)
-        losses = self._losses(batch, generator)
+        losses = self.losses(batch, generator)
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    _losses = training_losses
+    losses = training_losses
 
     def require_body(self) -> Body:
         """The body whose joints decoded losses compare, on this model's device."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from magnet.motion.frames import partners, turn
+from magnet.motion.frames import partners, rotate_ground
 from magnet.motion.pose_graph import Planar, solve_pose_graph
 from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
@@ -109,7 +109,7 @@ class PairwisePosterior(nn.Module):
         )
         partner = partners(self.layout.agents, steps.device)
         apart = solved_yaw[:, :, partner] - solved_yaw[..., None]
-        away = turn(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
+        away = rotate_ground(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
         return pairwise_by_token(nine_of(apart, away))
 
     def _at(self, knots: Tensor, levels: Tensor) -> Tensor:

@@ -216,7 +216,7 @@ class Evaluation:
         """
         answers = {}
         for name, method in self.methods.items():
-            generators = self._generators(model, batch.scenes)
+            generators = self.generators_of(model, batch.scenes)
             began = time.perf_counter()
             answers[name] = method(batch, self.samples, generators)
             self.seconds[name] += time.perf_counter() - began
@@ -295,7 +295,7 @@ class Evaluation:
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
         if batch_idx == 0:
             self.stats, self.scenes = SamplingStats(), 0
-        generators = self._generators(model, batch.scenes)
+        generators = self.generators_of(model, batch.scenes)
         self.scenes += batch.scenes
         return model.generate(
             in_slots(batch, min(batch.agents, max(occupied(batch), model.layout.agents))),
@@ -315,7 +315,7 @@ class Evaluation:
         world = 1 if trainer is None else trainer.world_size
         return [(self.scenes + b) * world + model.global_rank for b in range(scenes)]
 
-    def _generators(self, model: Denoiser, scenes: int) -> list[torch.Generator]:
+    def generators_of(self, model: Denoiser, scenes: int) -> list[torch.Generator]:
         """One for each sample of the next scenes of this run, known by a scene's number, not by its batch."""
         numbers = self._numbers(model, scenes)
         seeds = [derive(self.seed, "test", number, sample) for number in numbers for sample in range(self.samples)]

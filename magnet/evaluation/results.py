@@ -146,7 +146,7 @@ class Results:
 
     def to_markdown(self, metrics: Sequence[str] | None = None, intervals: bool = False) -> str:
         """The table in markdown, with its footnotes."""
-        chosen = self._chosen(metrics)
+        chosen = self.chosen(metrics)
         lines = ["| method | " + " | ".join(self._title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
         best = {metric: self.best(metric) for metric in chosen}
         for method in self.rows:
@@ -159,7 +159,7 @@ class Results:
             lines.append(f"| {method} | " + " | ".join(cells) + " |")
         return "\n".join(lines) + "\n\n" + "  \n".join(self._footnotes(chosen)) + "\n"
 
-    def _chosen(self, metrics: Sequence[str] | None) -> list[str]:
+    def chosen(self, metrics: Sequence[str] | None) -> list[str]:
         """Metrics to show: those asked for, else the main ones that were measured, else all."""
         measured = self.metrics
         if metrics is not None:
@@ -205,7 +205,7 @@ def print_table(
         intervals: also the interval of each value that has one.
     """
     console = console or Console()
-    chosen = results._chosen(metrics)
+    chosen = results.chosen(metrics)
     best = {metric: results.best(metric) for metric in chosen}
     parts: list[list[str]] = [[]]
     for metric in chosen:

@@ -91,13 +91,13 @@ def add_mesh(canvas: Canvas, vertices: Array, faces: NDArray[np.integer], colour
         normals[person, :, axis] += np.bincount(faces[:, corner], area[person, :, axis], minlength=V)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     if len(faces) < 8000:
-        corners, shading = _rounded(corners, normals[:, faces])
+        corners, shading = bulged(corners, normals[:, faces])
         vertices, normals = corners.reshape(len(vertices), -1, 3), shading.reshape(len(vertices), -1, 3)
         faces = np.arange(vertices.shape[1]).reshape(-1, 3)
     _add_shaded(canvas, vertices, normals, faces, colours[:, None])
 
 
-def _rounded(corners: Array, normals: Array, bulge: float = 0.7) -> tuple[Array, Array]:
+def bulged(corners: Array, normals: Array, bulge: float = 0.7) -> tuple[Array, Array]:
     """Each triangle as four, new points near the tangent planes of the old: Phong tessellation. (..., F, 3, 3) x 2"""
     after, after_normal = np.roll(corners, -1, axis=-2), np.roll(normals, -1, axis=-2)
     middle = (corners + after) / 2

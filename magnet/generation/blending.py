@@ -6,12 +6,12 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar, turn
+from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, rotate_ground, to_planar
 from magnet.motion.scene import Scene, cat_time
 
 SPRING = 2.5
-"""How fast `go_on` fades, against the frames over which a seam is to: the slower, the smoother, and the longer feet
-slide that the decoder had put elsewhere. With `blend` 10 a difference is halved in 7 frames."""
+"""Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
+put elsewhere slide for longer. With `blend` 10 a difference is halved in 7 frames."""
 
 
 def smoothstep(ramp: Tensor) -> Tensor:
@@ -19,38 +19,38 @@ def smoothstep(ramp: Tensor) -> Tensor:
     return ramp * ramp * (3 - 2 * ramp)
 
 
-def step_between(T_world_can: Tensor, key_step: Tensor) -> Tensor:
-    """The step into a known frame, which nothing tells: midway between the last step before and the first after.
+def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:
+    """The delta into a known frame, which is not predicted: the mean of the last delta before and the first after.
 
-    T_world_can (B, F, 4, 4) up to the frame before, key_step (B, 4, 4) -> (B, 4, 4)
+    T_world_can (B, F, 4, 4) up to the frame before, key_delta (B, 4, 4) -> (B, 4, 4)
     """
     yaw, ground = to_planar(inverse(T_world_can[:, -2]) @ T_world_can[:, -1])
-    key_yaw, key_ground = to_planar(key_step)
+    key_yaw, key_ground = to_planar(key_delta)
     return from_planar((yaw + key_yaw) / 2, (ground + key_ground) / 2)
 
 
-def arrive(T_world_can: Tensor, T_world_key: Tensor, key_step: Tensor) -> Tensor:
-    """Bend a path so that it leads to a known frame: first the turns, then, with steps as long as before, the way.
+def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_delta: Tensor) -> Tensor:
+    """Bend a path so that it leads to a known frame: headings first, then positions, with deltas of the same length.
 
     Args:
         T_world_can: (B, F, 4, 4) canonical frames up to the one before the known one; the first stays.
         T_world_key: (B, 4, 4) the known frame.
-        key_step: (B, 4, 4) the step from there.
+        key_delta: (B, 4, 4) the delta from there.
 
     Returns:
         (B, F, 4, 4). What is added grows as a smoothstep, so that it adds no speed at either end.
     """
     path, T_world_key = T_world_can.double(), T_world_key.double()
     yaw, ground = to_planar(path)
-    _, step = to_planar(inverse(path[:, :-1]) @ path[:, 1:])
-    last_yaw, last_step = to_planar(step_between(path, key_step.double()))
+    _, delta = to_planar(inverse(path[:, :-1]) @ path[:, 1:])
+    last_yaw, last_step = to_planar(delta_between(path, key_delta.double()))
     key_yaw, key_ground = to_planar(T_world_key)
     frames = path.shape[1]
     ramp = smoothstep(torch.arange(frames, device=path.device, dtype=path.dtype) / frames)
     off = key_yaw - yaw[:, -1] - last_yaw
     yaw = yaw + ramp * torch.atan2(off.sin(), off.cos())[:, None]
-    ground = torch.cat([ground[:, :1], ground[:, :1] + turn(yaw[:, :-1], step).cumsum(dim=1)], dim=1)
-    away = key_ground - ground[:, -1] - turn(yaw[:, -1], last_step)
+    ground = torch.cat([ground[:, :1], ground[:, :1] + rotate_ground(yaw[:, :-1], delta).cumsum(dim=1)], dim=1)
+    away = key_ground - ground[:, -1] - rotate_ground(yaw[:, -1], last_step)
     return from_planar(yaw, ground + ramp[:, None] * away[:, None]).to(T_world_can)
 
 
@@ -133,7 +133,7 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
     return torch.where(after, stays, 0.0), torch.where(grows, since * left, 0.0)
 
 
-def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
+def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Put given frames back, and go on from them smoothly into what is decoded; nothing in front of a seam changes.
 
     Unlike with `crossfade_given`, poses go on as fast as they were moving: each block of a causal plan has a seam, and
@@ -171,7 +171,7 @@ def go_on(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend
     )
 
 
-def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
+def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
     """Agents that are neither given nor generated from some time on stand still from there.
 
     there (T, P) bool; `before` is the frame in front of the scene's first, if there is one.
@@ -180,6 +180,6 @@ def hold(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
         return scene
     if before is not None:
         whole = cat_time([before, scene])
-        return hold(whole, torch.cat([torch.ones_like(there[:1]), there])).slice(1)
+        return freeze_after(whole, torch.cat([torch.ones_like(there[:1]), there])).slice(1)
     last, agents = last_known(there), torch.arange(there.shape[1], device=there.device)
     return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])

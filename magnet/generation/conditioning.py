@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_choice, require_number, require_whole
-from magnet.motion.frames import Placement, canonical_frame, canonical_steps, pairwise, to_9d
+from magnet.motion.frames import Placement, canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import STRIDE, by_token, pairwise_by_token
 from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
@@ -41,10 +41,10 @@ class SamplerOptions:
             8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
             that can roll do, with half of the window half denoised; those whose agents take turns or that look
             ahead to keyframes go in strides.
-        placement: how predicted steps and pairwise transforms become world poses: `integrate` (the
+        placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        pairwise_weight: weight of a pairwise transform against a step in `fuse`; chosen on validation scenes
-            (docs/results.md): steps are far surer than pairwise transforms, so a little is enough.
+        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
+            (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
         requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
             does. None: if codes are what the model was trained to generate (`target` of the denoiser).
         keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
@@ -141,12 +141,12 @@ def label(scene: Scene, number: int) -> str:
     return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
 
 
-def reach(model: Denoiser) -> tuple[int, int]:
+def receptive_field(model: Denoiser) -> tuple[int, int]:
     """Tokens before and after that a code or a decoded frame can depend on: encoder and decoder look equally far."""
-    return model.tokenizer.vqvae.decoder.reach if isinstance(model.tokenizer, Tokenizer) else (0, 0)
+    return model.tokenizer.vqvae.decoder.receptive_field if isinstance(model.tokenizer, Tokenizer) else (0, 0)
 
 
-def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
+def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
     """The scene as far as it is known: everything else is gone, so that nothing can leak. known (N, P) bool
 
     Unknown frames hold a body at rest at the origin; missing frames are added, surplus ones cut.
@@ -175,94 +175,94 @@ def scrub(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) 
     return scene.replace(body_rot=body_rot, T_world_root=T_world_root, valid=None)
 
 
-def sight(schedule: MaskSchedule) -> Tensor:
+def lookahead_limit(schedule: MaskSchedule) -> Tensor:
     """How far a known token's code may look ahead: up to which row, exclusive. -> (N, P) int
 
     Without lookahead codes look to the end of the block that they are in, and those before the first block to where it
     begins: so each is what it would be live, and is never encoded anew. In other plans the first stage that hides
     what comes after a token settles it. N where no stage hides anything from everybody.
     """
-    cuts = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
+    limits = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
     if not schedule.lookahead:
         edges = sorted({edge for stage in schedule.stages for edge in stage.active})
         for first, last in itertools.pairwise([0, *edges, schedule.tokens]):
-            cuts[first:last] = last
-        return cuts
+            limits[first:last] = last
+        return limits
     done = [0] * schedule.agents
     for stage in schedule.stages:
         if stage.hidden is None:
             continue
         gone = stage.hidden.all(dim=0) & schedule.known[stage.start : stage.stop]  # (W, P)
         for agent in gone.any(dim=0).nonzero()[:, 0].tolist():
-            cut = stage.start + int(gone[:, agent].int().argmax())
-            cuts[done[agent] : cut, agent] = cut
+            limit = stage.start + int(gone[:, agent].int().argmax())
+            limits[done[agent] : limit, agent] = limit
             if not done[agent]:
-                begins = min(stage.active[0], cut)
-                cuts[:begins, agent] = begins
-            done[agent] = max(done[agent], cut)
-    return cuts
+                begins = min(stage.active[0], limit)
+                limits[:begins, agent] = begins
+            done[agent] = max(done[agent], limit)
+    return limits
 
 
-def task_sight(task: Task, grid: Grid) -> Tensor:
-    """`sight` by what a task hides, whether or not a window on this grid would show it. -> (N, P) int
+def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
+    """`lookahead_limit` by what a task hides, whether or not a window on this grid would show it. -> (N, P) int
 
     A window that ends where a block does has nothing to hide, so the task is asked where the window goes on.
     """
-    roomy = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, pyramid_offset=0)
-    return torch.minimum(sight(task.schedule(grid)), sight(task.schedule(roomy)))
+    wider = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, pyramid_offset=0)
+    return torch.minimum(lookahead_limit(task.schedule(grid)), lookahead_limit(task.schedule(wider)))
 
 
 def known_tokens(
-    model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, cuts: Tensor | None = None
+    model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, limits: Tensor | None = None
 ) -> Tensor:
     """Normalised tokens of what is known; other tokens hold nothing of use. known (N, P) -> (B, N, P, D)
 
-    Each agent's unbroken stretches are encoded alone: an encoder that looks ahead must not see beyond
-    them, nor beyond `cuts` (N, P), see `sight`; where that is 0, the code is not wanted. Pairwise transforms are
-    those of `related`, by default the same scene. A step into a stretch from an unknown frame cannot be known
-    either; the stretch's own next step stands in for it, which leaves a smaller misfit at keyframes than standing
-    still does. At the very beginning nobody has come from anywhere.
+    Each agent's known segments are encoded one by one: an encoder that looks ahead must not see beyond a segment, nor
+    beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are
+    those of `related`, by default the same scene. The delta into a segment from an unknown frame is unknown too: the
+    segment's next delta stands in for it, which leaves a smaller error at keyframes than a delta of zero. The first
+    step of a scene is zero.
     """
     N, P = known.shape
     like = given.T_world_root
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
-    steps = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
-    for start, stop, agents in stretches(known):
+    deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
+    for start, stop, agents in segments(known):
         part = given.slice(start * STRIDE, stop * STRIDE).permute_agents(torch.tensor(agents, device=like.device))
-        for low, first, last, cut, those in encodings(start, stop, agents, cuts, reach(model)[0]):
-            seen = given.slice(low * STRIDE, cut * STRIDE).permute_agents(torch.tensor(those, device=like.device))
+        for low, first, last, limit, those in encodings(start, stop, agents, limits, receptive_field(model)[0]):
+            seen = given.slice(low * STRIDE, limit * STRIDE).permute_agents(torch.tensor(those, device=like.device))
             latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
-        own = by_token(to_9d(canonical_steps(canonical_frame(part.T_world_root))))
+        own = by_token(to_9d(canonical_deltas(canonical_frame(part.T_world_root))))
         if start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
-        steps[:, start:stop, agents] = own
+        deltas[:, start:stop, agents] = own
     pairs = pairwise_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
-    return model.normalizer.normalize(model.layout.pack(latent, steps, pairs))
+    return model.normalizer.normalize(model.layout.pack(latent, deltas, pairs))
 
 
 def encodings(
-    start: int, stop: int, agents: list[int], cuts: Tensor | None, behind: int
+    start: int, stop: int, agents: list[int], limits: Tensor | None, behind: int
 ) -> list[tuple[int, int, int, int, list[int]]]:
-    """What to encode of a known stretch, as (low, first, last, cut, agents): rows [first, last) from rows [low, cut).
+    """What to encode of a known segment: (low, first, last, limit, agents), rows [first, last) from rows [low, limit).
 
-    Rows that look up to the end are encoded with the whole stretch, others with all the `behind` rows that their
-    codes depend on, and one more, so that an artificial beginning is not seen.
+    Rows that may look to the end are encoded with the whole segment. Others are encoded with the `behind` rows that
+    their codes depend on and one more, so that the beginning of the slice has no influence.
     """
-    if cuts is None:
+    if limits is None:
         return [(start, start, stop, stop, agents)]
     found: dict[tuple[int, int, int, int], list[int]] = {}
     for agent in agents:
-        ends = cuts[start:stop, agent].clamp(max=stop)
-        for cut in ends[ends > 0].unique().tolist():
-            rows = (ends == cut).nonzero()[:, 0] + start
+        ends = limits[start:stop, agent].clamp(max=stop)
+        for limit in ends[ends > 0].unique().tolist():
+            rows = (ends == limit).nonzero()[:, 0] + start
             first, last = int(rows[0]), int(rows[-1]) + 1
-            low = start if cut == stop else max(start, first - behind - 1)
-            found.setdefault((low, first, last, cut), []).append(agent)
+            low = start if limit == stop else max(start, first - behind - 1)
+            found.setdefault((low, first, last, limit), []).append(agent)
     return [(*rows, those) for rows, those in found.items()]
 
 
-def stretches(known: Tensor) -> list[tuple[int, int, list[int]]]:
-    """Unbroken known stretches as (start, stop, agents that share it). known (N, P) bool"""
+def segments(known: Tensor) -> list[tuple[int, int, list[int]]]:
+    """Runs of known token steps as (start, stop, agents that share it). known (N, P) bool"""
     found: dict[tuple[int, int], list[int]] = {}
     edges = torch.nn.functional.pad(known.int(), (0, 0, 1, 1)).diff(dim=0)
     for agent in range(known.shape[1]):

@@ -1,4 +1,4 @@
-"""A model that plays on and on: motion generated piece by piece from the last second, while its settings change.
+"""A model that plays on and on: motion generated chunk by chunk from the last second, while its settings change.
 
 Nothing here knows of a browser or of threads; see `Worker` for one that keeps it a little ahead of who watches.
 """
@@ -29,7 +29,7 @@ from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 
 CONTEXT = 32
-"""Frames that each piece goes on from."""
+"""Frames that each chunk goes on from."""
 FIRST = 64
 """Frames of a scene from nothing."""
 REACH = 32
@@ -37,13 +37,13 @@ REACH = 32
 
 
 @dataclass
-class Settings:
-    """What the next piece is generated with.
+class LiveSettings:
+    """What the next chunk is generated with.
 
     Attributes:
         task: a name in the registry.
         fields: the task's own options, where they differ from its defaults.
-        piece: frames of a piece, whole tokens.
+        chunk: frames of a chunk, whole tokens.
         goals: where agents (slots) are steered to; see `Live`.
         sampler: all other options of sampling.
     """
@@ -52,13 +52,13 @@ class Settings:
     fields: dict[str, Any] = field(default_factory=lambda: {"block": 2})
     steps: int = 10
     guidance: Guidance = field(default_factory=Guidance)
-    piece: int = 16
+    chunk: int = 16
     goals: dict[int, Goal] = field(default_factory=dict)
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
 
 @dataclass(frozen=True)
-class Piece:
+class LiveChunk:
     """What one call of `Live.advance` has made."""
 
     start: int  # first new frame
@@ -70,7 +70,7 @@ class Piece:
 class Live:
     """A scene that grows; its `given` says what the model did not make itself.
 
-    Each piece is a sample of the chosen task that continues the last `CONTEXT` frames. Where a task is given
+    Each chunk is a sample of the chosen task that continues the last `CONTEXT` frames. Where a task is given
     somebody's future (as `motion_control` is), that future comes first: from `partner`, if there is one; from
     in-betweening towards that agent's goal, if it is steered; else from a joint prediction.
 
@@ -83,7 +83,7 @@ class Live:
 
     Attributes:
         keys: keyframes that `between` goes through; those of people who are gone are dropped.
-        asked: whether the next piece is to be made `between` the keyframes.
+        asked: whether the next chunk is to be made `between` the keyframes.
 
     Raises:
         ValueError: more people than the model has slots, `start` is shorter than `CONTEXT`, or motion that the model
@@ -104,7 +104,7 @@ class Live:
             require_rate(partner, "partner")
             check_given(partner, torch.ones(partner.frames // STRIDE, partner.agents, dtype=torch.bool))
         self.partner = partner
-        self.settings = Settings()
+        self.settings = LiveSettings()
         self.keys: list[Keyframe] = []
         self.asked = False
         self.lock = threading.RLock()
@@ -115,7 +115,7 @@ class Live:
 
     # -- starting ------------------------------------------------------------------------------
 
-    def begin(self, people: int = 2, start: Scene | None = None) -> Piece:
+    def begin(self, people: int = 2, start: Scene | None = None) -> LiveChunk:
         """Start anew: from a scene, or from nothing with so many people."""
         begun = time.perf_counter()
         if start is None:
@@ -131,14 +131,14 @@ class Live:
             self.settings.goals = {a: goal for a, goal in self.settings.goals.items() if a < scene.agents}
             self.keys, self.asked = [], False
             self.version += 1
-        return Piece(0, scene.frames, time.perf_counter() - begun)
+        return LiveChunk(0, scene.frames, time.perf_counter() - begun)
 
     def _from_nothing(self, people: int) -> Scene:
         slots = self.model.layout.agents
         if not 1 <= people <= slots:
             raise ValueError(f"people: got {people}, expected 1 to {slots}, the slots that the model has")
         empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
-        made = self._sample(empty, Generation(), 0, FIRST)
+        made = self.sample(empty, Generation(), 0, FIRST)
         return made.replace(given=torch.zeros(1, FIRST, people, dtype=torch.bool))
 
     def _check(self, start: Scene) -> None:
@@ -190,8 +190,8 @@ class Live:
             fields["target"] = tuple(agent for agent in people if agent not in leads) or (0,)
         return kind(**fields)
 
-    def advance(self) -> Piece:
-        """Generate the next piece and append it; if it was `asked` for, the one between the keyframes instead.
+    def advance(self) -> LiveChunk:
+        """Generate the next chunk and append it; if it was `asked` for, the one between the keyframes instead.
 
         Raises:
             ValueError: the task cannot go on here; says why.
@@ -213,10 +213,10 @@ class Live:
                 "try joint_future, motion_control or inbetweening"
             )
         given = self._future(past, scene.frames, known, frames)
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
-        return self._append(scene, piece, version, begun)
+        chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        return self._append(scene, chunk, version, begun)
 
-    def between(self) -> Piece:
+    def between(self) -> LiveChunk:
         """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
 
         Raises:
@@ -231,8 +231,8 @@ class Live:
         shifted = [dataclasses.replace(key, frame=key.frame - start + CONTEXT) for key in keys]
         given = with_keyframes(self._held(scene.slice(start - CONTEXT), frames), shifted)
         task = Inbetweening(pairs=tuple((key.agent, key.frame // STRIDE) for key in shifted))
-        piece = self._sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
-        return dataclasses.replace(self._append(scene, piece, version, begun, anew=True), between=True)
+        chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        return dataclasses.replace(self._append(scene, chunk, version, begun, anew=True), between=True)
 
     def between_from(self) -> int:
         """The first frame that `between` makes anew.
@@ -250,19 +250,19 @@ class Live:
             )
         return max(CONTEXT, min(self.scene.frames, first - REACH) // STRIDE * STRIDE)
 
-    def _append(self, scene: Scene, piece: Scene, version: int, begun: float, anew: bool = False) -> Piece:
-        """Put a piece behind the scene that it continues, unless that was restarted meanwhile."""
+    def _append(self, scene: Scene, chunk: Scene, version: int, begun: float, anew: bool = False) -> LiveChunk:
+        """Put a chunk behind the scene that it continues, unless that was restarted meanwhile."""
         with self.lock:
             took = time.perf_counter() - begun
-            if version != self.version:  # what this piece continues is no longer there
-                return Piece(self.scene.frames, 0, took)
-            self.scene = cat_time([scene, piece])
+            if version != self.version:  # what this chunk continues is no longer there
+                return LiveChunk(self.scene.frames, 0, took)
+            self.scene = cat_time([scene, chunk])
             self.version += anew
-            self.made, self.spent = self.made + piece.frames, self.spent + took
-            return Piece(scene.frames, piece.frames, took)
+            self.made, self.spent = self.made + chunk.frames, self.spent + took
+            return LiveChunk(scene.frames, chunk.frames, took)
 
-    def _sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
-        # A piece fits into the window, so denoising it all at once costs the fewest steps.
+    def sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
+        # A chunk fits into the window, so denoising it all at once costs the fewest steps.
         # What it has made itself is not asked where its floor is.
         settings = self.settings
         own: dict[str, Any] = {
@@ -276,7 +276,7 @@ class Live:
         return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
 
     def _length(self, kind: type) -> int:
-        return REACH if kind is Inbetweening else max(self.settings.piece // STRIDE, 1) * STRIDE
+        return REACH if kind is Inbetweening else max(self.settings.chunk // STRIDE, 1) * STRIDE
 
     def _steered(self) -> list[int]:
         return sorted(agent for agent in self.settings.goals if agent < self.scene.agents)
@@ -314,7 +314,7 @@ class Live:
                 last = CONTEXT + REACH - STRIDE
                 task = Inbetweening(pairs=tuple((agent, last // STRIDE) for agent in steered))
                 goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
-            made = self._sample(goals, task, CONTEXT, length).replace(given=goals.given)
+            made = self.sample(goals, task, CONTEXT, length).replace(given=goals.given)
             source = made.slice(0, CONTEXT + frames)
         chosen = agents[None, None, :, None, None]
         assert scene.given is not None and source.given is not None

@@ -8,8 +8,8 @@ import torch
 
 from magnet.denoiser.module import Denoiser
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.fed import FedStream
 from magnet.generation.inputs import check_request
+from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid
@@ -52,13 +52,13 @@ class Partner:
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present = past.present
         whole = past.slice(past.frames % STRIDE).replace(valid=None, given=None)
-        self._stream = FedStream(denoiser, whole, self.task, self.options, generator)
+        self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
 
     @property
     def past(self) -> Scene:
         """The last frames of everybody, given and answered, as far back as the model or its decoder still looks."""
-        canvas = self._stream.canvas
-        held = canvas.given.slice(0, canvas.shown * STRIDE)
+        world = self.stream.world
+        held = world.given.slice(0, world.finalized * STRIDE)
         return held.permute_agents(torch.arange(self._present.shape[1]))
 
     def answer(self, frames: Scene) -> Scene:
@@ -81,6 +81,6 @@ class Partner:
         if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
         # Block by block: what has been fed beyond a block is not to be read in it.
-        answers = [self._stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        answers = [self.stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
         answer = cat_time(answers).replace(names=frames.names)
         return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from magnet.tasks.base import Task
 
 
-class Turn(NamedTuple):
+class PlannedStage(NamedTuple):
     """A stage, and what holds once it has run."""
 
     stage: Stage | None  # None before the first
@@ -23,7 +23,7 @@ class Turn(NamedTuple):
     needed: int  # rows before this one are never shown to the model again
 
 
-Plan = Iterator[Turn]
+Plan = Iterator[PlannedStage]
 
 
 def planned(schedule: MaskSchedule) -> Plan:
@@ -32,9 +32,9 @@ def planned(schedule: MaskSchedule) -> Plan:
     if schedule.causal:  # what has been shown is not moved, whatever it leads to
         needed, final = (least(rows, end) for rows in ([s.start for s in stages], [s.active[0] for s in stages]))
     else:
-        needed = final = least(lows(schedule), end)
+        needed = final = least(first_changed(schedule), end)
     for stage, *rows in zip((None, *stages), final, needed, strict=True):
-        yield Turn(stage, *rows)
+        yield PlannedStage(stage, *rows)
 
 
 def least(rows: Sequence[int], end: int) -> list[int]:
@@ -42,10 +42,10 @@ def least(rows: Sequence[int], end: int) -> list[int]:
     return list(itertools.accumulate(reversed([*rows, end]), min))[::-1]
 
 
-def lows(schedule: MaskSchedule) -> list[int]:
+def first_changed(schedule: MaskSchedule) -> list[int]:
     """For each stage the first row that it may change: its window's, or the first of a gap that it closes.
 
-    An agent that arrives at a keyframe is moved since its last known row (see `Canvas`); where nobody was known
+    An agent that arrives at a keyframe is moved since its last known row (see `WorldState`); where nobody was known
     before, everybody moves along.
     """
     known = schedule.known
@@ -61,10 +61,10 @@ def lows(schedule: MaskSchedule) -> list[int]:
     return found
 
 
-def endless(task: Task, grid: Grid, slots: int, fed: bool = False) -> tuple[MaskSchedule, Plan]:
+def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> tuple[MaskSchedule, Plan]:
     """The beginning of a scene without end, and its plan: that of a long scene, the end of which is repeated.
 
-    `slots` are the model's, free ones included. `fed`: what the task is given after the context comes as it happens.
+    `slots` are the model's, free ones included. `online`: what the task is given after the context comes as it happens.
 
     Raises:
         ValueError: the plan depends on the scene's end, or does not repeat itself; or what would be fed is read ahead.
@@ -75,7 +75,7 @@ def endless(task: Task, grid: Grid, slots: int, fed: bool = False) -> tuple[Mask
     )
     name = type(task).__name__
     later = longer.known[grid.context :]
-    if bool(later.any()) and not fed:
+    if bool(later.any()) and not online:
         raise ValueError(f"{name} is given something after the context, so it has an end: say how many frames")
     if bool(later.any()) and (longer.lookahead or bool((later != later[0]).any())):
         raise ValueError(f"{name}: what it is given later cannot be fed as it happens, for it is read ahead")
@@ -101,9 +101,9 @@ def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Pla
     everything = itertools.chain(begun, rounds)
     coming = list(itertools.islice(everything, len(stages) + period))
 
-    def turn(stage: Stage | None) -> Turn:
+    def turn(stage: Stage | None) -> PlannedStage:
         needed = min(each.start for each, _ in coming)
-        return Turn(stage, min(first for _, first in coming) if causal else needed, needed)
+        return PlannedStage(stage, min(first for _, first in coming) if causal else needed, needed)
 
     yield turn(None)
     while True:

@@ -1,4 +1,4 @@
-"""Scenes of any length: sampled, decoded and handed out piece by piece, in memory that does not grow."""
+"""Scenes of any length: sampled, decoded and handed out chunk by chunk, in memory that does not grow."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.transformer import without_dropout
+from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
 from magnet.generation.conditioning import (
     SamplerOptions,
     known_tokens,
+    mask_unknown,
     occupied,
     planning_grid,
-    reach,
+    receptive_field,
     require_people,
-    scrub,
-    task_sight,
+    task_lookahead_limit,
 )
 from magnet.generation.inputs import check_given, check_request
-from magnet.generation.plan import endless, planned
-from magnet.generation.showing import Expected, own_view, show
-from magnet.generation.world import Canvas, SamplingStats
+from magnet.generation.plan import periodic_plan, planned
+from magnet.generation.world import SamplingStats, WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS, NoiseStream
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
     from magnet.tasks.base import Task
 
-PIECE = 64
-"""Token steps that are decoded at a time: scenes of up to 8.5 seconds are one piece."""
+CHUNK = 64
+"""Token steps that are decoded at a time: scenes of up to 8.5 seconds are one chunk."""
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
@@ -89,34 +89,34 @@ def stream(
     generator: Generators = None,
     progress: Callable[[int], None] | None = None,
     stats: SamplingStats | None = None,
-    piece: int = PIECE,
+    chunk: int = CHUNK,
 ) -> Iterator[Scene]:
-    """Sample a task in consecutive pieces of frames, which make up what `generate` returns.
+    """Sample a task in consecutive chunks of frames, which make up what `generate` returns.
 
-    Memory holds a piece and its neighbourhood, however long the scene; it grows only where a keyframe far ahead
+    Memory holds a chunk and its neighbourhood, however long the scene; it grows only where a keyframe far ahead
     decides where everything before it stands. Arguments as for `generate`, and:
 
     Args:
         frames: None: without end, for tasks that then are given no more than the context.
-        piece: token steps decoded and handed out at a time. Smaller pieces come sooner and cost more; poses
+        chunk: token steps decoded and handed out at a time. Smaller chunks come sooner and cost more; poses
             differ by rounding.
 
     Raises:
-        ValueError: as `generate`; or the task cannot go on without end, or a piece has no tokens.
+        ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
     """
-    if piece < 1:
-        raise ValueError(f"piece: got {piece}, expected at least 1 token step")
-    return Stream(model, scene, task, context, frames, samples, options, generator, progress, stats, piece).pieces()
+    if chunk < 1:
+        raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
+    return Rollout(model, scene, task, context, frames, samples, options, generator, progress, stats, chunk).chunks()
 
 
-class Stream:
+class Rollout:
     """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
 
     The rows held are [first, stop): `tokens` and `mask_noise` (B, n, P, D), the `history` of a multistep solver, and
-    the world in `canvas`. `there` is how many rows there are so far of what is given.
+    the world in `world`. `there` is how many rows there are so far of what is given.
     """
 
-    fed = False
+    online = False
 
     def __init__(
         self,
@@ -130,11 +130,11 @@ class Stream:
         generator: Generators,
         progress: Callable[[int], None] | None,
         stats: SamplingStats | None,
-        piece: int,
+        chunk: int,
     ) -> None:
         check_request(model, scene, context, frames, samples)
         layout = model.layout
-        self.model, self.options, self.piece = model, options or SamplerOptions(), piece
+        self.model, self.options, self.chunk = model, options or SamplerOptions(), chunk
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.stats = samples, progress, stats or SamplingStats()
         self.frames = None if frames is None else context + frames
@@ -146,17 +146,17 @@ class Stream:
         grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
         self.rows: float = grid.tokens
         if frames is None:
-            schedule, self.plan = endless(task, grid, layout.agents, self.fed)
+            schedule, self.plan = periodic_plan(task, grid, layout.agents, self.online)
             self.rows = torch.inf
         else:
             schedule = task.schedule(grid).padded(layout.agents)
             self.plan = planned(schedule)
         require_people(schedule, self.scene)
         self.known = schedule.known
-        self.cuts: Tensor | None = None  # how far codes look ahead; matters only where something is given later
+        self.limits: Tensor | None = None  # how far codes look ahead; matters only where something is given later
         if frames is not None and bool(self.known[past:].any()):
             free = layout.agents - grid.agents
-            self.cuts = torch.nn.functional.pad(task_sight(task, grid), (0, free), value=grid.tokens)
+            self.limits = torch.nn.functional.pad(task_lookahead_limit(task, grid), (0, free), value=grid.tokens)
         # The paper read literally: a known token holds its pairs to everybody, also to those not known. It leaks.
         self.related: Tensor | None = None
         if layout.pairwise_noise == "token":
@@ -169,22 +169,22 @@ class Stream:
         self.first = self.stop = 0
         self.there: float = self.rows
         self.reached = 0  # one past the last row that has been generated
-        self.expected = Expected(reach(model)[1])
-        self.canvas = Canvas(model, self._given(0, 0), schedule, o, samples, self.stats)
+        self.expected = Expected(receptive_field(model)[1])
+        self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         kind = model.device.type
         self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
 
-    def pieces(self) -> Iterator[Scene]:
-        """Everything, piece by piece."""
+    def chunks(self) -> Iterator[Scene]:
+        """Everything, chunk by chunk."""
         start, before = 0, None
         for stage, final, needed in self.plan:
             if stage is not None:
                 self._run(stage)
             for ready in self._ready(final):
-                while start < self.rows and ready >= min(start + self.piece, self.rows):
-                    stop = int(min(start + self.piece, self.rows))
+                while start < self.rows and ready >= min(start + self.chunk, self.rows):
+                    stop = int(min(start + self.chunk, self.rows))
                     made = self._decoded(start, stop, before, needed)
                     yield made if self.frames is None else made.slice(0, self.frames - start * STRIDE)
                     start, before = stop, made.slice(made.frames - 1)
@@ -194,33 +194,33 @@ class Stream:
 
         Bodies of causal plans are made here, block by block, as they are live.
         """
-        if not self.canvas.causal:
+        if not self.world.causal:
             yield self.rows if final >= self.rows else final - self._margins[1]
             return
         for end in (min(self.reached, final), final):
-            while (shown := self.first + self.canvas.shown) < end:
-                yield self._show(min(shown + PIECE, end), end)
+            while (shown := self.first + self.world.finalized) < end:
+                yield self._finalize(min(shown + CHUNK, end), end)
 
     @torch.no_grad()
-    def _show(self, stop: int, end: int) -> int:
+    def _finalize(self, stop: int, end: int) -> int:
         """Settle the bodies up to row `stop`, of which those before `end` are finished. Returns `stop`."""
-        near = min(stop + reach(self.model)[1], end)
+        near = min(stop + receptive_field(self.model)[1], end)
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(near)
             expected = self.expected.behind(end) if near == end else None
-            show(self.canvas, self.tokens, stop - self.first, near - self.first, expected)
+            finalize_bodies(self.world, self.tokens, stop - self.first, near - self.first, expected)
         return stop
 
     @property
     def _margins(self) -> tuple[int, int]:
-        """Rows before and after a piece that its poses depend on: by its seams, which depend on their neighbours."""
-        before, after = reach(self.model)
-        if self.canvas.causal:
+        """Rows before and after a chunk that its poses depend on: by its seams, which depend on their neighbours."""
+        before, after = receptive_field(self.model)
+        if self.world.causal:
             return before + 2, 0
         seam = -(-self.options.blend // STRIDE) if self.options.keep_given else 0
         return before + seam + 1, after + seam
 
-    # Contexts are entered anew in each call: while a piece is being looked at they would hold outside too.
+    # Contexts are entered anew in each call: while a chunk is being looked at they would hold outside too.
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
@@ -232,9 +232,9 @@ class Stream:
                 [dataclasses.replace(stage, start=stage.start - self.first)],
                 self.tokens,
                 self.mask_noise,
-                self.canvas.given.present,
+                self.world.given.present,
                 self.model.layout,
-                self.canvas.make_consistent,
+                self.world.make_consistent,
                 self.progress,
                 self.options.guidance,
                 self.noise,
@@ -242,7 +242,7 @@ class Stream:
                 self.history,
             )
         self.reached = max(self.reached, stage.active[1])
-        if self.canvas.causal and self.expected.most:
+        if self.world.causal and self.expected.most:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
@@ -258,14 +258,14 @@ class Stream:
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
-        """Bodies of rows [start, stop), which are final; rows that no later piece or stage needs are let go."""
+        """Bodies of rows [start, stop), which are final; rows that no later chunk or stage needs are let go."""
         behind, ahead = self._margins
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(stop + ahead)
-            made = self.canvas.scene(self.tokens, start - self.first, stop - self.first, before)
+            made = self.world.scene(self.tokens, start - self.first, stop - self.first, before)
         surplus = min(stop - behind, needed - 1) - self.first
         if surplus > 0:
-            self.canvas.release(surplus)
+            self.world.release(surplus)
             self.tokens, self.mask_noise = self.tokens[:, surplus:].clone(), self.mask_noise[:, surplus:].clone()
             self.history = None if self.history is None else self.history.release(surplus)
             self.first += surplus
@@ -273,15 +273,15 @@ class Stream:
         return made.replace(given=given[None] & made.present[:, None])
 
     def _bring_in(self, stop: int) -> None:
-        """Bring in rows, whole pieces at a time, until those before `stop` are held."""
-        behind, ahead = reach(self.model)
+        """Bring in rows, whole chunks at a time, until those before `stop` are held."""
+        behind, ahead = receptive_field(self.model)
         while self.stop < min(stop, self.there):
-            last = int(min(self.stop + self.piece, self.there))
+            last = int(min(self.stop + self.chunk, self.there))
             # What is known is encoded with all the neighbours that its codes can depend on.
             low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
             known = self._known(low, high)
             given = self._given(low, high)
-            related = None if self.related is None else scrub(self.scene, self.related, low, high)
+            related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
             tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
@@ -290,20 +290,20 @@ class Stream:
             self.tokens = torch.cat([self.tokens, new], dim=1)
             self.history = None if self.history is None else self.history.extend(new)
             self.mask_noise = torch.cat([self.mask_noise, mask_noise], dim=1)
-            self.canvas.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
+            self.world.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
             self.stop = last
 
     def _given(self, low: int, high: int) -> Scene:
         """Rows [low, high) of the recording, as far as they are known."""
-        return scrub(self.scene, self.known, low, high)
+        return mask_unknown(self.scene, self.known, low, high)
 
     def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
         """How far the codes of some of the rows [low, high) look ahead, counted from `low`; 0 for the others."""
-        if self.cuts is None:
+        if self.limits is None:
             return None
-        cuts = torch.zeros_like(self.cuts[low:high])
-        cuts[part] = (self.cuts[low:high][part] - low).clamp(max=high - low)
-        return cuts
+        limits = torch.zeros_like(self.limits[low:high])
+        limits[part] = (self.limits[low:high][part] - low).clamp(max=high - low)
+        return limits
 
     def _known(self, first: int, stop: int) -> Tensor:
         """Rows [first, stop) of what is known; nothing is, beyond the plan of a scene without end."""

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.blending import arrive, crossfade_given, hold, step_between
-from magnet.generation.conditioning import reach, sight
-from magnet.generation.showing import seen
+from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
+from magnet.generation.causal_bodies import finalized_bodies
+from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.motion.frames import (
     Placement,
+    align_planar,
+    canonical_deltas,
     canonical_frame,
-    canonical_steps,
     from_9d,
     inverse,
     pairwise,
@@ -23,7 +24,6 @@ from magnet.motion.frames import (
     place,
     posed,
     project_se2,
-    shift_onto,
     to_9d,
 )
 from magnet.motion.scene import Scene, cat_time
@@ -90,7 +90,7 @@ class SamplingStats:
         self.pairwise_drifts += len(away)
 
 
-class Canvas:
+class WorldState:
     """World poses of the scene while it is being generated.
 
     After each stage the new tokens are made self-consistent before the model sees them again: codes
@@ -99,7 +99,7 @@ class Canvas:
 
     Args:
         model: whose tokens these are.
-        given: (B, T) what is known of the scene, the rest scrubbed; or of its first rows, see `extend`.
+        given: (B, T) what is known of the scene, the rest masked; or of its first rows, see `extend`.
         schedule: the plan of the whole scene; only what it knows is read.
         options: how to sample.
         samples: scenes drawn for each of B.
@@ -125,8 +125,8 @@ class Canvas:
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
-        self.causal, self._sight, self.released = schedule.causal, sight(schedule), 0
-        self.shown = 0  # rows of a causal plan whose bodies are final, and given from then on
+        self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
+        self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
 
     def extend(self, given: Scene, known: Tensor) -> None:
         """Take in more rows at the end. given (B, 4 n), known (n, P)"""
@@ -140,75 +140,75 @@ class Canvas:
         change must stay."""
         frames = rows * STRIDE
         self.rooted |= bool(self.known[:rows].any())
-        self.shown, self.released = max(self.shown - rows, 0), self.released + rows
+        self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
         self.T_world_can = self.T_world_can[:, frames:].clone()
         kept = self.given.slice(frames)
         self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
 
-    def make_consistent(self, canvas: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
-        """Make the tokens that a stage finished self-consistent, in place. canvas (B, N, P, D), finished (N, P) bool
+    def make_consistent(self, tokens: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
+        """Make the tokens that a stage finished self-consistent, in place. tokens (B, N, P, D), finished (N, P) bool
 
-        Of known tokens nothing changes but the step that leads into them, once it is known where from. `decentralized`:
-        some agents did not see what others did in this stage. What their tokens say of each other is noise then, and
-        would tie together who decided alone, so everybody is placed by the own steps, whatever the options say.
+        Known tokens keep everything but the delta that leads into them, which is written once the agent before them is
+        placed. `decentralized`: some agents did not see what others did in this stage. Their pairwise transforms are
+        noise then, so everybody is placed by the own deltas alone, whatever the options say.
         """
         rows = finished.any(dim=1).nonzero()[:, 0]
         if not len(rows):
-            return canvas
+            return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        latent, steps, pairs = layout.unpack(normalizer.denormalize(canvas[:, first:stop]))
+        latent, deltas, pairs = layout.unpack(normalizer.denormalize(tokens[:, first:stop]))
         if self.model.quantized if self.options.requantize is None else self.options.requantize:
-            new = finished[first:stop].to(canvas.device)
+            new = finished[first:stop].to(tokens.device)
             code = self.model.tokenizer.requantize(latent)
             self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
-        moved = self._place_all(steps, pairs if layout.slots else None, finished, first, stop, placement)
+        moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
-            earlier = layout.unpack(normalizer.denormalize(canvas[:, begin:first]))[0]
+            earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
-        true_steps = self._steps(begin, stop)
+        true_deltas = self._deltas(begin, stop)
         implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
-        settled = layout.pack(latent, true_steps, implied)
-        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(canvas.device)
+        settled = layout.pack(latent, true_deltas, implied)
+        changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
         if layout.slots:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
             if decentralized:
-                new = finished[first:stop].to(canvas.device)
-                together &= ~(new[:, :, None] & new[:, partners(layout.agents, canvas.device)])
+                new = finished[first:stop].to(tokens.device)
+                together &= ~(new[:, :, None] & new[:, partners(layout.agents, tokens.device)])
             self.stats.add_pairwise_drift(pairs, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
-        canvas[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), canvas[:, begin:stop])
-        return self._enter(canvas, begin, stop)
+        tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
+        return self._enter(tokens, begin, stop)
 
-    def _steps(self, first: int, stop: int) -> Tensor:
+    def _deltas(self, first: int, stop: int) -> Tensor:
         """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
-        # One frame more in front, so that the first step leads in from where each agent stood.
+        # One frame more in front, so that the first delta leads in from where each agent stood.
         lead = min(1, first)
-        steps = canonical_steps(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
-        steps = by_token(to_9d(steps))
-        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(steps.device)
-        steps[:, :, :, 0] = torch.where(before[..., None], steps[:, :, :, 0], to_9d(torch.eye(4)).to(steps))
-        return steps
+        deltas = canonical_deltas(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
+        deltas = by_token(to_9d(deltas))
+        before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(deltas.device)
+        deltas[:, :, :, 0] = torch.where(before[..., None], deltas[:, :, :, 0], to_9d(torch.eye(4)).to(deltas))
+        return deltas
 
-    def _enter(self, canvas: Tensor, first: int, stop: int) -> Tensor:
-        """Write the true step into known tokens that a gap has just been closed in front of."""
+    def _enter(self, tokens: Tensor, first: int, stop: int) -> Tensor:
+        """Write the true delta into known tokens that a gap has just been closed in front of."""
         until = min(stop + 1, len(self.known))
         before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
-        entered = (self.known[first:until] & ~before).to(canvas.device)
+        entered = (self.known[first:until] & ~before).to(tokens.device)
         entered[0] = False  # nothing in front of these rows has moved
         if not bool(entered.any()):
-            return canvas
+            return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
-        latent, _, pairs = layout.unpack(canvas[:, first:until])
-        true = normalizer.normalize(layout.pack(latent, self._steps(first, until), pairs))
-        number = torch.arange(layout.width, device=canvas.device)
-        step = (number >= layout.latent) & (number < layout.latent + 9)
-        canvas[:, first:until] = torch.where(entered[..., None] & step, true, canvas[:, first:until])
-        return canvas
+        latent, _, pairs = layout.unpack(tokens[:, first:until])
+        true = normalizer.normalize(layout.pack(latent, self._deltas(first, until), pairs))
+        number = torch.arange(layout.width, device=tokens.device)
+        delta = (number >= layout.latent) & (number < layout.latent + 9)
+        tokens[:, first:until] = torch.where(entered[..., None] & delta, true, tokens[:, first:until])
+        return tokens
 
     def _ready(self, first: int, stop: int) -> Tensor:
         """Which groups of tokens speak only of agents that are placed. -> (n, P, 1 + slots) bool"""
@@ -227,7 +227,7 @@ class Canvas:
 
     def _place_all(
         self,
-        steps: Tensor,
+        deltas: Tensor,
         pairs: Tensor | None,
         finished: Tensor,
         first: int,
@@ -240,19 +240,19 @@ class Canvas:
             part = slice(start - first, end - first)
             new = finished[start]
             near = None if pairs is None else pairs[:, part]
-            self._place(steps[:, part], near, start, end, new, placement)
+            self._place(deltas[:, part], near, start, end, new, placement)
             self.placed[start:end] |= new
-            moved |= self._arrive(end, new)
+            moved |= self._warp_to_keyframe(end, new)
         return moved
 
     def _place(
-        self, steps: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
+        self, deltas: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
     ) -> None:
-        """Put newly generated agents into the world from their predicted steps and pairs. new (P,) bool"""
-        new = new.to(steps.device)
-        known = self.placed[first].to(steps.device)
-        true_steps = from_9d(by_frame(self._steps(first, stop)))
-        T_prev_can = torch.where(known[:, None, None], true_steps, project_se2(from_9d(by_frame(steps))))
+        """Put newly generated agents into the world from their predicted deltas and pairs. new (P,) bool"""
+        new = new.to(deltas.device)
+        known = self.placed[first].to(deltas.device)
+        true_deltas = from_9d(by_frame(self._deltas(first, stop)))
+        T_prev_can = torch.where(known[:, None, None], true_deltas, project_se2(from_9d(by_frame(deltas))))
         T_self_partner = None
         if pairs is not None:
             T_self_partner = from_9d(pairwise_by_frame(pairs))
@@ -271,7 +271,7 @@ class Canvas:
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
-        """Canonical frames just before token `first`, such that the first step leads to the right place.
+        """Canonical frames just before token `first`, such that the first delta leads to the right place.
 
         Whoever was there before goes on from there. A newcomer's whole way hangs by the pairwise transforms, as
         nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
@@ -297,11 +297,11 @@ class Canvas:
         for agent in (~there & ~now).nonzero()[:, 0].tolist():
             slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
             hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
-            shift = shift_onto(ways[:, :, agent], hung)
+            shift = align_planar(ways[:, :, agent], hung)
             starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
         return starts
 
-    def _arrive(self, row: int, new: Tensor) -> Tensor:
+    def _warp_to_keyframe(self, row: int, new: Tensor) -> Tensor:
         """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
 
         Each agent's misfit is spread over its whole gap, or as much of it as has not been shown. Where nothing was
@@ -312,58 +312,58 @@ class Canvas:
         if not bool(arriving.any()):
             return moved
         key = row * STRIDE
-        if not self.rooted and not self.shown and not bool(self.known[:row].any()):
+        if not self.rooted and not self.finalized and not bool(self.known[:row].any()):
             self._root(key, arriving)
             moved[:row] |= self.placed[:row]
         for agent in arriving.nonzero()[:, 0].tolist():
             T_world_key = self.T_world_can[:, key, agent]
-            key_step = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
+            key_delta = inverse(T_world_key) @ self.T_world_can[:, key + 1, agent]
             gap = (self.placed & ~self.known)[:row, agent]
-            gap[: self.shown] = False  # too late to move
+            gap[: self.finalized] = False  # too late to move
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
             path = self.T_world_can[:, start * STRIDE - left : key, agent]
-            self.T_world_can[:, start * STRIDE : key, agent] = arrive(path, T_world_key, key_step)[:, left:]
+            self.T_world_can[:, start * STRIDE : key, agent] = warp_to_keyframe(path, T_world_key, key_delta)[:, left:]
             moved[start:row, agent] = True
         return moved
 
     def _late(self, row: int) -> Tensor:
         """Who is told of a known token only when the one before has been shown. -> (P,) bool"""
         row += self.released
-        if not self.causal or not 0 < row < len(self._sight):
+        if not self.causal or not 0 < row < len(self._lookahead_limit):
             return torch.zeros_like(self.known[0])
-        return self._sight[row - 1] <= row
+        return self._lookahead_limit[row - 1] <= row
 
     def _root(self, key: int, arriving: Tensor) -> None:
         """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
         there = self.given.present & arriving.to(self.given.device)
         scene, lead = torch.arange(len(there), device=there.device), first_of(there)
         T_world_key = self.T_world_can[scene, key, lead]
-        key_step = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
+        key_delta = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
         path = self.T_world_can[scene, :key, lead]
-        shift = T_world_key @ inverse(path[:, -1] @ step_between(path, key_step))
+        shift = T_world_key @ inverse(path[:, -1] @ delta_between(path, key_delta))
         shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
         placed = self.by_frame(self.placed[: key // STRIDE])[..., None, None]
         now = self.T_world_can[:, :key]
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
-    def scene(self, canvas: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
-        """Rows [first, stop) of the finished canvas as bodies in the world; by default all rows.
+    def scene(self, tokens: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
+        """Rows [first, stop) of the finished tokens as bodies in the world; by default all rows.
 
         `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
         Poses depend on as many neighbouring rows as the decoder and the seams reach; those of causal plans on earlier
-        rows alone (`magnet.generation.showing`).
+        rows alone (`magnet.generation.causal_bodies`).
         """
         if self.causal:
-            return seen(self, canvas, first, len(self.known) if stop is None else stop)
+            return finalized_bodies(self, tokens, first, len(self.known) if stop is None else stop)
         layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.keep_given else 0
         stop = len(self.known) if stop is None else stop
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
-        behind, ahead = reach(self.model)
+        behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
-        latent, steps, _ = layout.unpack(self.model.normalizer.denormalize(canvas[:, near]))
-        features = self.model.tokenizer.decode(latent, self.given.betas, steps)
+        latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
+        features = self.model.tokenizer.decode(latent, self.given.betas, deltas)
         frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
         given = self.given.slice(low * STRIDE, high * STRIDE)
         T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
@@ -373,7 +373,7 @@ class Canvas:
                 decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
             )
         decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
-        return hold(decoded, self.by_frame(self.placed[first:stop]), before)
+        return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:
         """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""

@@ -19,7 +19,7 @@ from magnet.motion.scene import Scene
 Placement = Literal["integrate", "anchor", "fuse"]
 
 FIXED = 1e9
-"""Weight of a step that is known: `fuse` moves such an agent by less than rounding does."""
+"""Weight of a delta that is known: `fuse` moves such an agent by less than rounding does."""
 
 UPRIGHT = 1e-3
 """Below this horizontal length of the left axis the person lies on the side, and the axis tells no yaw."""
@@ -82,7 +82,7 @@ def _on_ground(rotation: Tensor, ground: Tensor) -> Tensor:
     return rigid(rotation, torch.stack([x, torch.zeros_like(x), z], dim=-1))
 
 
-def turn(yaw: Tensor, ground: Tensor) -> Tensor:
+def rotate_ground(yaw: Tensor, ground: Tensor) -> Tensor:
     """Turn ground vectors (x, z) about the vertical. (...), (..., 2) -> (..., 2)"""
     cos, sin = yaw.cos(), yaw.sin()
     x, z = ground.unbind(-1)
@@ -112,18 +112,18 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
     return _on_ground(about_y_of(sine / length, cosine / length), T_world_root[..., [0, 2], 3])
 
 
-def canonical_steps(T_world_can: Tensor) -> Tensor:
+def canonical_deltas(T_world_can: Tensor) -> Tensor:
     """dT_can(t) = inverse(T_can(t-1)) @ T_can(t), the identity at the first frame. (..., T, P, 4, 4) -> same
 
     >>> T_world_can = torch.eye(4).repeat(3, 1, 1, 1)  # three frames of one person
     >>> T_world_can[:, 0, 2, 3] = torch.tensor([0.0, 0.1, 0.3])  # who walks forward, along z
-    >>> canonical_steps(T_world_can)[:, 0, 2, 3]
+    >>> canonical_deltas(T_world_can)[:, 0, 2, 3]
     tensor([0.0000, 0.1000, 0.2000])
     """
     before = torch.cat([T_world_can[..., :1, :, :, :], T_world_can[..., :-1, :, :, :]], dim=-4)
-    steps = inverse(before) @ T_world_can
-    steps[..., :1, :, :, :] = torch.eye(4, dtype=steps.dtype, device=steps.device)
-    return steps
+    deltas = inverse(before) @ T_world_can
+    deltas[..., :1, :, :, :] = torch.eye(4, dtype=deltas.dtype, device=deltas.device)
+    return deltas
 
 
 def partners(agents: int, device: torch.device | None = None) -> Tensor:
@@ -150,13 +150,13 @@ def pairwise(T_world_can: Tensor) -> Tensor:
     return inverse(T_world_can)[..., None, :, :] @ T_world_partner
 
 
-def propagated(T_self_partner: Tensor, steps: Tensor) -> Tensor:
-    """Right side of paper Eq. 11: each frame's pairwise transform as the frame before and the steps imply it.
+def propagate_pairwise(T_self_partner: Tensor, deltas: Tensor) -> Tensor:
+    """Each frame's pairwise transform as the frame before and the deltas imply it (right side of paper Eq. 11).
 
-    T_self_partner (..., T, P, P - 1, 4, 4), steps (..., T, P, 4, 4) -> (..., T - 1, P, P - 1, 4, 4),
+    T_self_partner (..., T, P, P - 1, 4, 4), deltas (..., T, P, 4, 4) -> (..., T - 1, P, P - 1, 4, 4),
     to be compared with frames 1 to T - 1. On real motion the two are equal.
     """
-    now = steps[..., 1:, :, :, :]
+    now = deltas[..., 1:, :, :, :]
     step_partner = now[..., partners(now.shape[-3], now.device), :, :]
     return inverse(now)[..., None, :, :] @ T_self_partner[..., :-1, :, :, :, :] @ step_partner
 
@@ -186,7 +186,7 @@ def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
     )
 
 
-def shift_onto(path: Tensor, target: Tensor) -> Tensor:
+def align_planar(path: Tensor, target: Tensor) -> Tensor:
     """The turn and move over the ground that best lay a path onto another: headings first, then positions.
 
     (..., T, 4, 4), (..., T, 4, 4) -> (..., 4, 4), such that shift @ path is about target.
@@ -194,7 +194,7 @@ def shift_onto(path: Tensor, target: Tensor) -> Tensor:
     (yaw, ground), (yaw_target, ground_target) = to_planar(path), to_planar(target)
     off = yaw_target - yaw
     turned = torch.atan2(off.sin().mean(dim=-1), off.cos().mean(dim=-1))
-    return from_planar(turned, (ground_target - turn(turned[..., None], ground)).mean(dim=-2))
+    return from_planar(turned, (ground_target - rotate_ground(turned[..., None], ground)).mean(dim=-2))
 
 
 # -- from predicted tokens back into the world -------------------------------------------------
@@ -206,7 +206,7 @@ def project_se2(T: Tensor) -> Tensor:
 
 
 def place(
-    steps: Tensor,
+    deltas: Tensor,
     T_self_partner: Tensor | None,
     T_world_start: Tensor,
     placement: Placement = "integrate",
@@ -218,50 +218,50 @@ def place(
     """World canonical frames of a predicted stretch of motion.
 
     Args:
-        steps: (B, T, P, 4, 4), step from the frame before; the first leads away from `T_world_start`.
+        deltas: (B, T, P, 4, 4), delta from the frame before; the first leads away from `T_world_start`.
         T_self_partner: (B, T, P, P - 1, 4, 4); `integrate` does not read it and takes None.
         T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
-        placement: `integrate`: every agent integrates its own steps (the reference's way; agents may
+        placement: `integrate`: every agent integrates its own deltas (the reference's way; agents may
             drift apart slowly). `anchor`: one agent integrates, the others hang off it by its pairwise
-            transforms (no drift apart, but their own steps are ignored). `fuse` (ours): at each frame
-            the least-squares compromise of all steps and all pairwise transforms, equal for all agents.
-        pairwise_weight: `fuse` only: weight of one pairwise transform against one step. 0 is `integrate`.
+            transforms (no drift apart, but their own deltas are ignored). `fuse` (ours): at each frame
+            the least-squares compromise of all deltas and all pairwise transforms, equal for all agents.
+        pairwise_weight: `fuse` only: weight of one pairwise transform against one delta. 0 is `integrate`.
         present: (B, P) bool; pairs to absent agents are not read. None: all are there.
-        fixed: (P,) bool, `fuse` only: agents whose steps are known and must not be compromised. None: nobody.
+        fixed: (P,) bool, `fuse` only: agents whose deltas are known and must not be compromised. None: nobody.
         anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
 
     Returns:
-        T_world_can (B, T, P, 4, 4), in the dtype of `steps`; computed in float64 so that thousands of
+        T_world_can (B, T, P, 4, 4), in the dtype of `deltas`; computed in float64 so that thousands of
         frames add up exactly.
     """
-    step_yaw, step_ground = to_planar(steps.double())
+    delta_yaw, delta_ground = to_planar(deltas.double())
     start_yaw, start_ground = to_planar(T_world_start.double())
-    if placement == "fuse" and T_self_partner is not None and steps.shape[2] > 1:
+    if placement == "fuse" and T_self_partner is not None and deltas.shape[2] > 1:
         if present is None:
-            present = torch.ones(steps.shape[0], steps.shape[2], dtype=torch.bool, device=steps.device)
-        weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(steps.device), FIXED, 1.0)
+            present = torch.ones(deltas.shape[0], deltas.shape[2], dtype=torch.bool, device=deltas.device)
+        weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(deltas.device), FIXED, 1.0)
         pairs = to_planar(T_self_partner.double())
-        steps_planar = (step_yaw, step_ground)
-        return from_planar(*_fuse(*steps_planar, *pairs, start_yaw, start_ground, pairwise_weight, present, weight)).to(
-            steps
-        )
-    yaw = start_yaw[:, None] + step_yaw.cumsum(dim=1)
+        deltas_planar = (delta_yaw, delta_ground)
+        return from_planar(
+            *_fuse(*deltas_planar, *pairs, start_yaw, start_ground, pairwise_weight, present, weight)
+        ).to(deltas)
+    yaw = start_yaw[:, None] + delta_yaw.cumsum(dim=1)
     before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
-    ground = start_ground[:, None] + turn(before, step_ground).cumsum(dim=1)
+    ground = start_ground[:, None] + rotate_ground(before, delta_ground).cumsum(dim=1)
     T_world_can = from_planar(yaw, ground)
     if placement == "anchor" and T_self_partner is not None:
-        scene = torch.arange(len(steps), device=steps.device)
-        anchor = torch.zeros_like(scene) if anchor is None else anchor.to(steps.device)
+        scene = torch.arange(len(deltas), device=deltas.device)
+        anchor = torch.zeros_like(scene) if anchor is None else anchor.to(deltas.device)
         T_anchor_others = project_se2(T_self_partner[scene, :, anchor].double())
         T_world_others = T_world_can[scene, :, anchor][:, :, None] @ T_anchor_others  # (B, T, P - 1, 4, 4)
-        others = partners(steps.shape[2], steps.device)[anchor]
+        others = partners(deltas.shape[2], deltas.device)[anchor]
         T_world_can[scene[:, None], :, others] = T_world_others.transpose(1, 2)
-    return T_world_can.to(steps)
+    return T_world_can.to(deltas)
 
 
 def _fuse(
-    step_yaw: Tensor,
-    step_ground: Tensor,
+    delta_yaw: Tensor,
+    delta_ground: Tensor,
     pair_yaw: Tensor,
     pair_ground: Tensor,
     yaw: Tensor,
@@ -276,9 +276,9 @@ def _fuse(
     diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
     """
     partner = partners(present.shape[1], present.device)
-    together = pairwise_weight * (present[:, :, None] & present[:, None]).to(step_yaw)
+    together = pairwise_weight * (present[:, :, None] & present[:, None]).to(delta_yaw)
     together.diagonal(dim1=1, dim2=2).zero_()
-    system = torch.diag(own.to(step_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
+    system = torch.diag(own.to(delta_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
     solve = torch.linalg.inv(system)
     weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
 
@@ -288,13 +288,13 @@ def _fuse(
         return (-weighted.sum(dim=2)).index_add(1, partner.flatten(), weighted.flatten(1, 2))
 
     yaws, grounds = [], []
-    for t in range(step_yaw.shape[1]):
-        ground = ground + turn(yaw, step_ground[:, t])
-        yaw = yaw + step_yaw[:, t]
+    for t in range(delta_yaw.shape[1]):
+        ground = ground + rotate_ground(yaw, delta_ground[:, t])
+        yaw = yaw + delta_yaw[:, t]
         off = pair_yaw[:, t] - (yaw[:, partner] - yaw[:, :, None])
         off = torch.atan2(off.sin(), off.cos())
         yaw = yaw + (solve @ pull(off[..., None]))[..., 0]
-        away = turn(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
+        away = rotate_ground(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
         ground = ground + solve @ pull(away)
         yaws.append(yaw)
         grounds.append(ground)

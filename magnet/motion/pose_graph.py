@@ -1,4 +1,4 @@
-"""Where people stand, from their own steps and from what they see of each other: one least-squares solve.
+"""Where people stand, from their own deltas and from what they see of each other: one least-squares solve.
 
 The unknowns are the headings and ground positions of all agents over a stretch of frames. Steps tie an agent's frames
 to each other, pairwise transforms tie agents to each other, and each comes with a precision (one over its variance).
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import partners, turn
+from magnet.motion.frames import partners, rotate_ground
 
 GAUGE = 1e-6
-"""Precision that holds everybody where their steps alone would lead, where nothing else says where they are."""
+"""Precision that holds everybody where their deltas alone would lead, where nothing else says where they are."""
 
 
 @dataclass(frozen=True)
@@ -35,52 +35,52 @@ class Planar:
     ground_precision: Tensor
 
 
-def solve_pose_graph(steps: Planar, pairs: Planar, start_yaw: Tensor, start_ground: Tensor) -> tuple[Tensor, Tensor]:
-    """Headings and positions that fit steps and pairwise transforms best, each by its precision.
+def solve_pose_graph(deltas: Planar, pairs: Planar, start_yaw: Tensor, start_ground: Tensor) -> tuple[Tensor, Tensor]:
+    """Headings and positions that fit deltas and pairwise transforms best, each by its precision.
 
-    Minimises the squared differences between consecutive poses and the steps, and between the agents of a frame
-    and the pairwise transforms. With pairwise precisions of 0 it is the plain integration of the steps.
+    Minimises the squared differences between consecutive poses and the deltas, and between the agents of a frame
+    and the pairwise transforms. With pairwise precisions of 0 it is the plain integration of the deltas.
 
     Args:
-        steps: (B, T, P): T_prev_now of each agent; the first leads away from the start.
+        deltas: (B, T, P): T_prev_now of each agent; the first leads away from the start.
         pairs: (B, T, P, P - 1): T_self_partner, in the order of `partners`.
-        start_yaw: (B, P) headings before the first frame. How firmly they hold is the first step's precision.
+        start_yaw: (B, P) headings before the first frame. How firmly they hold is the first delta's precision.
         start_ground: (B, P, 2) positions before the first frame.
 
     Returns:
         yaw (B, T, P) and ground (B, T, P, 2), in float64.
     """
     start_yaw, start_ground = start_yaw.double(), start_ground.double()
-    partner = partners(steps.yaw.shape[2], steps.yaw.device)
-    yaw = start_yaw[:, None] + steps.yaw.double().cumsum(dim=1)
+    partner = partners(deltas.yaw.shape[2], deltas.yaw.device)
+    yaw = start_yaw[:, None] + deltas.yaw.double().cumsum(dim=1)
     off = pairs.yaw.double() - (yaw[:, :, partner] - yaw[..., None])
     off = torch.atan2(off.sin(), off.cos())
-    correction = _correct(steps.yaw_precision, pairs.yaw_precision, off[..., None])
+    correction = _correct(deltas.yaw_precision, pairs.yaw_precision, off[..., None])
     yaw = yaw + correction[..., 0]
     before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
-    ground = start_ground[:, None] + turn(before, steps.ground.double()).cumsum(dim=1)
-    seen = turn(yaw[..., None], pairs.ground.double())
+    ground = start_ground[:, None] + rotate_ground(before, deltas.ground.double()).cumsum(dim=1)
+    seen = rotate_ground(yaw[..., None], pairs.ground.double())
     away = seen - (ground[:, :, partner] - ground[:, :, :, None])
-    return yaw, ground + _correct(steps.ground_precision, pairs.ground_precision, away)
+    return yaw, ground + _correct(deltas.ground_precision, pairs.ground_precision, away)
 
 
-def _correct(step_precision: Tensor, pair_precision: Tensor, off: Tensor) -> Tensor:
+def _correct(delta_precision: Tensor, pair_precision: Tensor, off: Tensor) -> Tensor:
     """By how much each agent leaves its integrated path in each frame.
 
-    step_precision (B, T, P), pair_precision (B, T, P, P - 1), off (B, T, P, P - 1, C), how far each pairwise transform
+    delta_precision (B, T, P), pair_precision (B, T, P, P - 1), off (B, T, P, P - 1, C), how far each pairwise transform
     is from the integrated paths -> (B, T, P, C)
     """
-    B, T, P = step_precision.shape
-    step, pair = step_precision.double(), pair_precision.double()
-    partner = partners(P, step.device)
+    B, T, P = delta_precision.shape
+    delta, pair = delta_precision.double(), pair_precision.double()
+    partner = partners(P, delta.device)
     pull = pair[..., None] * off
     right = (-pull.sum(dim=3)).index_add(2, partner.flatten(), pull.flatten(2, 3))
     # Ordered pairs both ways as one symmetric matrix a frame: (B, T, P, P).
-    tie = torch.zeros(B, T, P, P, dtype=step.dtype, device=step.device).scatter(3, partner.expand(B, T, P, -1), pair)
+    tie = torch.zeros(B, T, P, P, dtype=delta.dtype, device=delta.device).scatter(3, partner.expand(B, T, P, -1), pair)
     tie = tie + tie.transpose(2, 3)
-    following = torch.nn.functional.pad(step[:, 1:], (0, 0, 0, 1))
-    frames = torch.diag_embed(step + following + GAUGE + tie.sum(dim=3)) - tie
-    return solve_block_tridiagonal(frames, torch.diag_embed(-step), right)
+    following = torch.nn.functional.pad(delta[:, 1:], (0, 0, 0, 1))
+    frames = torch.diag_embed(delta + following + GAUGE + tie.sum(dim=3)) - tie
+    return solve_block_tridiagonal(frames, torch.diag_embed(-delta), right)
 
 
 def solve_block_tridiagonal(diagonal: Tensor, before: Tensor, right: Tensor) -> Tensor:

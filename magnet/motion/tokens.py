@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, canonical_steps, pairwise, partners, to_9d
+from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, partners, to_9d
 from magnet.motion.scene import Scene
 
 STRIDE = 4
@@ -17,10 +17,10 @@ STRIDE = 4
 
 @dataclass(frozen=True)
 class TokenLayout:
-    """Where things lie in a packed token: latent, 4 x 9 steps, then 4 x 9 for each partner slot.
+    """Where things lie in a packed token: latent, 4 x 9 deltas, then 4 x 9 for each partner slot.
 
     The numbers fall into *groups* that share one noise level: group 0 is the agent's own (latent and
-    steps), group 1 + s is partner slot s.
+    deltas), group 1 + s is partner slot s.
 
     >>> TokenLayout(latent=512, agents=2).width
     584
@@ -72,9 +72,9 @@ class TokenLayout:
         """One value a group to one value a number. (..., 1 + slots) -> (..., D)"""
         return grouped[..., self.groups(grouped.device)]
 
-    def pack(self, latent: Tensor, steps: Tensor, pairs: Tensor) -> Tensor:
+    def pack(self, latent: Tensor, deltas: Tensor, pairs: Tensor) -> Tensor:
         """(B, N, P, C), (B, N, P, 4, 9), (B, N, P, P - 1, 4, 9) -> (B, N, P, D)"""
-        parts = [latent, steps.flatten(-2)]
+        parts = [latent, deltas.flatten(-2)]
         if self.slots:
             parts.append(pairs.flatten(-3))
         return torch.cat(parts, dim=-1)
@@ -82,8 +82,8 @@ class TokenLayout:
     def unpack(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Inverse of `pack`; without pairs the last one has no slots."""
         sizes = [self.latent, 9 * STRIDE, 9 * STRIDE * self.slots]
-        latent, steps, pairs = tokens.split(sizes, dim=-1)
-        return latent, steps.unflatten(-1, (STRIDE, 9)), pairs.unflatten(-1, (self.slots, STRIDE, 9))
+        latent, deltas, pairs = tokens.split(sizes, dim=-1)
+        return latent, deltas.unflatten(-1, (STRIDE, 9)), pairs.unflatten(-1, (self.slots, STRIDE, 9))
 
 
 def by_token(frames: Tensor) -> Tensor:
@@ -103,9 +103,9 @@ def by_frame(tokens: Tensor) -> Tensor:
     return tokens.transpose(2, 3).flatten(1, 2)
 
 
-def scene_steps(scene: Scene) -> Tensor:
-    """Canonical steps in 9-D, a frame each. -> (B, T, P, 9)"""
-    return to_9d(canonical_steps(canonical_frame(scene.T_world_root)))
+def scene_deltas(scene: Scene) -> Tensor:
+    """Canonical deltas in 9-D, a frame each. -> (B, T, P, 9)"""
+    return to_9d(canonical_deltas(canonical_frame(scene.T_world_root)))
 
 
 def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -115,7 +115,7 @@ def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
 
 def transforms(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
     """Steps and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
-    return by_token(to_9d(canonical_steps(T_world_can))), pairwise_by_token(to_9d(pairwise(T_world_can)))
+    return by_token(to_9d(canonical_deltas(T_world_can))), pairwise_by_token(to_9d(pairwise(T_world_can)))
 
 
 def pairwise_by_token(pairs: Tensor) -> Tensor:

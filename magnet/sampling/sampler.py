@@ -24,9 +24,9 @@ class DenoiseFn(Protocol):
 
 
 StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
-"""Called after each stage with the canvas (B, N, P, D), which tokens it finished (N, P) bool, and whether it hid from
-somebody what it generated of others; returns the canvas with those tokens made self-consistent (codes snapped,
-transforms recomputed from world poses)."""
+"""Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was
+decentralized (`Stage.decentralized`). Returns the tokens with the finished ones made self-consistent: latents moved to
+their nearest codes, transforms recomputed from world poses."""
 
 
 @torch.no_grad()
@@ -67,12 +67,12 @@ def sample(
         raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
     noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
     init_noise, mask_noise = noise.draw(N)
-    canvas = begin(tokens, init_noise, schedule.known, layout)
-    history = None if solver == "ddim" else History.empty(canvas)
+    tokens = begin(tokens, init_noise, schedule.known, layout)
+    history = None if solver == "ddim" else History.empty(tokens)
     return run_stages(
         denoise,
         schedule.stages,
-        canvas,
+        tokens,
         mask_noise,
         present,
         layout,
@@ -94,7 +94,7 @@ def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> 
 def run_stages(
     denoise: DenoiseFn,
     stages: Iterable[Stage],
-    canvas: Tensor,
+    tokens: Tensor,
     mask_noise: Tensor,
     present: Tensor,
     layout: TokenLayout,
@@ -105,24 +105,32 @@ def run_stages(
     offset: int = 0,
     history: History | None = None,
 ) -> Tensor:
-    """Run stages in their order on a canvas. canvas, mask_noise (B, N, P, D) -> (B, N, P, D)
+    """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
-    Arguments as for `sample`; `noise` gives what is new in each step, and `offset` says which of its rows the canvas
-    begins with. A `history` of the canvas makes the solver a multistep one, and is brought up to date.
+    Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
+    `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it.
     """
-    canvas = canvas.clone()
+    tokens = tokens.clone()
     for stage in stages:
         window = slice(stage.start, stage.stop)
-        tokens, hides, first = canvas[:, window], mask_noise[:, window], offset + stage.start
-        past = None if history is None else history.window(window)
-        canvas[:, window] = run_stage(
-            denoise, stage, tokens, hides, present, layout, progress, guidance or Guidance(), noise, first, past
+        tokens[:, window] = run_stage(
+            denoise,
+            stage,
+            tokens[:, window],
+            mask_noise[:, window],
+            present,
+            layout,
+            progress,
+            guidance or Guidance(),
+            noise,
+            offset + stage.start,
+            None if history is None else history.window(window),
         )
         if on_stage_end is not None:
-            finished = torch.zeros(canvas.shape[1:3], dtype=torch.bool)
+            finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)
             finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)
-            canvas = on_stage_end(canvas, finished, stage.decentralized)
-    return canvas
+            tokens = on_stage_end(tokens, finished, stage.decentralized)
+    return tokens
 
 
 def run_stage(

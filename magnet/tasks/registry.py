@@ -27,8 +27,8 @@ class Registered:
     origin: str
 
 
-_tasks: dict[str, Registered] = {}
-_failures: dict[str, Exception] = {}
+known_tasks: dict[str, Registered] = {}
+failed_plugins: dict[str, Exception] = {}
 _discovered = False
 
 
@@ -52,10 +52,10 @@ def _add(name: str, task: type, origin: str) -> None:
     if not is_dataclass(task) or missing:
         what = f"has no {' and no '.join(missing)}" if missing else "is not a dataclass"
         raise TypeError(f"task {name}: {task!r} {what}; see docs/tasks.md")
-    known = _tasks.get(name)
+    known = known_tasks.get(name)
     if known is not None and known.task is not task:
         raise ValueError(f"task name {name} is taken by {known.task.__module__}.{known.task.__qualname__}")
-    _tasks[name] = Registered(name, task, origin)
+    known_tasks[name] = Registered(name, task, origin)
 
 
 def discover(again: bool = False) -> None:
@@ -80,17 +80,17 @@ def _load_variable(value: str) -> None:
     if name:
         _load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)
         return
-    before = set(_tasks)
+    before = set(known_tasks)
     try:
         importlib.import_module(module)
-        own = [entry.name for entry in _tasks.values() if entry.task.__module__.startswith(module)]
+        own = [entry.name for entry in known_tasks.values() if entry.task.__module__.startswith(module)]
         if not own:
             raise ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
     except Exception as error:  # a stranger's import may raise anything
-        _failures[module] = error
+        failed_plugins[module] = error
         return
-    for name in {*own, *(set(_tasks) - before)}:
-        _tasks[name] = Registered(name, _tasks[name].task, origin)
+    for name in {*own, *(set(known_tasks) - before)}:
+        known_tasks[name] = Registered(name, known_tasks[name].task, origin)
 
 
 def snake_case(name: str) -> str:
@@ -101,25 +101,25 @@ def snake_case(name: str) -> str:
 def _load(name: str, load: Callable[[], type], origin: str) -> None:
     try:
         task = load()
-        own = [entry.name for entry in _tasks.values() if entry.task is task]
+        own = [entry.name for entry in known_tasks.values() if entry.task is task]
         for known in own:  # it has registered itself with the decorator, which does not know where from
-            _tasks[known] = Registered(known, task, origin)
+            known_tasks[known] = Registered(known, task, origin)
         if not own:
             _add(name, task, origin)
     except Exception as error:  # a stranger's import may raise anything
-        _failures[name] = error
+        failed_plugins[name] = error
 
 
 def names() -> list[str]:
     """Names of all tasks."""
     discover()
-    return sorted(_tasks)
+    return sorted(known_tasks)
 
 
 def entries() -> list[Registered]:
     """All tasks with their origins, by name."""
     discover()
-    return [_tasks[name] for name in sorted(_tasks)]
+    return [known_tasks[name] for name in sorted(known_tasks)]
 
 
 def get(name: str) -> type:
@@ -137,17 +137,17 @@ def get(name: str) -> type:
     """
     discover()
     if not isinstance(name, str):
-        raise ValueError(f"task: got {name!r}, expected a name: {', '.join(sorted(_tasks))}")
-    if name in _tasks:
-        return _tasks[name].task
-    if name in _failures:
-        raise ValueError(f"task {name} failed to load: {_failures[name]!r}") from _failures[name]
-    close = difflib.get_close_matches(name, _tasks, n=1)
+        raise ValueError(f"task: got {name!r}, expected a name: {', '.join(sorted(known_tasks))}")
+    if name in known_tasks:
+        return known_tasks[name].task
+    if name in failed_plugins:
+        raise ValueError(f"task {name} failed to load: {failed_plugins[name]!r}") from failed_plugins[name]
+    close = difflib.get_close_matches(name, known_tasks, n=1)
     hint = f"; did you mean {close[0]}?" if close else "."
-    raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(_tasks))}.")
+    raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(known_tasks))}.")
 
 
 def failures() -> dict[str, Exception]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
-    return dict(_failures)
+    return dict(failed_plugins)

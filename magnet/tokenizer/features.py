@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, pose_features, posed
 from magnet.motion.scene import Scene, require_rate
-from magnet.motion.tokens import STRIDE, scene_steps
+from magnet.motion.tokens import STRIDE, scene_deltas
 from magnet.tokenizer.quantizer import sum_over_processes
 
 
@@ -36,7 +36,7 @@ def features(scene: Scene) -> Features:
     scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
     # Mixed precision would round the products of transforms.
     with torch.autocast(scene.device.type, enabled=False):
-        pose, steps = pose_features(scene), scene_steps(scene)
+        pose, steps = pose_features(scene), scene_deltas(scene)
     counts = scene.present[:, None].expand(pose.shape[:3])
     if scene.valid is not None:
         counts = counts & scene.valid[..., None]

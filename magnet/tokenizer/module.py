@@ -134,7 +134,7 @@ class Tokenizer(L.LightningModule):
         Returns:
             (B, N, P, C) float32.
         """
-        embedded = self._embed(pose, betas, steps, valid)
+        embedded = self.embed(pose, betas, steps, valid)
         return self.quantizer.nearest(embedded) if quantize else embedded.float()
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
@@ -145,7 +145,7 @@ class Tokenizer(L.LightningModule):
         """
         if window is None or latent.shape[1] <= window:
             return self._reconstruct(latent, betas, steps)
-        before, after = self.vqvae.decoder.reach
+        before, after = self.vqvae.decoder.receptive_field
         parts = []
         for start in range(0, latent.shape[1], window):
             first = max(start - before, 0)
@@ -170,7 +170,7 @@ class Tokenizer(L.LightningModule):
         latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
         return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
 
-    def _embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
+    def embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
         """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
         B, T, P, _ = pose.shape
         if T % STRIDE:
@@ -211,7 +211,7 @@ class Tokenizer(L.LightningModule):
         vectors: list[Tensor] = []
         for scene in some:
             seen = features(scene)
-            vectors.append(self._embed(seen.pose, seen.betas, seen.steps, seen.valid)[seen.tokens])
+            vectors.append(self.embed(seen.pose, seen.betas, seen.steps, seen.valid)[seen.tokens])
             if sum(map(len, vectors)) >= KMEANS_VECTORS * self.quantizer.size:
                 break
         self.quantizer.kmeans_init(torch.cat(vectors), self._generator("start"))
@@ -236,7 +236,7 @@ class Tokenizer(L.LightningModule):
 
     def on_fit_start(self) -> None:
         if self.hparams["start_from"] and not self._initialized:
-            self._start_from(self.hparams["start_from"])
+            self.take_weights(self.hparams["start_from"])
         if self.hparams["decoder_only"]:
             if not self._initialized:
                 raise ValueError("decoder_only: there are no codes to decode yet; give start_from a trained tokenizer")
@@ -252,7 +252,7 @@ class Tokenizer(L.LightningModule):
         if not self._initialized:
             self.init_codebook(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
-    def _start_from(self, path: str | Path) -> None:
+    def take_weights(self, path: str | Path) -> None:
         """Take over another tokenizer's networks and statistics, and its codes where there are as many."""
         _, state = read_checkpoint(path)
         mine = self.state_dict()
@@ -263,7 +263,7 @@ class Tokenizer(L.LightningModule):
             kept = {name: value for name, value in kept.items() if not name.startswith("quantizer.")}
         self.load_state_dict(kept, strict=False)
 
-    def _augmented(self, scene: Scene, batch_idx: int) -> Scene:
+    def augmented(self, scene: Scene, batch_idx: int) -> Scene:
         h = self.hparams
         generator = self._generator("augment", self.global_step, batch_idx)
         if h["exchange_limbs"]:
@@ -271,9 +271,9 @@ class Tokenizer(L.LightningModule):
         return joint_noise(scene, h["turn_joints"], generator) if h["turn_joints"] else scene
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
-        batch = self._augmented(batch, batch_idx)
+        batch = self.augmented(batch, batch_idx)
         seen = features(batch)
-        losses, pose, quantized = self._losses(seen, batch_idx)
+        losses, pose, quantized = self.losses(seen, batch_idx)
         if self._trainer is not None:
             self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
@@ -285,11 +285,11 @@ class Tokenizer(L.LightningModule):
             self.log_dict(logged, batch_size=batch.scenes)
         return losses["loss"]
 
-    def _losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
+    def losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
         h = self.hparams
         with torch.set_grad_enabled(torch.is_grad_enabled() and not h["decoder_only"]):
-            embedded = self._embed(seen.pose, seen.betas, seen.steps, seen.valid)
+            embedded = self.embed(seen.pose, seen.betas, seen.steps, seen.valid)
         quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         steps = seen.steps
         if self.training and h["drift"]:
@@ -335,7 +335,7 @@ class Tokenizer(L.LightningModule):
 
     def _evaluate(self, batch: Scene, stage: str) -> None:
         seen = features(batch)
-        losses, pose, quantized = self._losses(seen)
+        losses, pose, quantized = self.losses(seen)
         world, local = self._joint_errors(pose, batch)
         weight = seen.counts.sum()
         self.mpjpe.update(100 * masked_mean(world, seen.counts), weight)

@@ -94,7 +94,7 @@ class Decoder(nn.Module):
         self.depth, self.causal = depth, causal
 
     @property
-    def reach(self) -> tuple[int, int]:
+    def receptive_field(self) -> tuple[int, int]:
         """Tokens before and after its own that a decoded frame can depend on."""
         steps, rate = 1.0, 1
         for _ in range(STAGES):

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.export.page.palette import agent_colours
-from magnet.generation.recording import Recording
+from magnet.generation.trace import DenoisingTrace
 from magnet.sampling.noise import LEVELS
 
 CELL = 14
 
 
-def level_image(recording: Recording, step: int) -> NDArray[np.uint8]:
+def level_image(recording: DenoisingTrace, step: int) -> NDArray[np.uint8]:
     """Levels after a step: full colour is clean, white pure noise; the window is framed. -> (H, W, 3)"""
     levels = recording.levels[step].numpy().astype(float) / LEVELS  # (N, P)
     N, P = levels.shape

@@ -9,7 +9,7 @@ import numpy as np
 
 from magnet.body.base import Body
 from magnet.export.page.takes import Take, take
-from magnet.generation.live import Live, Piece
+from magnet.generation.live import Live, LiveChunk
 from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.clock import Clock
@@ -118,13 +118,13 @@ class Playground(Stage):
         self.keys.go.disabled = False
         self.shown = -1
 
-    def _made(self, piece: Piece) -> None:
-        if piece.between:
+    def _made(self, chunk: LiveChunk) -> None:
+        if chunk.between:
             self.keys.go.disabled = False
-            if piece.frames:
-                self.again = max(piece.start - 16, 0)
+            if chunk.frames:
+                self.again = max(chunk.start - 16, 0)
                 self.clock.play(True)
-            self.say(f"in-betweening made {piece.frames} frames in {piece.seconds:.1f} s")
+            self.say(f"in-betweening made {chunk.frames} frames in {chunk.seconds:.1f} s")
 
     # -- controls ------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from magnet.generation.live import Live, Piece
+from magnet.generation.live import Live, LiveChunk
 
 
 class Worker:
@@ -17,7 +17,7 @@ class Worker:
         live: the engine.
         ahead: fewer answer sooner to steering, more outlast a slow moment.
         failed: told a message when the task refuses; the worker then waits for `wake`.
-        done: told each piece.
+        done: told each chunk.
     """
 
     def __init__(
@@ -25,7 +25,7 @@ class Worker:
         live: Live,
         ahead: int = 32,
         failed: Callable[[str], None] | None = None,
-        done: Callable[[Piece], None] | None = None,
+        done: Callable[[LiveChunk], None] | None = None,
     ) -> None:
         self.live, self.ahead, self.failed, self.done = live, ahead, failed, done
         self.watched = 0
@@ -61,9 +61,9 @@ class Worker:
                 self._wake.clear()
                 continue
             try:
-                piece = self.live.advance()
+                chunk = self.live.advance()
                 if self.done is not None:
-                    self.done(piece)
+                    self.done(chunk)
             except Exception as error:  # whatever a task or its options raise: the page says so, and goes on
                 if self.failed is not None:
                     self.failed(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")

@@ -112,12 +112,12 @@ def test_what_cannot_be_foretold_is_met_by_its_mean() -> None:
 def test_no_recording_is_on_both_sides_of_a_fold() -> None:
     names = tuple(f"take {k % 7} x{1 + k % 2 / 10:g} [0:{k}]" for k in range(56))
     train = windows(wander(56, 1, seed=7).replace(names=names))
-    folds = RidgeRegression(train)._folds(torch.arange(56))
+    folds = RidgeRegression(train).fold_numbers(torch.arange(56))
     by_take = {name: set(folds[[r == name for r in train.recordings]].tolist()) for name in train.recordings}
     assert len(by_take) == 7 and all(len(found) == 1 for found in by_take.values())
     assert len(set(folds.tolist())) == 5
     alone = RidgeRegression(windows(wander(10, 1, seed=7).replace(names=("the only [0:9]",) * 10)))
-    assert alone._folds(torch.arange(10)).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert alone.fold_numbers(torch.arange(10)).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
 def test_a_label_names_its_recording() -> None:

@@ -150,8 +150,8 @@ def test_no_stretch_of_a_recording_is_taken_for_off_the_floor(cmu_root, takes):
 
 def test_a_body_first_read_while_testing_can_be_fitted_afterwards():
     """Lightning tests in inference mode; what is kept from there must not be of it."""
-    base._open_body.cache_clear()
-    floor._open_body.cache_clear()
+    base.open_body_arrays.cache_clear()
+    floor.open_body.cache_clear()
     with torch.inference_mode():
         lowest(still([0, 0, 0], 0.93))
-    assert not load_body().J_template.is_inference() and not floor._open_body().J_shapedirs.is_inference()
+    assert not load_body().J_template.is_inference() and not floor.open_body().J_shapedirs.is_inference()

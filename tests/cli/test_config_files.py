@@ -119,7 +119,7 @@ def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -
     ],
 )
 def test_the_viewer_samples_as_it_is_told(words: tuple[str, ...], expected: SamplerOptions) -> None:
-    assert view._sampler(view.arguments_of(["--live", *words])) == expected
+    assert view.sampler_options(view.arguments_of(["--live", *words])) == expected
 
 
 def test_the_demo_takes_a_preset_and_its_steps() -> None:

@@ -41,8 +41,8 @@ class Foreign:
 def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
     registry.discover()
     entry = registry.Registered("foreign", Foreign, "strange-tasks 3.1")
-    monkeypatch.setitem(registry._tasks, "foreign", entry)
-    monkeypatch.setitem(registry._failures, "broken", ImportError("no module named [nowhere]"))
+    monkeypatch.setitem(registry.known_tasks, "foreign", entry)
+    monkeypatch.setitem(registry.failed_plugins, "broken", ImportError("no module named [nowhere]"))
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

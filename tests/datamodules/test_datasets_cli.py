@@ -14,6 +14,7 @@ import yaml
 from magnet import cli
 from magnet.datamodules import cmu, registry
 from magnet.datamodules.fakes import remocap as fake_remocap
+from tests.cases import some_slow
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
@@ -23,8 +24,8 @@ SMALL = {
 }  # fmt: skip
 FRAMES = {"remocap": 40, "bvh": 40}
 """Of a fake's takes, where fitting 150 takes too long."""
-SLOW = {"bvh": pytest.mark.slow}
-"""Fourteen people are fitted; `tests/test_own.py` goes the same way."""
+SLOW = ("bvh", "chi3d", "remocap")
+"""Many frames are fitted or turned; `tests/test_own.py` goes the same way."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""
 
@@ -37,7 +38,7 @@ def flags(prefix: str, values: dict[str, str]) -> list[str]:
     return [word for name, value in values.items() for word in (f"--{prefix}.{name}", value)]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in registry.readers()])
+@pytest.mark.parametrize("name", some_slow(registry.readers(), *SLOW))
 def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     body = () if registry.reader(name).family == "positions" else ("--body", "dl/body.npz")
@@ -51,7 +52,10 @@ def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch,
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("remocap", ("--reader.fits", "dl/fits")), ("duobox", ("--reader.form", "skeleton", "--reader.phases", "1"))],
+    [
+        ("remocap", ("--reader.fits", "dl/fits")),
+        pytest.param("duobox", ("--reader.form", "skeleton", "--reader.phases", "1"), marks=pytest.mark.slow),
+    ],
 )
 def test_ready_fits_and_bare_skeletons_train_as_well(name, options, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -19,6 +19,7 @@ from magnet.datamodules import registry
 from magnet.datamodules.fakes.remocap import write_fits
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob, content, take_key
+from tests.cases import some_slow
 from tests.datamodules.made_scenes import FORMS, written
 from tests.datamodules.readers import fake_of
 
@@ -132,7 +133,7 @@ NO_LISTS = {
 """What is said where the data set's rule cannot do without lists."""
 
 
-@pytest.mark.parametrize("form", DOWNLOADS)
+@pytest.mark.parametrize("form", some_slow(DOWNLOADS, "bvh", "remocap"))
 def test_a_users_list_needs_none_of_the_data_sets_own(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ from magnet.datamodules.preparing.prepare import prepare, select_takes
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.resample import times
 from magnet.datamodules.store.windows import recorded_windows
+from tests.cases import some_slow
 from tests.datamodules.made_scenes import (
     FITTED,
     FORMS,
@@ -86,7 +87,7 @@ def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp
     assert set(lengths) == {20}
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "duobox, bare skeleton"))
 def test_prepared_and_read_back_joints_are_those_that_were_written(form: str) -> None:
     fitted = FORMS[form][2] == FITTED
 
@@ -189,7 +190,7 @@ SAID = {
 """Where it is said otherwise."""
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d"))
 def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

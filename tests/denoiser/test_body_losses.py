@@ -120,7 +120,7 @@ def test_the_surest_scenes_are_those_with_the_least_noise():
 def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
     model = tiny_denoiser(max_agents=3, window=8, pose_weight=1.0, motion_weight=0.1, partner_weight=0.5)
     model.train()
-    losses = model._losses(random_scene(4, 32, 3, generator), generator)
+    losses = model.losses(random_scene(4, 32, 3, generator), generator)
     losses["loss"].backward()
     assert set(BODY_LOSSES) <= losses.keys()
     assert all(weight.grad is not None for weight in model.transformer.blocks.parameters())
@@ -174,7 +174,7 @@ def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, mon
     monkeypatch.setattr(
         model.tokenizer, "decode", lambda *given: decoded.append((given, plain(*given))) or decoded[-1][1]
     )
-    assert model._losses(scene, generator)["pose"].isfinite()
+    assert model.losses(scene, generator)["pose"].isfinite()
     (latent, betas, steps), poses = decoded[0]
     assert latent.shape == (9, 8, 1, model.layout.latent), "nine people of four scenes"
     together = [x.transpose(0, 2) for x in (latent, steps)]  # the same people as one scene of nine

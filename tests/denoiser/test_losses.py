@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from magnet.denoiser.losses import FINE_GROUND, FINE_YAW, NEAR, consistency_losses, near_loss, snr_weights, token_losses
-from magnet.motion.frames import canonical_frame, canonical_steps, from_9d, from_planar, pairwise, propagated, to_9d
+from magnet.motion.frames import (
+    canonical_deltas,
+    canonical_frame,
+    from_9d,
+    from_planar,
+    pairwise,
+    propagate_pairwise,
+    to_9d,
+)
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, pairwise_by_token, scene_transforms
@@ -37,7 +45,7 @@ def test_consistency_equals_eq_11_computed_with_whole_matrices(scene: Scene, gen
 
     T_prev_can = from_9d((steps + shift).transpose(2, 3).flatten(1, 2))
     T_self_partner = pairwise(canonical_frame(scene.T_world_root))
-    expected = propagated(T_self_partner, T_prev_can)
+    expected = propagate_pairwise(T_self_partner, T_prev_can)
     rotation = (1 - geodesic(expected[..., :3, :3], T_self_partner[:, 1:, ..., :3, :3]).cos()).mean()
     error = (expected - T_self_partner[:, 1:])[..., :3, 3]
     translation = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none").sum(-1).mean()
@@ -75,7 +83,7 @@ def test_steps_and_relations_have_finite_gradients_at_zero():
 
 
 def test_canonical_steps_are_what_the_first_frame_starts_from(scene: Scene):
-    steps = canonical_steps(canonical_frame(scene.T_world_root))
+    steps = canonical_deltas(canonical_frame(scene.T_world_root))
     assert torch.equal(steps[:, 0], torch.eye(4).expand_as(steps[:, 0]))
 
 

@@ -128,7 +128,7 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
     optimizer = torch.optim.AdamW(model.transformer.parameters(), lr=3e-3)
     losses = []
     for _ in range(150):
-        loss = model._losses(batch, generator)["loss"]
+        loss = model.losses(batch, generator)["loss"]
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -185,7 +185,7 @@ def test_absent_agents_cost_nothing(generator):
     scene = random_scene(2, 32, 3, generator, present=torch.tensor([[True, True, False]] * 2))
 
     def loss(of: Scene) -> torch.Tensor:
-        return model._losses(of, torch.Generator().manual_seed(0))["loss"]
+        return model.losses(of, torch.Generator().manual_seed(0))["loss"]
 
     moved = scene.replace(T_world_root=scene.T_world_root.clone())
     moved.T_world_root[:, :, 2, :3, 3] += 5.0

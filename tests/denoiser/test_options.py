@@ -127,7 +127,7 @@ def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, mon
     for level in (0, 300, 600, 900, 1000):
         at = torch.full((2, 8, 3), level)
         monkeypatch.setattr(objective, "draw_levels", lambda *_, at=at: at)
-        a, b = (model._losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
+        a, b = (model.losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
         weight = snr_weights(torch.tensor(level), 3.0)
         for name in ("latent", "step", "pairwise"):
             assert torch.allclose(b[name], weight * a[name], rtol=1e-5)

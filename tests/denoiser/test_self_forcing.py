@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from magnet.denoiser.self_forcing import with_self_forcing
-from magnet.motion.frames import from_9d, propagated
+from magnet.motion.frames import from_9d, propagate_pairwise
 from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.testing import random_scene, tiny_denoiser
 
@@ -49,7 +49,7 @@ def test_steps_and_pairwise_transforms_of_a_made_past_agree(model, scene):
     _, made = shown(model, scene, rolled_out())
     _, steps, pairs = model.layout.unpack(model.normalizer.denormalize(made[:, :PAST]))
     T_self_partner, T_prev_can = from_9d(pairwise_by_frame(pairs)), from_9d(by_frame(steps))
-    torch.testing.assert_close(propagated(T_self_partner, T_prev_can), T_self_partner[:, 1:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(propagate_pairwise(T_self_partner, T_prev_can), T_self_partner[:, 1:], atol=1e-4, rtol=0)
 
 
 def test_latents_of_a_made_past_are_codes(model, scene):

@@ -95,7 +95,7 @@ def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
         evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
         evaluation.start(model, datamodule)
         batch = next(iter(datamodule.test_dataloader()))
-        seen.append(evaluation.sample(model, batch, 2, evaluation._generators(model, batch.scenes)))
+        seen.append(evaluation.sample(model, batch, 2, evaluation.generators_of(model, batch.scenes)))
     plain, replaced = seen
     assert torch.equal(plain.body_rot, replaced.body_rot)
     assert torch.equal(plain.T_world_root, replaced.T_world_root)
@@ -135,9 +135,9 @@ def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in():
 
 def test_no_two_samples_share_their_noise():
     model, evaluation, _ = prepared()
-    seeds = [g.initial_seed() for g in evaluation._generators(model, 2)]
+    seeds = [g.initial_seed() for g in evaluation.generators_of(model, 2)]
     evaluation.scenes = 2
-    seeds += [g.initial_seed() for g in evaluation._generators(model, 1)]
+    seeds += [g.initial_seed() for g in evaluation.generators_of(model, 1)]
     assert len(set(seeds)) == len(seeds) == 9
 
 
@@ -168,7 +168,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     assert (seen.now, seen.past_is_given) == (0, False)
     batch = next(iter(datamodule.test_dataloader()))
     model = tiny_denoiser(max_agents=3)
-    made = seen.sample(model, batch, 3, seen._generators(model, batch.scenes))
+    made = seen.sample(model, batch, 3, seen.generators_of(model, batch.scenes))
     yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
     there = made.present[..., None]
     middle = torch.where(there, ground, 0).sum(dim=1) / there.sum(dim=1)

@@ -117,7 +117,7 @@ def test_the_short_table_is_one_table_that_shows_people_together(measured: dict[
     """Of all rows that it has, with the widest of usual numbers, in a hundred columns."""
     row = dict.fromkeys([*measured, "nearest_training"], 0.0123)
     results = Results(dict.fromkeys(METHODS, row), columns=NearestTraining.columns)
-    short = results._chosen(None)
+    short = results.chosen(None)
     assert {"fd", "fd_pair", "div", "fs", "hand_contact", "depth_body_over_5cm", "nearest_training"} <= set(short)
     assert {"mpjpe@1s", "mpjpe_mean@1s"} <= set(short)
     text = printed(results, 100)
@@ -160,7 +160,7 @@ def test_somebody_elses_metric_shows_itself(tmp_path: Path) -> None:
     metrics = MetricCollection({"bounce": Bounce(), "DIV": all_metrics()["DIV"]}, compute_groups=False)
     rows = {"ours": {"bounce": 0.25, "silent": 1.0, "div": 2.0}, "theirs": {"bounce": 0.5, "silent": 2.0, "div": 1.0}}
     results = Results(rows, columns=columns_of(metrics))
-    assert results._chosen(None) == ["div", "bounce"] and results.best("bounce") == {"theirs"}
+    assert results.chosen(None) == ["div", "bounce"] and results.best("bounce") == {"theirs"}
     assert results.best("silent") == set()
     text = results.to_markdown()
     assert "| bounce ↑ |" in text and "bounce (m): how high people jump." in text

@@ -61,7 +61,7 @@ def sampled(task: object) -> tuple[Evaluation, Denoiser, Scene, Scene]:
     evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
     evaluation.start(model, datamodule)
     batch = next(iter(datamodule.test_dataloader()))
-    return evaluation, model, batch, evaluation.sample(model, batch, 2, evaluation._generators(model, batch.scenes))
+    return evaluation, model, batch, evaluation.sample(model, batch, 2, evaluation.generators_of(model, batch.scenes))
 
 
 def mean_error(evaluation: Evaluation, made: Scene, batch: Scene, scored: Tensor) -> float:

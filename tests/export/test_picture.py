@@ -12,7 +12,7 @@ from PIL import Image
 from magnet.body import Body
 from magnet.export import contact_sheet, topview
 from magnet.export.cast import STYLES, Style
-from magnet.export.figures import _rounded
+from magnet.export.figures import bulged
 from magnet.export.stage import AGENTS, CONTEXT
 from magnet.motion.scene import Scene
 
@@ -65,7 +65,7 @@ def test_bad_frames_and_suffixes_are_named(duet: Scene, body: Body, tmp_path: Pa
 
 def test_rounding_a_mesh_of_a_sphere_comes_nearer_the_sphere() -> None:
     corners = np.array([[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1.0, -1) for y in (1.0, -1) for z in (1.0, -1)])
-    rounded, normals = _rounded(corners, corners)
+    rounded, normals = bulged(corners, corners)
     assert rounded.shape == (32, 3, 3)
     assert np.allclose(np.linalg.norm(normals, axis=-1), 1)
     flat = 1 - np.linalg.norm((corners + np.roll(corners, -1, axis=1)) / 2, axis=-1).min()

@@ -4,7 +4,7 @@ import pytest
 import roma
 import torch
 
-from magnet.generation.blending import SPRING, go_on, spring_weights
+from magnet.generation.blending import SPRING, spring_from_given, spring_weights
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -43,7 +43,7 @@ def test_given_frames_come_back_and_nothing_in_front_of_a_seam_changes(pair):
     given, decoded, T_world_can = pair
     keep = torch.zeros(24, 3, dtype=torch.bool)
     keep[6:12, 0], keep[:8, 1] = True, True
-    made = go_on(decoded, given, T_world_can, keep, 10)
+    made = spring_from_given(decoded, given, T_world_can, keep, 10)
     assert torch.equal(made.T_world_root[:, 6:12, 0], given.T_world_root[:, 6:12, 0])
     assert torch.equal(made.body_rot[:, :8, 1], given.body_rot[:, :8, 1])
     for agent, until in ((0, 6), (2, 24)):
@@ -61,7 +61,7 @@ def test_poses_go_on_where_and_as_fast_as_they_were(pair):
     keep = torch.zeros(24, 3, dtype=torch.bool)
     keep[:10] = True
     given, decoded = given.replace(body_rot=first), given.replace(body_rot=second)
-    made = go_on(decoded, given, T_world_can, keep, 30)
+    made = spring_from_given(decoded, given, T_world_can, keep, 30)
     angle = roma.rotmat_to_rotvec(made.body_rot)[..., 2]
     step = angle.diff(dim=1)
     assert torch.allclose(step[:, :9], torch.tensor(0.03), atol=1e-5)
@@ -73,6 +73,6 @@ def test_without_blending_only_given_frames_are_put_back(pair):
     given, decoded, T_world_can = pair
     keep = torch.zeros(24, 3, dtype=torch.bool)
     keep[:10] = True
-    made = go_on(decoded, given, T_world_can, keep, 0)
+    made = spring_from_given(decoded, given, T_world_can, keep, 0)
     assert torch.allclose(made.body_rot[:, 10:], decoded.body_rot[:, 10:], atol=1e-5)
     assert torch.equal(made.body_rot[:, :10], given.body_rot[:, :10])

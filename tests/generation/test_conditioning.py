@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.generation.blending import seam_weights
-from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub, stretches
+from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, stretches
 from magnet.generation.world import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
@@ -111,7 +111,7 @@ def test_holding_the_last_pose_keeps_the_last_known_token_nearer_to_what_it_woul
     def embedded(scene: Scene, hold: int) -> torch.Tensor:
         """Before quantisation, which would hide how near two vectors are."""
         part = features(scene.people().pad_frames(4 * hold))
-        vectors = model.tokenizer._embed(part.pose, part.betas, part.steps, part.valid)[:, :, 0]
+        vectors = model.tokenizer.embed(part.pose, part.betas, part.steps, part.valid)[:, :, 0]
         return vectors[:, hold : vectors.shape[1] - hold]
 
     away = [(embedded(scene, hold)[:, 7] - embedded(scene.slice(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]
@@ -191,15 +191,15 @@ def test_moving_the_world_moves_the_sample_before_a_keyframe_of_somebody_lying_o
 
 def test_tokens_fed_back_agree_with_the_world(model, scene):
     """After a stage, pairs are what the placed agents imply."""
-    from magnet.generation.world import Canvas
+    from magnet.generation.world import WorldState
     from magnet.motion.frames import from_9d
     from magnet.motion.tokens import by_frame, pairwise_by_frame
     from magnet.sampling.sampler import sample
 
     grid = Grid(12, 3, 4, 3, 8, 2)
     schedule = JointFuture().schedule(grid)
-    given = scrub(scene, schedule.known)
-    canvas = Canvas(model, given, schedule, FAST, 1)
+    given = mask_unknown(scene, schedule.known)
+    world = WorldState(model, given, schedule, FAST, 1)
     tokens = sample(
         model.denoise,
         schedule,
@@ -207,15 +207,15 @@ def test_tokens_fed_back_agree_with_the_world(model, scene):
         given.present,
         model.layout,
         torch.Generator().manual_seed(0),
-        canvas.make_consistent,
+        world.make_consistent,
     )
     _, _, pairs = model.layout.unpack(model.normalizer.denormalize(tokens))
     T_self_partner = from_9d(pairwise_by_frame(pairs))
-    assert torch.allclose(T_self_partner, pairwise(canvas.T_world_can), atol=1e-3)
-    assert torch.allclose(canvas.T_world_can[:, :16], canonical_frame(scene.T_world_root)[:, :16])
+    assert torch.allclose(T_self_partner, pairwise(world.T_world_can), atol=1e-3)
+    assert torch.allclose(world.T_world_can[:, :16], canonical_frame(scene.T_world_root)[:, :16])
     steps = from_9d(by_frame(model.layout.unpack(model.normalizer.denormalize(tokens))[1]))
-    placed = canvas.T_world_can[:, :-1] @ steps[:, 1:]
-    assert torch.allclose(placed, canvas.T_world_can[:, 1:], atol=1e-3)
+    placed = world.T_world_can[:, :-1] @ steps[:, 1:]
+    assert torch.allclose(placed, world.T_world_can[:, 1:], atol=1e-3)
 
 
 def test_health_tells_how_far_latents_are_from_codes_and_relations_from_the_world(model, scene):
@@ -251,7 +251,7 @@ def test_the_step_into_a_keyframe_is_shown_as_the_keyframes_own_next_step(model,
     """Nobody knows where from it leads; at the very beginning it is standing still."""
     known = torch.zeros(16, 3, dtype=torch.bool)
     known[:2], known[6:8, 1], known[9, 2] = True, True, True
-    tokens = known_tokens(model, scrub(scene, known), known)
+    tokens = known_tokens(model, mask_unknown(scene, known), known)
     steps = model.layout.unpack(model.normalizer.denormalize(tokens))[1]
     true = scene_transforms(scene)[0]
     for token, agent in ((6, 1), (9, 2)):
@@ -269,7 +269,7 @@ def test_each_agents_unbroken_stretches_are_found():
 def test_scrubbed_scenes_hold_nothing_unknown(scene):
     known = torch.zeros(16, 3, dtype=torch.bool)
     known[:4, 1] = True
-    given = scrub(scene, known)
+    given = mask_unknown(scene, known)
     assert torch.equal(given.T_world_root[:, :16, 1], scene.T_world_root[:, :16, 1])
     for agent, start in ((0, 0), (1, 16), (2, 0)):
         assert torch.equal(

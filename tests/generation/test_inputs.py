@@ -15,7 +15,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.live import Live
 from magnet.generation.partner import Partner
-from magnet.generation.recording import record
+from magnet.generation.trace import record
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
 from magnet.tasks.joint import Generation, JointFuture
@@ -44,7 +44,7 @@ def answered(model: Denoiser, scene: Scene) -> Scene:
 
 WAYS: dict[str, Callable[[Denoiser, Scene], Any]] = {
     "generate": lambda model, scene: model.generate(scene, JointFuture(), CONTEXT, FRAMES, options=FAST),
-    "stream": lambda model, scene: next(model.stream(scene, JointFuture(), CONTEXT, None, options=FAST, piece=1)),
+    "stream": lambda model, scene: next(model.stream(scene, JointFuture(), CONTEXT, None, options=FAST, chunk=1)),
     "predict": lambda model, scene: Model(model, FAST).predict(scene, frames=FRAMES),
     "continue_": lambda model, scene: Model(model, FAST).continue_(scene, frames=FRAMES),
     "inpaint": lambda model, scene: Model(model, FAST).inpaint(scene, agent=1),

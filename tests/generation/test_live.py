@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from magnet.generation.keyframes import Goal, keyframe, reached, speeds, with_keyframes
-from magnet.generation.live import CONTEXT, FIRST, REACH, Live, Piece
+from magnet.generation.live import CONTEXT, FIRST, REACH, Live, LiveChunk
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
@@ -37,9 +37,9 @@ def test_a_scene_from_nothing_has_so_many_people(model) -> None:
 
 def test_pieces_go_on_from_what_was_there(live: Live) -> None:
     before = live.scene
-    piece = live.advance()
-    assert (piece.start, piece.frames) == (FIRST, live.settings.piece)
-    assert live.scene.frames == FIRST + piece.frames
+    chunk = live.advance()
+    assert (chunk.start, chunk.frames) == (FIRST, live.settings.chunk)
+    assert live.scene.frames == FIRST + chunk.frames
     assert torch.equal(live.scene.slice(0, FIRST).T_world_root, before.T_world_root)
     step = live.scene.T_world_root[0, :, :, :3, 3].diff(dim=0).norm(dim=-1)
     assert step[FIRST - 1].max() <= 3 * step.median() + 0.2  # nobody jumps at the seam
@@ -100,8 +100,8 @@ def test_a_keyframe_is_reached_exactly(live: Live) -> None:
     at = live.scene.T_world_root[0, -1, 1, :3, 3]
     live.settings.task = "inbetweening"
     live.settings.goals = {1: Goal(float(at[0]) + 0.4, float(at[2]), 0.0)}
-    piece = live.advance()
-    assert piece.frames == REACH
+    chunk = live.advance()
+    assert chunk.frames == REACH
     end = live.scene.T_world_root[0, -1, 1, :3, 3]
     assert end[0] - at[0] == pytest.approx(0.4, abs=1e-3)
 
@@ -181,8 +181,8 @@ def test_in_betweening_goes_through_every_keyframe_and_keeps_what_comes_before(l
     first = keyframe(before, 0, 72)
     last = dataclasses.replace(keyframe(before, 1, 79, pose=8), frame=120, goal=Goal(1.0, 1.0, 1.0))
     live.keys, live.asked = [last, first], True
-    piece = live.advance()
-    assert (piece.between, piece.start, piece.frames) == (True, 72 - REACH, 124 - 72 + REACH)
+    chunk = live.advance()
+    assert (chunk.between, chunk.start, chunk.frames) == (True, 72 - REACH, 124 - 72 + REACH)
     scene = live.scene
     assert scene.frames == 124 and not live.asked
     assert torch.equal(scene.slice(0, 40).T_world_root, before.slice(0, 40).T_world_root)
@@ -225,7 +225,7 @@ def test_smoothing_guidance_reaches_the_sampler(live: Live) -> None:
 
 
 def test_what_was_asked_for_is_made_while_the_worker_rests(live: Live) -> None:
-    made: list[Piece] = []
+    made: list[LiveChunk] = []
     worker = Worker(live, done=made.append)
     worker.paused = True
     worker.start()
@@ -241,14 +241,14 @@ def test_what_was_asked_for_is_made_while_the_worker_rests(live: Live) -> None:
 
 
 def test_a_piece_that_went_on_from_a_forgotten_past_is_dropped(live: Live, monkeypatch) -> None:
-    sample = live._sample
+    sample = live.sample
 
     def restarted_meanwhile(*arguments):
         done = sample(*arguments)
         live.restart(40)
         return done
 
-    monkeypatch.setattr(live, "_sample", restarted_meanwhile)
+    monkeypatch.setattr(live, "sample", restarted_meanwhile)
     assert live.advance().frames == 0
     assert live.scene.frames == 40
 
@@ -260,7 +260,7 @@ def test_the_worker_keeps_only_a_little_ahead_and_tells_what_a_task_refuses(live
         worker.watch(60)
         wait(lambda: live.scene.frames > 80)
         time.sleep(0.3)
-        assert live.scene.frames <= 60 + 20 + live.settings.piece
+        assert live.scene.frames <= 60 + 20 + live.settings.chunk
         live.settings.task = "partner_inpainting"
         worker.watch(live.scene.frames)
         wait(lambda: bool(said))

@@ -30,16 +30,16 @@ def duet() -> Scene:
     return random_scene(1, 60, 2, torch.Generator().manual_seed(5))
 
 
-def answered(denoiser, scene: Scene, piece: int = 4, past: int = 16, agents=(0,)) -> Scene:
+def answered(denoiser, scene: Scene, chunk: int = 4, past: int = 16, agents=(0,)) -> Scene:
     partner = Partner(denoiser, scene.slice(0, past), agents, FAST, torch.Generator().manual_seed(0))
-    fed = [scene.slice(first, first + piece) for first in range(past, scene.frames, piece)]
+    fed = [scene.slice(first, first + chunk) for first in range(past, scene.frames, chunk)]
     return cat_time([partner.answer(frames) for frames in fed])
 
 
-@pytest.mark.parametrize("piece", [4, 8])
-def test_what_is_fed_comes_back_and_the_answer_is_the_models(denoiser, duet, piece):
+@pytest.mark.parametrize("chunk", [4, 8])
+def test_what_is_fed_comes_back_and_the_answer_is_the_models(denoiser, duet, chunk):
     scene = duet.slice(0, 56)
-    out, fed = answered(denoiser, scene, piece), scene.slice(16)
+    out, fed = answered(denoiser, scene, chunk), scene.slice(16)
     assert out.frames == 40
     assert torch.equal(out.T_world_root[:, :, 1], fed.T_world_root[:, :, 1])
     assert torch.equal(out.body_rot[:, :, 1], fed.body_rot[:, :, 1])
@@ -105,10 +105,10 @@ def test_answers_are_what_motion_control_gives_bit_for_bit(denoiser, block, opti
     task, frames = MotionControl((0, 2), block), 136 - 16
     whole = denoiser.generate(scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
     partner = Partner(denoiser, scene.slice(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)
-    pieces = [4 * block * n for n in (1, 2)] * 40
+    chunks = [4 * block * n for n in (1, 2)] * 40
     fed, first = [], past
     while first < scene.frames:
-        stop = first + min(pieces.pop(), scene.frames - first)
+        stop = first + min(chunks.pop(), scene.frames - first)
         fed.append(partner.answer(scene.slice(first, stop)))
         first = stop
     live = cat_time(fed)
@@ -131,7 +131,7 @@ def test_memory_does_not_grow(denoiser, duet):
     held = []
     for _ in range(60):
         partner.answer(duet.slice(16, 20))
-        stream = partner._stream
+        stream = partner.stream
         held.append((partner.past.frames, stream.scene.frames, stream.tokens.shape[1], stream.mask_noise.shape[1]))
     assert held[-1] == held[-20] and max(held[-1]) < 100
     assert torch.equal(partner.past.T_world_root[:, -4:, 1], duet.T_world_root[:, 16:20, 1])

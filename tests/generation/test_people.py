@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import SamplerOptions, known_tokens, occupied, planning_grid, scrub
-from magnet.generation.world import Canvas, SamplingStats
+from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, occupied, planning_grid
+from magnet.generation.world import SamplingStats, WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample
@@ -52,15 +52,15 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     if schedule.causal:  # shown block by block, see test_showing
         return
     padded = schedule.padded(4)
-    given = scrub(scene.pad_agents(4), padded.known)
-    canvas = Canvas(model, given, padded, FAST, 1)
+    given = mask_unknown(scene.pad_agents(4), padded.known)
+    world = WorldState(model, given, padded, FAST, 1)
     start = known_tokens(model, given, padded.known)
     noise = NoiseStream((1, 4, model.layout.width), [torch.Generator().manual_seed(0)], eta=FAST.eta)
     out = sample(
-        model.denoise, padded, start, given.present, model.layout, on_stage_end=canvas.make_consistent, noise=noise
+        model.denoise, padded, start, given.present, model.layout, on_stage_end=world.make_consistent, noise=noise
     )
     with torch.no_grad():
-        assert close(canvas.scene(out), made)
+        assert close(world.scene(out), made)
 
 
 @pytest.mark.parametrize("task", [AgenticAsync(), AgenticAsync(offset=0.5, order=(1,)), AgenticSync()], ids=str)
@@ -124,7 +124,7 @@ def test_scenes_without_the_people_that_a_task_needs_are_named(model):
 
 def test_a_stream_without_end_waits_for_nobody(model):
     scene = people([[True, True]], 8)
-    begun = model.stream(scene, AgenticAsync(), 8, None, 1, FAST, torch.Generator().manual_seed(0), piece=4)
-    ended = model.stream(scene, AgenticAsync(), 8, 400, 1, FAST, torch.Generator().manual_seed(0), piece=4)
-    a, b = (cat_time([next(pieces) for _ in range(3)]) for pieces in (begun, ended))
+    begun = model.stream(scene, AgenticAsync(), 8, None, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
+    ended = model.stream(scene, AgenticAsync(), 8, 400, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
+    a, b = (cat_time([next(chunks) for _ in range(3)]) for chunks in (begun, ended))
     assert close(a, b)

@@ -40,9 +40,9 @@ def test_every_task_samples_whole_scenes_by_these_plans(model, scene, name, opti
 @pytest.mark.parametrize("options", [PYRAMID, INDEPENDENT], ids=["pyramid", "independent"])
 def test_scenes_without_end_begin_as_long_ones_do(model, options):
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(4))
-    whole = cat_time(list(run(model, scene, JointFuture(), options, frames=120, piece=4)))
-    pieces = run(model, scene, JointFuture(), options, frames=None, piece=4)
-    begun = cat_time(list(itertools.islice(pieces, 6)))
+    whole = cat_time(list(run(model, scene, JointFuture(), options, frames=120, chunk=4)))
+    chunks = run(model, scene, JointFuture(), options, frames=None, chunk=4)
+    begun = cat_time(list(itertools.islice(chunks, 6)))
     assert torch.allclose(begun.T_world_root, whole.slice(0, begun.frames).T_world_root, atol=1e-5)
 
 

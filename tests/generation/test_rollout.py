@@ -1,4 +1,4 @@
-"""Scenes that are handed out piece by piece are those that are made at once, and cost no more memory."""
+"""Scenes that are handed out chunk by chunk are those that are made at once, and cost no more memory."""
 
 import itertools
 
@@ -6,10 +6,17 @@ import pytest
 import torch
 
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import SamplerOptions, known_tokens, planning_grid, reach, scrub, task_sight
-from magnet.generation.plan import endless, lows
-from magnet.generation.rollout import Stream
-from magnet.generation.world import Canvas, SamplingStats
+from magnet.generation.conditioning import (
+    SamplerOptions,
+    known_tokens,
+    mask_unknown,
+    planning_grid,
+    receptive_field,
+    task_lookahead_limit,
+)
+from magnet.generation.plan import first_changed, periodic_plan
+from magnet.generation.rollout import Rollout
+from magnet.generation.world import SamplingStats, WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream
@@ -50,25 +57,23 @@ def recording() -> Scene:
 
 
 def at_once(model, scene: Scene, task, context: int, frames: int, options: SamplerOptions, seed: int = 0) -> Scene:
-    """The whole scene on one canvas: encoded, sampled and decoded in one go."""
+    """The whole scene on one world: encoded, sampled and decoded in one go."""
     tokens = -(-(context + frames) // 4)
     grid = planning_grid(tokens, 3, context // 4, model.window, options)
     schedule = task.schedule(grid)
-    given = scrub(scene, schedule.known)
-    canvas = Canvas(model, given, schedule, options, 1)
-    start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid))
+    given = mask_unknown(scene, schedule.known)
+    world = WorldState(model, given, schedule, options, 1)
+    start = known_tokens(model, given, schedule.known, limits=task_lookahead_limit(task, grid))
     generator = torch.Generator().manual_seed(seed)
     noise = NoiseStream((scene.scenes, 3, model.layout.width), generator, eta=options.eta)
     how = {"guidance": options.guidance, "noise": noise, "solver": options.solver}
-    out = sample(
-        model.denoise, schedule, start, given.present, model.layout, on_stage_end=canvas.make_consistent, **how
-    )
+    out = sample(model.denoise, schedule, start, given.present, model.layout, on_stage_end=world.make_consistent, **how)
     with torch.no_grad():
-        return canvas.scene(out).slice(0, context + frames)
+        return world.scene(out).slice(0, context + frames)
 
 
-def streamed(model, scene: Scene, task, context: int, frames: int | None, piece: int, options=FAST, seed: int = 0):
-    return model.stream(scene, task, context, frames, 1, options, torch.Generator().manual_seed(seed), piece=piece)
+def streamed(model, scene: Scene, task, context: int, frames: int | None, chunk: int, options=FAST, seed: int = 0):
+    return model.stream(scene, task, context, frames, 1, options, torch.Generator().manual_seed(seed), chunk=chunk)
 
 
 def context_of(name: str) -> int:
@@ -90,25 +95,25 @@ CAUSAL = ("motion_control", "agentic_sync", "agentic_async", "blocks", "turns")
 
 
 @pytest.mark.parametrize(
-    ("name", "piece"), [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
+    ("name", "chunk"), [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
 )
-def test_pieces_make_up_the_scene_made_at_once(model, recording, name, piece):
+def test_pieces_make_up_the_scene_made_at_once(model, recording, name, chunk):
     context = context_of(name)
     frames = 4 * TOKENS - context - 3
-    pieces = list(streamed(model, recording, TASKS[name], context, frames, piece))
-    assert [made.frames for made in pieces[:-1]] == [4 * piece] * (len(pieces) - 1)
-    whole = cat_time(pieces)
+    chunks = list(streamed(model, recording, TASKS[name], context, frames, chunk))
+    assert [made.frames for made in chunks[:-1]] == [4 * chunk] * (len(chunks) - 1)
+    whole = cat_time(chunks)
     assert whole.frames == context + frames
     assert close(at_once(model, recording, TASKS[name], context, frames, FAST), whole)
 
 
 @pytest.mark.parametrize("name", CAUSAL)
 def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(model, recording, name):
-    """Nor on when rows are let go: one piece holds them all."""
-    whole, pieces, rows = (
-        cat_time(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, piece))) for piece in (64, 5, 1)
+    """Nor on when rows are let go: one chunk holds them all."""
+    whole, chunks, rows = (
+        cat_time(list(streamed(model, recording, TASKS[name], 8, 4 * TOKENS - 11, chunk))) for chunk in (64, 5, 1)
     )
-    assert same(whole, pieces) and same(whole, rows)
+    assert same(whole, chunks) and same(whole, rows)
 
 
 @pytest.mark.parametrize("name", CAUSAL)
@@ -121,10 +126,10 @@ def test_the_same_happens_however_long_a_causal_scene_goes_on(model, recording, 
 @pytest.mark.parametrize("name", CAUSAL)
 def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model, recording, name):
     done: list[int] = []
-    pieces = model.stream(recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, piece=1)
+    chunks = model.stream(recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, chunk=1)
     blocks = list(blocks_of(TASKS[name].schedule(planning_grid(26, 3, 2, 8, FAST))))
     for row in range(26):
-        next(pieces)
+        next(chunks)
         needed = [stages for stages, end in blocks if end <= row] + [b for b, end in blocks if end > row][: row >= 2]
         assert len(done) == sum(len(stage.levels) - 1 for stages in needed for stage in stages)
 
@@ -148,16 +153,16 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
 )
 def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, options):
     for task in (JointFuture(), PartnerInpainting((1,))):
-        pieces = list(streamed(model, recording, task, 8, 141, 5, options))
-        assert close(at_once(model, recording, task, 8, 141, options), cat_time(pieces))
+        chunks = list(streamed(model, recording, task, 8, 141, 5, options))
+        assert close(at_once(model, recording, task, 8, 141, options), cat_time(chunks))
 
 
 def test_generate_returns_the_pieces_of_a_stream_bit_for_bit(model, recording):
     long = random_scene(2, 400, 3, torch.Generator().manual_seed(4))
     for task in (JointFuture(), PartnerInpainting()):
-        pieces = list(streamed(model, long, task, 8, 392, 64))
-        assert [made.frames for made in pieces] == [256, 144]
-        assert same(cat_time(pieces), model.generate(long, task, 8, 392, 1, FAST, torch.Generator().manual_seed(0)))
+        chunks = list(streamed(model, long, task, 8, 392, 64))
+        assert [made.frames for made in chunks] == [256, 144]
+        assert same(cat_time(chunks), model.generate(long, task, 8, 392, 1, FAST, torch.Generator().manual_seed(0)))
 
 
 @pytest.mark.parametrize("causal", [False, True])
@@ -169,7 +174,7 @@ def test_long_given_stretches_are_encoded_in_pieces_as_they_are_whole(causal, de
         torch.manual_seed(1)
         model.tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=depth, causal=causal).eval()
     scene = random_scene(1, 400, 2, torch.Generator().manual_seed(5))
-    before, after = reach(model)
+    before, after = receptive_field(model)
 
     def embedded(scene: Scene) -> torch.Tensor:
         model.tokenizer.requantize, kept = (lambda latent: latent), model.tokenizer.requantize
@@ -201,11 +206,11 @@ def test_no_more_rows_are_held_for_a_longer_scene(model, name):
     def most_rows(frames: int) -> int:
         context = context_of(name)
         options = SamplerOptions(steps=1, stride=4)
-        stream = Stream(model, scene, TASKS[name], context, frames - context, 1, options, None, None, None, 4)
+        stream = Rollout(model, scene, TASKS[name], context, frames - context, 1, options, None, None, None, 4)
         held = 0
-        for _ in stream.pieces():
+        for _ in stream.chunks():
             held = max(held, stream.tokens.shape[1] + stream.mask_noise.shape[1])
-            held = max(held, stream.canvas.T_world_can.shape[1] // 4 + stream.canvas.given.frames // 4)
+            held = max(held, stream.world.T_world_can.shape[1] // 4 + stream.world.given.frames // 4)
         return held
 
     assert most_rows(480) == most_rows(240) < 70
@@ -214,18 +219,18 @@ def test_no_more_rows_are_held_for_a_longer_scene(model, name):
 def test_the_first_piece_comes_long_before_the_last(model, recording):
     """A live viewer shows what is there already."""
     done = []
-    pieces = model.stream(recording, JointFuture(), 8, 160, 1, FAST, progress=done.append, piece=4)
-    next(pieces)
+    chunks = model.stream(recording, JointFuture(), 8, 160, 1, FAST, progress=done.append, chunk=4)
+    next(chunks)
     whole = JointFuture().schedule(planning_grid(42, 3, 2, 8, FAST))
     assert 0 < len(done) < 0.4 * whole.evaluations
 
 
 def test_nothing_that_the_stream_sets_is_left_set_between_pieces(model, recording):
-    pieces = streamed(model, recording, JointFuture(), 8, 100, 4)
+    chunks = streamed(model, recording, JointFuture(), 8, 100, 4)
     with torch.autocast("cpu", torch.bfloat16):
-        next(pieces)
+        next(chunks)
         assert torch.is_autocast_enabled("cpu") and torch.is_grad_enabled()
-    next(pieces)
+    next(chunks)
     assert not torch.is_autocast_enabled("cpu") and torch.is_grad_enabled()
 
 
@@ -236,19 +241,19 @@ def test_nothing_that_the_stream_sets_is_left_set_between_pieces(model, recordin
 def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording, name):
     context = context_of(name)
     schedule = TASKS[name].schedule(Grid(TOKENS, 3, context // 4, 2, 8, 2))
-    given = scrub(recording, schedule.known)
-    canvas = Canvas(model, given, schedule, FAST, 1)
-    low = iter(lows(schedule))
-    before: list[tuple[torch.Tensor, torch.Tensor]] = [(torch.empty(0), canvas.T_world_can.clone())]
+    given = mask_unknown(recording, schedule.known)
+    world = WorldState(model, given, schedule, FAST, 1)
+    low = iter(first_changed(schedule))
+    before: list[tuple[torch.Tensor, torch.Tensor]] = [(torch.empty(0), world.T_world_can.clone())]
 
     def on_stage_end(tokens: torch.Tensor, finished: torch.Tensor, decentralized: bool) -> torch.Tensor:
         first = next(low)
-        after = canvas.make_consistent(tokens.clone(), finished, decentralized)
+        after = world.make_consistent(tokens.clone(), finished, decentralized)
         old_tokens, old_world = before[-1]
         if len(old_tokens):
             assert torch.equal(old_tokens[:, :first], after[:, :first])
-        assert torch.equal(old_world[:, : 4 * first], canvas.T_world_can[:, : 4 * first])
-        before.append((after.clone(), canvas.T_world_can.clone()))
+        assert torch.equal(old_world[:, : 4 * first], world.T_world_can[:, : 4 * first])
+        before.append((after.clone(), world.T_world_can.clone()))
         return after
 
     start = known_tokens(model, given, schedule.known)
@@ -287,11 +292,11 @@ def test_a_plan_that_does_not_repeat_itself_needs_an_end():
             return type(plan)(plan.tokens, plan.agents, plan.stages[:1], plan.known)
 
     with pytest.raises(ValueError, match="does not repeat itself"):
-        endless(Odd(), Grid(4, 3, 2, 2, 8, 2), 3)
+        periodic_plan(Odd(), Grid(4, 3, 2, 2, 8, 2), 3)
 
 
 def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
-    with pytest.raises(ValueError, match="piece: got 0"):
+    with pytest.raises(ValueError, match="chunk: got 0"):
         streamed(model, recording, JointFuture(), 8, 20, 0)
     with pytest.raises(ValueError, match="context of 7 frames"):
         streamed(model, recording, JointFuture(), 7, 20, 4)

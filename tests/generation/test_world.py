@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from magnet.generation.blending import hold
-from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub
-from magnet.generation.world import Canvas, SamplingStats
+from magnet.generation.blending import freeze_after
+from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown
+from magnet.generation.world import SamplingStats, WorldState
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.sampling.sampler import sample
@@ -28,10 +28,10 @@ def model():
 
 def test_rows_taken_in_one_after_the_other_are_those_taken_in_at_once(model, scene):
     schedule = Inbetweening(every=5).schedule(Grid(16, 3, 2, 2, 8, 2))
-    whole = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 2)
-    grown = Canvas(model, scrub(scene, schedule.known, 0, 0), schedule, OPTIONS, 2)
+    whole = WorldState(model, mask_unknown(scene, schedule.known), schedule, OPTIONS, 2)
+    grown = WorldState(model, mask_unknown(scene, schedule.known, 0, 0), schedule, OPTIONS, 2)
     for start, stop in ((0, 3), (3, 4), (4, 16)):
-        grown.extend(scrub(scene, schedule.known, start, stop), schedule.known[start:stop])
+        grown.extend(mask_unknown(scene, schedule.known, start, stop), schedule.known[start:stop])
     for name in ("known", "placed", "T_world_can"):
         assert torch.equal(getattr(whole, name), getattr(grown, name))
     assert torch.equal(whole.given.body_rot, grown.given.body_rot)
@@ -39,23 +39,23 @@ def test_rows_taken_in_one_after_the_other_are_those_taken_in_at_once(model, sce
 
 def test_rows_let_go_are_forgotten_but_for_whether_anybody_was_known_there(model, scene):
     schedule = Inbetweening(keys=(6,)).schedule(Grid(16, 3, 0, 2, 8, 2))
-    canvas = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 1)
-    canvas.release(6)
-    assert not canvas.rooted
-    assert torch.equal(canvas.T_world_can[:, :4], canonical_frame(scene.T_world_root)[:, 24:28])
-    canvas.release(1)
-    assert canvas.rooted
-    assert (len(canvas.known), canvas.given.frames) == (9, 36)
+    world = WorldState(model, mask_unknown(scene, schedule.known), schedule, OPTIONS, 1)
+    world.release(6)
+    assert not world.rooted
+    assert torch.equal(world.T_world_can[:, :4], canonical_frame(scene.T_world_root)[:, 24:28])
+    world.release(1)
+    assert world.rooted
+    assert (len(world.known), world.given.frames) == (9, 36)
 
 
 def test_settling_changes_nothing_but_what_it_is_told_of(model, scene):
     """And the step into a known token, once the gap in front of it is closed."""
     schedule = Inbetweening(keys=(4,)).schedule(Grid(8, 3, 2, 2, 8, 2))
-    canvas = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 1)
+    world = WorldState(model, mask_unknown(scene, schedule.known), schedule, OPTIONS, 1)
     tokens = torch.randn(2, 8, 3, model.layout.width, generator=torch.Generator().manual_seed(0))
     finished = torch.zeros(8, 3, dtype=torch.bool)
     finished[2:4] = True
-    settled = canvas.make_consistent(tokens.clone(), finished)
+    settled = world.make_consistent(tokens.clone(), finished)
     changed = (settled != tokens).any(dim=0)
     assert changed[2:4].all(dim=-1).all()
     assert not changed[[0, 1, 5, 6, 7]].any()
@@ -68,7 +68,7 @@ def test_whoever_has_ended_stands_as_in_the_frame_before(scene):
     there = torch.ones(8, 3, dtype=torch.bool)
     there[3:, 1], there[:, 2] = False, False
     part = scene.slice(20, 28)
-    held = hold(part, there, scene.slice(19, 20))
+    held = freeze_after(part, there, scene.slice(19, 20))
     assert torch.equal(held.T_world_root[:, :, 0], part.T_world_root[:, :, 0])
     assert torch.equal(held.T_world_root[:, 3:, 1], part.T_world_root[:, 2:3, 1].expand(-1, 5, -1, -1))
     assert torch.equal(held.body_rot[:, :, 2], scene.body_rot[:, 19:20, 2].expand(-1, 8, -1, -1, -1))
@@ -91,12 +91,12 @@ TOKENS = 12
 
 def told(
     model, scene: Scene, task: Task, placement: str, context: int, wrong: torch.Tensor | None = None, **about
-) -> tuple[Canvas, torch.Tensor]:
-    """The finished canvas and tokens where a model says the truth, and `wrong` (B, N, P, D) on top."""
+) -> tuple[WorldState, torch.Tensor]:
+    """The finished world and tokens where a model says the truth, and `wrong` (B, N, P, D) on top."""
     options = SamplerOptions(steps=4, stride=2, placement=placement, pairwise_weight=0.1)
     schedule = task.schedule(Grid(TOKENS, 3, context, 4, 8, 2))
-    given = scrub(scene, schedule.known)
-    canvas = Canvas(model, given, schedule, options, 1, **about)
+    given = mask_unknown(scene, schedule.known)
+    world = WorldState(model, given, schedule, options, 1, **about)
     truth = known_tokens(model, scene.slice(0, 4 * TOKENS), torch.ones_like(schedule.known))
     truth = truth if wrong is None else truth + wrong
     position = iter([stage for stage in schedule.stages for _ in range(len(stage.levels) - 1)])
@@ -107,19 +107,19 @@ def told(
 
     start = known_tokens(model, given, schedule.known)
     generator = torch.Generator().manual_seed(1)
-    tokens = sample(oracle, schedule, start, scene.present, model.layout, generator, canvas.make_consistent)
-    return canvas, tokens
+    tokens = sample(oracle, schedule, start, scene.present, model.layout, generator, world.make_consistent)
+    return world, tokens
 
 
-def off(canvas: Canvas, scene: Scene, free: bool) -> torch.Tensor:
+def off(world: WorldState, scene: Scene, free: bool) -> torch.Tensor:
     """Metres and radians that placed people are away from where they were; `free`: the scene may stand anywhere."""
-    true, placed = canonical_frame(scene.slice(0, 4 * TOKENS).T_world_root), canvas.T_world_can
+    true, placed = canonical_frame(scene.slice(0, 4 * TOKENS).T_world_root), world.T_world_can
     if free:
         lead = torch.arange(scene.scenes), 0, scene.present.int().argmax(dim=1)
         true, placed = (inverse(T[lead])[:, None, None] @ T for T in (true, placed))
     yaw, ground = to_planar(inverse(true) @ placed)
     away = yaw.abs() + ground.norm(dim=-1)
-    counts = canvas.placed.repeat_interleave(4, dim=0)[None] & scene.present[:, None]
+    counts = world.placed.repeat_interleave(4, dim=0)[None] & scene.present[:, None]
     return away[counts].max()
 
 
@@ -127,9 +127,9 @@ def off(canvas: Canvas, scene: Scene, free: bool) -> torch.Tensor:
 @pytest.mark.parametrize("name", TASKS)
 def test_with_the_true_tokens_everybody_is_where_they_were(model, scene, name, placement):
     context = 0 if name == "generation" else 3
-    canvas, _ = told(model, scene, TASKS[name], placement, context)
+    world, _ = told(model, scene, TASKS[name], placement, context)
     # What is left at keyframes is the guess of the one step into each.
-    assert off(canvas, scene, free=name == "generation") < (0.05 if name == "inbetweening" else 2e-3)
+    assert off(world, scene, free=name == "generation") < (0.05 if name == "inbetweening" else 2e-3)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -140,8 +140,8 @@ def test_nobody_is_hung_off_an_absent_agent(model, scene, task, placement):
     some = without_absent(scene.replace(present=present))
     wrong = torch.randn(2, TOKENS, 3, model.layout.width, generator=torch.Generator().manual_seed(2))
     wrong[model.layout.spread(model.layout.group_present(present))[:, None].expand_as(wrong)] = 0
-    canvas, _ = told(model, some, task, placement, 0, wrong)
-    assert off(canvas, some, free=isinstance(task, Generation)) < (2e-3 if isinstance(task, Generation) else 0.05)
+    world, _ = told(model, some, task, placement, 0, wrong)
+    assert off(world, some, free=isinstance(task, Generation)) < (2e-3 if isinstance(task, Generation) else 0.05)
 
 
 # -- agents who do not see each other -------------------------------------------------------------
@@ -191,6 +191,6 @@ def test_relations_between_agents_who_saw_nothing_of_each_other_do_not_count_as_
         (True, 4),
     ):  # each of two with the third, both ways; and the two, both ways
         stats = SamplingStats()
-        canvas = Canvas(model, scrub(scene, schedule.known), schedule, OPTIONS, 1, stats)
-        canvas.make_consistent(torch.zeros(2, TOKENS, 3, model.layout.width), finished, decentralized)
+        world = WorldState(model, mask_unknown(scene, schedule.known), schedule, OPTIONS, 1, stats)
+        world.make_consistent(torch.zeros(2, TOKENS, 3, model.layout.width), finished, decentralized)
         assert stats.pairwise_drifts == 2 * 2 * pairs

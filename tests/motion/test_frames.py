@@ -4,8 +4,9 @@ import torch
 
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.motion.frames import (
+    align_planar,
+    canonical_deltas,
     canonical_frame,
-    canonical_steps,
     from_9d,
     from_planar,
     inverse,
@@ -14,9 +15,8 @@ from magnet.motion.frames import (
     place,
     pose_features,
     posed,
-    propagated,
+    propagate_pairwise,
     rigid,
-    shift_onto,
     to_9d,
     to_planar,
 )
@@ -59,7 +59,7 @@ def test_what_tokens_hold_does_not_change_when_the_world_turns_and_shifts(scene:
 def test_eq_11_holds_exactly_on_motion(scene: Scene):
     T_world_can = canonical_frame(scene.T_world_root.double())
     T_self_partner = pairwise(T_world_can)
-    expected = propagated(T_self_partner, canonical_steps(T_world_can))
+    expected = propagate_pairwise(T_self_partner, canonical_deltas(T_world_can))
     assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-12)
 
 
@@ -71,7 +71,7 @@ def test_eq_11_holds_on_a_recorded_duet(cmu_root):
         poses.append(rigid(torch.from_numpy(recording.local[:, 0]), torch.from_numpy(recording.root)))
     T_world_can = canonical_frame(torch.stack(poses, dim=1)[None])
     T_self_partner = pairwise(T_world_can)
-    expected = propagated(T_self_partner, canonical_steps(T_world_can))
+    expected = propagate_pairwise(T_self_partner, canonical_deltas(T_world_can))
     assert torch.allclose(T_self_partner[:, 1:], expected, atol=1e-12)
 
 
@@ -79,8 +79,8 @@ def test_eq_11_holds_on_a_recorded_duet(cmu_root):
 def test_a_thousand_frames_come_back_within_a_tenth_of_a_millimetre(placement, generator):
     scene = random_scene(2, 1000, 3, generator)
     T_world_can = canonical_frame(scene.T_world_root)
-    steps, pairs = scene_transforms(scene)
-    T_prev_can, T_self_partner = from_9d(by_frame(steps)), from_9d(pairwise_by_frame(pairs))
+    deltas, pairs = scene_transforms(scene)
+    T_prev_can, T_self_partner = from_9d(by_frame(deltas)), from_9d(pairwise_by_frame(pairs))
     placed = place(T_prev_can[:, 1:], T_self_partner[:, 1:], T_world_can[:, 0], placement)
     assert (placed - T_world_can[:, 1:])[..., :3, 3].norm(dim=-1).max() < 1e-4
 
@@ -93,9 +93,9 @@ def test_pose_features_and_canonical_frames_give_the_scene_back(scene: Scene):
 
 def test_permuting_agents_permutes_everything(scene: Scene):
     order = torch.tensor([2, 0, 1])
-    steps, pairs = scene_transforms(scene)
-    steps_ordered, pairs_ordered = scene_transforms(scene.permute_agents(order))
-    assert torch.equal(steps[:, :, order], steps_ordered)
+    deltas, pairs = scene_transforms(scene)
+    deltas_ordered, pairs_ordered = scene_transforms(scene.permute_agents(order))
+    assert torch.equal(deltas[:, :, order], deltas_ordered)
     table = partners(3)
     for agent in range(3):
         for slot, partner in enumerate(table[agent].tolist()):
@@ -113,24 +113,24 @@ def test_placement_is_the_same_for_all_agents(scene: Scene, placement, generator
 
     def placed(agents: torch.Tensor) -> torch.Tensor:
         T = T_world_can[:, :, agents]
-        steps = canonical_steps(T)
-        steps = from_planar(to_planar(steps)[0] + noise[:, :, agents], to_planar(steps)[1])
-        return place(steps[:, 1:], pairwise(T)[:, 1:], T[:, 0], placement, pairwise_weight=0.3)
+        deltas = canonical_deltas(T)
+        deltas = from_planar(to_planar(deltas)[0] + noise[:, :, agents], to_planar(deltas)[1])
+        return place(deltas[:, 1:], pairwise(T)[:, 1:], T[:, 0], placement, pairwise_weight=0.3)
 
     assert torch.allclose(placed(torch.arange(3))[:, :, order], placed(order), atol=1e-5)
 
 
 def test_fuse_equals_a_general_least_squares_solver(generator):
-    """One frame, noisy steps and pairs, yaws known: the ground positions minimise the stated sum of squares."""
+    """One frame, noisy deltas and pairs, yaws known: the ground positions minimise the stated sum of squares."""
     P, pairwise_weight = 3, 0.4
     start = random_scene(1, 1, P, generator).T_world_root
     T_start = canonical_frame(start)[:, 0].double()
-    step = from_planar(torch.zeros(1, 1, P), 0.1 * torch.randn(1, 1, P, 2, generator=generator)).double()
-    stepped = T_start[:, None] @ step
+    delta = from_planar(torch.zeros(1, 1, P), 0.1 * torch.randn(1, 1, P, 2, generator=generator)).double()
+    stepped = T_start[:, None] @ delta
     exact = pairwise(stepped)
     yaw, ground = to_planar(exact)
     pairs = from_planar(yaw, ground + 0.1 * torch.randn(ground.shape, generator=generator).double())
-    placed = to_planar(place(step, pairs, T_start, "fuse", pairwise_weight))[1][0, 0]  # (P, 2)
+    placed = to_planar(place(delta, pairs, T_start, "fuse", pairwise_weight))[1][0, 0]  # (P, 2)
 
     rows, right = [], []
     for p in range(P):
@@ -150,22 +150,22 @@ def test_fuse_equals_a_general_least_squares_solver(generator):
 
 def test_fuse_does_not_listen_to_absent_agents(scene: Scene):
     T_world_can = canonical_frame(scene.T_world_root)
-    steps, pairs = canonical_steps(T_world_can), pairwise(T_world_can)
+    deltas, pairs = canonical_deltas(T_world_can), pairwise(T_world_can)
     present = torch.tensor([[True, True, False]]).expand(scene.scenes, 3)
     noise = pairs.clone()
     table = partners(3)
     noise[:, :, table == 2] = torch.eye(4)
     noise[:, :, 2] = torch.eye(4)
     start = T_world_can[:, 0]
-    placed = place(steps[:, 1:], noise[:, 1:], start, "fuse", present=present)
+    placed = place(deltas[:, 1:], noise[:, 1:], start, "fuse", present=present)
     assert torch.allclose(placed[:, :, :2], T_world_can[:, 1:, :2], atol=1e-5)
 
 
 def test_fuse_bounds_the_drift_between_agents(generator):
-    """With noisy steps, integrating drifts apart without bound; fused agents stay together."""
+    """With noisy deltas, integrating drifts apart without bound; fused agents stay together."""
     scene = random_scene(1, 600, 2, generator)
     T_world_can = canonical_frame(scene.T_world_root)
-    yaw, ground = to_planar(canonical_steps(T_world_can))
+    yaw, ground = to_planar(canonical_deltas(T_world_can))
     noisy = from_planar(yaw, ground + 0.01 * torch.randn(ground.shape, generator=generator))
     apart = {}
     for placement in PLACEMENTS:
@@ -177,19 +177,19 @@ def test_fuse_bounds_the_drift_between_agents(generator):
 
 
 def test_others_hang_off_the_anchor_alone(generator):
-    """What all but each scene's anchor say of others, and the others' steps, may be anything."""
+    """What all but each scene's anchor say of others, and the others' deltas, may be anything."""
     scene = random_scene(2, 40, 3, generator)
     T_world_can, anchor = canonical_frame(scene.T_world_root), torch.tensor([2, 1])
-    steps, pairs = canonical_steps(T_world_can), pairwise(T_world_can)
+    deltas, pairs = canonical_deltas(T_world_can), pairwise(T_world_can)
     heard = torch.arange(3) == anchor[:, None]
     noise = pairwise(canonical_frame(random_scene(2, 40, 3, generator).T_world_root))
     pairs = torch.where(heard[:, None, :, None, None, None], pairs, noise)
-    steps = torch.where(heard[:, None, :, None, None], steps, steps.flip(1))
-    placed = place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=anchor)
+    deltas = torch.where(heard[:, None, :, None, None], deltas, deltas.flip(1))
+    placed = place(deltas[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=anchor)
     assert torch.allclose(placed, T_world_can[:, 1:], atol=1e-4)
-    first = place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor")
+    first = place(deltas[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor")
     assert torch.equal(
-        first, place(steps[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=torch.zeros(2).long())
+        first, place(deltas[:, 1:], pairs[:, 1:], T_world_can[:, 0], "anchor", anchor=torch.zeros(2).long())
     )
     assert not torch.allclose(first, T_world_can[:, 1:], atol=0.1)
 
@@ -234,9 +234,9 @@ def test_a_path_is_laid_onto_where_it_was_moved_from(generator):
     scene = random_scene(3, 20, 2, generator)
     path = canonical_frame(scene.T_world_root)[:, :, 0]
     moved = from_planar(torch.tensor([0.3, -2.0, 3.0]), torch.randn(3, 2, generator=generator))
-    torch.testing.assert_close(shift_onto(path, moved[:, None] @ path), moved, atol=1e-5, rtol=0)
+    torch.testing.assert_close(align_planar(path, moved[:, None] @ path), moved, atol=1e-5, rtol=0)
     other = canonical_frame(scene.T_world_root)[:, :, 1]
-    laid = shift_onto(path, other)[:, None] @ path
+    laid = align_planar(path, other)[:, None] @ path
     torch.testing.assert_close(to_planar(laid)[1].mean(dim=1), to_planar(other)[1].mean(dim=1), atol=1e-5, rtol=0)
     off = to_planar(inverse(laid) @ other)[0]
     torch.testing.assert_close(off.sin().sum(dim=1), torch.zeros(3), atol=1e-4, rtol=0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from magnet.motion.frames import from_planar, inverse, pairwise, partners, to_planar, turn
+from magnet.motion.frames import from_planar, inverse, pairwise, partners, rotate_ground, to_planar
 from magnet.motion.pose_graph import GAUGE, Planar, solve_block_tridiagonal, solve_pose_graph
 
 
@@ -18,7 +18,7 @@ def paths(B: int, T: int, P: int, seed: int = 0) -> tuple[torch.Tensor, torch.Te
 
 
 def observed(
-    yaw: torch.Tensor, ground: torch.Tensor, noise: float, seed: int = 1, step: float = 50.0, pair: float = 20.0
+    yaw: torch.Tensor, ground: torch.Tensor, noise: float, seed: int = 1, delta: float = 50.0, pair: float = 20.0
 ) -> tuple[Planar, Planar]:
     """Steps and pairwise transforms of paths, noisy, with precisions that differ from one to the next."""
     generator = torch.Generator().manual_seed(seed)
@@ -31,7 +31,7 @@ def observed(
         move = move + noise * torch.randn(move.shape, generator=generator, dtype=torch.float64)
         return Planar(angle, move, precision * drawn[0], precision * drawn[1])
 
-    return noisy(inverse(T_world[:, :-1]) @ T_world[:, 1:], step), noisy(pairwise(T_world[:, 1:]), pair)
+    return noisy(inverse(T_world[:, :-1]) @ T_world[:, 1:], delta), noisy(pairwise(T_world[:, 1:]), pair)
 
 
 @pytest.mark.parametrize("T", [1, 2, 3, 7, 8, 33])
@@ -58,18 +58,18 @@ def test_cyclic_reduction_solves_what_a_dense_solver_solves(T: int, P: int):
 def test_the_solve_is_the_least_squares_answer(P: int):
     """Headings, then positions with those headings, each minimised by scipy over a plain sum of residuals."""
     yaw, ground = paths(1, 6, P)
-    steps, pairs = observed(yaw, ground, noise=0.05)
-    found_yaw, found = solve_pose_graph(steps, pairs, yaw[:, 0], ground[:, 0])
+    deltas, pairs = observed(yaw, ground, noise=0.05)
+    found_yaw, found = solve_pose_graph(deltas, pairs, yaw[:, 0], ground[:, 0])
     partner = partners(P)
-    stepped = yaw[0, 0].numpy() + steps.yaw[0].cumsum(dim=0).numpy()
+    stepped = yaw[0, 0].numpy() + deltas.yaw[0].cumsum(dim=0).numpy()
 
     def headings(x: np.ndarray) -> np.ndarray:
         theta = np.concatenate([yaw[0, :1].numpy(), x.reshape(6, P)])
         residuals = [np.sqrt(GAUGE) * (theta[1:] - stepped).ravel()]
         for t in range(6):
             for p in range(P):
-                off = theta[t + 1, p] - theta[t, p] - float(steps.yaw[0, t, p])
-                residuals.append([np.sqrt(float(steps.yaw_precision[0, t, p])) * off])
+                off = theta[t + 1, p] - theta[t, p] - float(deltas.yaw[0, t, p])
+                residuals.append([np.sqrt(float(deltas.yaw_precision[0, t, p])) * off])
                 for s in range(P - 1):
                     off = theta[t + 1, int(partner[p, s])] - theta[t + 1, p] - float(pairs.yaw[0, t, p, s])
                     off = np.angle(np.exp(1j * off))
@@ -79,18 +79,18 @@ def test_the_solve_is_the_least_squares_answer(P: int):
     best = least_squares(headings, stepped.ravel(), xtol=1e-14, ftol=1e-14, gtol=1e-14).x.reshape(6, P)
     assert np.allclose(found_yaw[0].numpy(), best, atol=1e-6)
     theta = torch.cat([yaw[:, :1], found_yaw], dim=1)[0]
-    walked = ground[0, 0] + turn(theta[:-1], steps.ground[0]).cumsum(dim=0)
+    walked = ground[0, 0] + rotate_ground(theta[:-1], deltas.ground[0]).cumsum(dim=0)
 
     def positions(x: np.ndarray) -> np.ndarray:
         where = torch.cat([ground[0, :1], torch.from_numpy(x).view(6, P, 2)])
         residuals = [np.sqrt(GAUGE) * (where[1:] - walked).flatten().numpy()]
         for t in range(6):
             for p in range(P):
-                off = where[t + 1, p] - where[t, p] - turn(theta[t, p], steps.ground[0, t, p])
-                residuals.append(float(steps.ground_precision[0, t, p]) ** 0.5 * off.numpy())
+                off = where[t + 1, p] - where[t, p] - rotate_ground(theta[t, p], deltas.ground[0, t, p])
+                residuals.append(float(deltas.ground_precision[0, t, p]) ** 0.5 * off.numpy())
                 for s in range(P - 1):
                     away = where[t + 1, int(partner[p, s])] - where[t + 1, p]
-                    off = away - turn(theta[t + 1, p], pairs.ground[0, t, p, s])
+                    off = away - rotate_ground(theta[t + 1, p], pairs.ground[0, t, p, s])
                     residuals.append(float(pairs.ground_precision[0, t, p, s]) ** 0.5 * off.numpy())
         return np.concatenate(residuals)
 
@@ -100,21 +100,21 @@ def test_the_solve_is_the_least_squares_answer(P: int):
 
 def test_exact_steps_and_pairs_give_the_paths_back():
     yaw, ground = paths(3, 20, 4)
-    steps, pairs = observed(yaw, ground, noise=0.0)
-    found_yaw, found = solve_pose_graph(steps, pairs, yaw[:, 0], ground[:, 0])
+    deltas, pairs = observed(yaw, ground, noise=0.0)
+    found_yaw, found = solve_pose_graph(deltas, pairs, yaw[:, 0], ground[:, 0])
     assert torch.allclose(found_yaw, yaw[:, 1:], atol=1e-5)
     assert torch.allclose(found, ground[:, 1:], atol=1e-5)
 
 
 def test_the_solve_can_be_differentiated():
     yaw, ground = paths(1, 5, 2)
-    steps, pairs = observed(yaw, ground, noise=0.05)
+    deltas, pairs = observed(yaw, ground, noise=0.05)
     start = yaw[:, 0], ground[:, 0]
 
-    def solved(step_yaw: torch.Tensor, pair_ground: torch.Tensor) -> torch.Tensor:
-        a = Planar(step_yaw, steps.ground, steps.yaw_precision, steps.ground_precision)
+    def solved(delta_yaw: torch.Tensor, pair_ground: torch.Tensor) -> torch.Tensor:
+        a = Planar(delta_yaw, deltas.ground, deltas.yaw_precision, deltas.ground_precision)
         b = Planar(pairs.yaw, pair_ground, pairs.yaw_precision, pairs.ground_precision)
         return torch.cat([each.flatten() for each in solve_pose_graph(a, b, *start)])
 
-    inputs = (steps.yaw.clone().requires_grad_(), pairs.ground.clone().requires_grad_())
+    inputs = (deltas.yaw.clone().requires_grad_(), pairs.ground.clone().requires_grad_())
     assert torch.autograd.gradcheck(solved, inputs)

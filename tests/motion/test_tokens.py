@@ -20,8 +20,8 @@ def test_pack_and_unpack_are_inverse(scene: Scene, generator):
 
 def test_groups_lie_where_unpack_finds_them():
     layout = TokenLayout(8, 3)
-    latent, steps, pairs = layout.unpack(layout.groups().float())
-    assert latent.unique().tolist() == steps.unique().tolist() == [0]
+    latent, deltas, pairs = layout.unpack(layout.groups().float())
+    assert latent.unique().tolist() == deltas.unique().tolist() == [0]
     assert [pairs[slot].unique().tolist() for slot in range(2)] == [[1], [2]]
 
 

@@ -40,7 +40,7 @@ def made(name: str, people: int, seed: int) -> tuple[CoupledScene, Tensor]:
 def palms(one: CoupledScene) -> Tensor:
     """Middle of each palm by the wrists' rotations, left and right. (T, P, 2, 3)"""
     scene = one.scene
-    R, t = body()._chain(scene.body_rot, scene.T_world_root, body().rest_joints(scene.betas[:, None]))
+    R, t = body().bone_chain(scene.body_rot, scene.T_world_root, body().rest_joints(scene.betas[:, None]))
     out = torch.tensor([[PALM, 0.0, 0.0], [-PALM, 0.0, 0.0]])
     return (t[..., 20:22, :] + (R[..., 20:22, :, :] @ out[..., None])[..., 0])[0]
 

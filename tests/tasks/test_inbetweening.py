@@ -5,9 +5,9 @@ from torch import Tensor
 from magnet import weights
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
-from magnet.generation.blending import arrive, next_known, seam_weights
-from magnet.generation.conditioning import SamplerOptions, known_tokens, scrub
-from magnet.generation.world import Canvas
+from magnet.generation.blending import next_known, seam_weights, warp_to_keyframe
+from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown
+from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, inverse, pairwise, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, pairwise_by_frame
@@ -35,14 +35,14 @@ def model():
 
 
 def settled(model, scene, task, options, tokens: int, context: int = 2):
-    """The finished canvas of a task, its tokens, and the tokens it was given."""
+    """The finished world of a task, its tokens, and the tokens it was given."""
     schedule = task.schedule(Grid(tokens, 4, context, 3, 8, 2))
-    given = scrub(scene.pad_agents(4), schedule.known)
-    canvas = Canvas(model, given, schedule, options, 1)
+    given = mask_unknown(scene.pad_agents(4), schedule.known)
+    world = WorldState(model, given, schedule, options, 1)
     start = known_tokens(model, given, schedule.known)
     generator = torch.Generator().manual_seed(0)
-    out = sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.make_consistent)
-    return canvas, out, start, schedule.known
+    out = sample(model.denoise, schedule, start, given.present, model.layout, generator, world.make_consistent)
+    return world, out, start, schedule.known
 
 
 # -- the plan ----------------------------------------------------------------------------------
@@ -151,10 +151,10 @@ def changes(scene: Scene, known: Tensor) -> tuple[dict[str, Tensor], dict[str, T
 def test_tokens_agree_with_the_world_everywhere(model, options, generator, task, tokens):
     """Gaps shorter and longer than the window of 8; steps into keyframes too."""
     scene = random_scene(2, tokens * 4, 3, generator)
-    canvas, out, _, _ = settled(model, scene, task, options, tokens)
+    world, out, _, _ = settled(model, scene, task, options, tokens)
     _, steps, pairs = model.layout.unpack(model.normalizer.denormalize(out))
-    T_world_can = canvas.T_world_can
-    assert canvas.placed[:, :3].all()
+    T_world_can = world.T_world_can
+    assert world.placed[:, :3].all()
     assert torch.allclose(T_world_can[:, :-1] @ from_9d(by_frame(steps))[:, 1:], T_world_can[:, 1:], atol=2e-3)
     assert torch.allclose(from_9d(pairwise_by_frame(pairs)), pairwise(T_world_can), atol=2e-3)
 
@@ -196,8 +196,8 @@ def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene
     """Placement alone: what is left is the guess of the one step into each keyframe, spread over its gap."""
     scene = scene.slice(0, 48).pad_agents(4)
     schedule = task.schedule(Grid(12, 4, 2, 3, 8, 2))
-    given = scrub(scene, schedule.known)
-    canvas = Canvas(model, given, schedule, options, 1)
+    given = mask_unknown(scene, schedule.known)
+    world = WorldState(model, given, schedule, options, 1)
     truth = known_tokens(model, scene, torch.ones_like(schedule.known))
     position = iter([stage for stage in schedule.stages for _ in range(len(stage.levels) - 1)])
 
@@ -206,9 +206,9 @@ def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene
         return truth[:, stage.start : stage.stop]
 
     start = known_tokens(model, given, schedule.known)
-    out = sample(oracle, schedule, start, scene.present, model.layout, on_stage_end=canvas.make_consistent)
+    out = sample(oracle, schedule, start, scene.present, model.layout, on_stage_end=world.make_consistent)
     true = canonical_frame(scene.T_world_root)
-    yaw, ground = to_planar(inverse(true) @ canvas.T_world_can)
+    yaw, ground = to_planar(inverse(true) @ world.T_world_can)
     assert yaw[:, :, :3].abs().max() < 0.02 and ground[:, :, :3].abs().max() < 0.02
     steps, true_steps = (model.layout.unpack(model.normalizer.denormalize(x))[1] for x in (out, truth))
     assert torch.allclose(steps[:, 1:, :3], true_steps[:, 1:, :3], atol=0.02)
@@ -229,7 +229,7 @@ def path(generator: torch.Generator, frames: int = 40) -> Tensor:
 def test_a_path_that_arrives_is_hardly_bent(generator):
     """Real paths meet their own continuation; the guess of one step is all that is spread."""
     whole = path(generator)
-    bent = arrive(whole[:, :30], whole[:, 30], inverse(whole[:, 30]) @ whole[:, 31])
+    bent = warp_to_keyframe(whole[:, :30], whole[:, 30], inverse(whole[:, 30]) @ whole[:, 31])
     assert torch.allclose(bent, whole[:, :30], atol=1e-2)
 
 
@@ -238,7 +238,7 @@ def test_a_path_that_misses_is_bent_and_adds_no_speed_at_its_ends(generator):
     off = from_planar(torch.tensor(0.6), torch.tensor([0.5, -0.8]))
     key = whole[:, 30] @ off
     step = inverse(whole[:, 30]) @ whole[:, 31]
-    bent = torch.cat([arrive(whole[:, :30], key, step), key[:, None]], dim=1)
+    bent = torch.cat([warp_to_keyframe(whole[:, :30], key, step), key[:, None]], dim=1)
     assert torch.allclose(bent[:, 0], whole[:, 0])
     yaw_steps = (
         to_planar(inverse(bent[:, :-1]) @ bent[:, 1:])[0] - to_planar(inverse(whole[:, :30]) @ whole[:, 1:31])[0]

@@ -15,7 +15,7 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
-from magnet.testing import TASK_GRIDS, _check_hidden, renaming_law, sampled_blind, task_laws
+from magnet.testing import TASK_GRIDS, check_hidden, renaming_law, sampled_blind, task_laws
 
 TWO_AND_MORE = ("partner_inpainting", "partner_prediction", "motion_control")
 CANNOT_ROLL = ("agentic_async", "agentic_sync", "inbetweening", "motion_control")
@@ -93,7 +93,7 @@ def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, gu
     task, grid = registry.get(name)(), Grid(8, 3, 3, steps=4, window=6, stride=2)
     schedule = task.schedule(grid)
     assert any(stage.hidden is not None for stage in schedule.stages)
-    _check_hidden(task, grid, schedule, guidance)
+    check_hidden(task, grid, schedule, guidance)
 
 
 @pytest.mark.parametrize("name", HIDING)
@@ -173,8 +173,8 @@ def in_more_slots(people: Tensor, slots: Tensor, small: TokenLayout, large: Toke
     """People's tokens in the first of more slots, the rest as it is in `slots`."""
     P = small.agents
     whole = [part.clone() for part in large.unpack(slots)]
-    latent, steps, pairs = small.unpack(people)
-    whole[0][:, :, :P], whole[1][:, :, :P], whole[2][:, :, :P, : P - 1] = latent, steps, pairs
+    latent, deltas, pairs = small.unpack(people)
+    whole[0][:, :, :P], whole[1][:, :, :P], whole[2][:, :, :P, : P - 1] = latent, deltas, pairs
     return large.pack(*whole)
 
 

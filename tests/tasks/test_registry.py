@@ -20,8 +20,8 @@ class Foreign:
 @pytest.fixture
 def clean_registry(monkeypatch):
     registry.discover()
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
-    monkeypatch.setattr(registry, "_failures", {})
+    monkeypatch.setattr(registry, "known_tasks", dict(registry.known_tasks))
+    monkeypatch.setattr(registry, "failed_plugins", {})
 
 
 class FakePoint:

@@ -47,12 +47,12 @@ def test_with_an_oracle_every_task_reconstructs_the_scene(name: str, people: int
         views = len(noisy) // len(truth)
         return truth[:, stage.start : stage.stop].repeat_interleave(views, dim=0)
 
-    def on_stage_end(canvas: Tensor, finished: Tensor, decentralized: bool) -> Tensor:
-        """Relations between agents that did not see each other come from where they then stand, as in `Canvas`."""
-        done = torch.zeros_like(canvas, dtype=torch.bool)
+    def on_stage_end(tokens: Tensor, finished: Tensor, decentralized: bool) -> Tensor:
+        """Relations between agents that did not see each other come from where they then stand, as in `WorldState`."""
+        done = torch.zeros_like(tokens, dtype=torch.bool)
         done[:, finished] = True
         done[..., : layout.latent + 36] = False
-        return torch.where(done, truth, canvas)
+        return torch.where(done, truth, tokens)
 
     decentralized = name == "agentic_sync"  # there nobody has seen what the others were about to do
     shown = torch.where(schedule.known[..., None], truth, torch.nan)

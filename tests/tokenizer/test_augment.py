@@ -74,9 +74,9 @@ def tiny(**options) -> Tokenizer:
 def test_training_augments_and_evaluation_does_not(people):
     tokenizer = tiny(exchange_limbs=1.0, turn_joints=0.2)
     tokenizer.init_codebook([people])
-    assert torch.equal(tokenizer._augmented(people, 0).body_rot, tokenizer._augmented(people, 0).body_rot)
-    assert not torch.equal(tokenizer._augmented(people, 0).body_rot, tokenizer._augmented(people, 1).body_rot)
-    assert torch.equal(tiny()._augmented(people, 0).body_rot, people.body_rot)
+    assert torch.equal(tokenizer.augmented(people, 0).body_rot, tokenizer.augmented(people, 0).body_rot)
+    assert not torch.equal(tokenizer.augmented(people, 0).body_rot, tokenizer.augmented(people, 1).body_rot)
+    assert torch.equal(tiny().augmented(people, 0).body_rot, people.body_rot)
 
 
 def test_a_tokenizer_starts_from_anothers_networks(people, tmp_path):
@@ -85,9 +85,9 @@ def test_a_tokenizer_starts_from_anothers_networks(people, tmp_path):
     path = tmp_path / "first.ckpt"
     torch.save({"hyper_parameters": dict(first.hparams), "state_dict": first.state_dict()}, path)
     second = tiny(levels=2)
-    second._start_from(path)
+    second.take_weights(path)
     for name, value in second.vqvae.state_dict().items():
         assert torch.equal(value, first.vqvae.state_dict()[name])
     assert not second.quantizer.initialized, "another number of codebooks starts anew"
     with pytest.raises(ValueError, match=r"start_from: .* does not fit"):
-        Tokenizer(latent=16, hidden=24, codes=32, depth=1)._start_from(path)
+        Tokenizer(latent=16, hidden=24, codes=32, depth=1).take_weights(path)

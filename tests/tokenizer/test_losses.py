@@ -6,7 +6,7 @@ import torch
 from magnet.body import load_body
 from magnet.motion.frames import canonical_frame, pose_features
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import scene_steps
+from magnet.motion.tokens import scene_deltas
 from magnet.testing import random_scene
 from magnet.tokenizer.losses import TOES, matrices, moved, reconstruction_losses, standing, world_velocity
 
@@ -23,7 +23,7 @@ def in_frames(body, scene: Scene) -> torch.Tensor:
 
 def test_ways_over_the_ground_are_those_of_joints_in_the_world(body, generator):
     scene = random_scene(2, 12, 3, generator)
-    ways = world_velocity(in_frames(body, scene), scene_steps(scene))
+    ways = world_velocity(in_frames(body, scene), scene_deltas(scene))
     world = body.joints(scene).diff(dim=1)
     turn = canonical_frame(scene.T_world_root)[:, :-1, :, :3, :3]
     assert torch.allclose(ways, world @ turn, atol=1e-5)
@@ -53,7 +53,7 @@ def test_stance_is_the_speed_at_which_given_steps_make_standing_toes_slide(body)
     lowest = body.joints(still)[..., TOES, 1].amax()
     pose = pose_features(still)
     pose[..., -2] -= lowest  # both toes on the floor or under it
-    steps = scene_steps(still)
+    steps = scene_deltas(still)
     away = steps.clone()
     away[..., 8] += 0.3 / 30
     mask = torch.ones(pose.shape[:3], dtype=torch.bool)

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from magnet.body import load_body
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene, concatenate
-from magnet.motion.tokens import by_token, scene_steps
+from magnet.motion.tokens import by_token, scene_deltas
 from magnet.testing import random_scene, tiny_denoiser, without_absent
 from magnet.tokenizer import RawPose, Tokenizer
 from magnet.tokenizer.features import features
@@ -34,7 +34,7 @@ def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
 
 
 def conditions(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
-    return scene.betas, by_token(scene_steps(scene))
+    return scene.betas, by_token(scene_deltas(scene))
 
 
 class Scenes(L.LightningDataModule):
@@ -68,7 +68,7 @@ def test_encode_and_decode_keep_the_shapes(scene: Scene) -> None:
     tokenizer = tiny(scene).eval()
     latent = tokenizer.encode_scene(scene)
     assert latent.shape == (2, 16, 3, 16)
-    assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_steps(scene)))
+    assert torch.equal(latent, tokenizer.encode(pose_features(scene), scene.betas, scene_deltas(scene)))
     pose = tokenizer.decode(latent, *conditions(scene))
     assert pose.shape == (2, 64, 3, 135)
     assert torch.equal(tokenizer.requantize(latent), latent)
@@ -83,7 +83,7 @@ def test_every_latent_is_a_code(scene: Scene) -> None:
 
 def test_a_part_of_a_token_is_refused(scene: Scene) -> None:
     with pytest.raises(ValueError, match="63 frames"):
-        tiny().encode(pose_features(scene)[:, :63], scene.betas, scene_steps(scene)[:, :63])
+        tiny().encode(pose_features(scene)[:, :63], scene.betas, scene_deltas(scene)[:, :63])
 
 
 def test_agents_do_not_see_each_other(scene: Scene) -> None:
@@ -100,7 +100,7 @@ def test_where_a_scene_lies_in_the_world_does_not_matter(scene: Scene) -> None:
     T_new_world[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.6, 0.8, -0.8, 0.6])
     T_new_world[:3, 3] = torch.tensor([2.0, 0.0, -1.0])
     seen, moved = features(scene), features(scene.transformed(T_new_world))
-    vectors = [tokenizer._embed(s.pose, s.betas, s.steps, None) for s in (seen, moved)]
+    vectors = [tokenizer.embed(s.pose, s.betas, s.steps, None) for s in (seen, moved)]
     torch.testing.assert_close(vectors[0], vectors[1], rtol=0, atol=1e-3)
 
 
@@ -131,8 +131,8 @@ def test_symmetric_tokens_do_look_ahead(generator: torch.Generator) -> None:
     scene = random_scene(1, 64, 1, generator)
     tokenizer = tiny(scene).eval()
     seen, cut = features(scene), features(scene.slice(0, 32))
-    whole = tokenizer._embed(seen.pose, seen.betas, seen.steps, None)[:, :8]
-    assert (whole - tokenizer._embed(cut.pose, cut.betas, cut.steps, None)).abs().max() > 1e-3
+    whole = tokenizer.embed(seen.pose, seen.betas, seen.steps, None)[:, :8]
+    assert (whole - tokenizer.embed(cut.pose, cut.betas, cut.steps, None)).abs().max() > 1e-3
 
 
 # -- what must not count -----------------------------------------------------------------------
@@ -189,7 +189,7 @@ def test_a_handful_of_windows_is_learnt(generator: torch.Generator) -> None:
 
     def angle() -> float:
         with torch.no_grad():
-            _, body = (tokenizer._losses(features(scene))[0][name] for name in ("loss", "body"))
+            _, body = (tokenizer.losses(features(scene))[0][name] for name in ("loss", "body"))
         return float((2 * body).sqrt().rad2deg())
 
     tokenizer.eval()

@@ -48,7 +48,7 @@ def test_a_causal_frame_depends_on_no_later_token() -> None:
 @pytest.mark.parametrize("depth", [1, 2, 3])
 def test_nothing_beyond_the_stated_reach_matters(depth: int, causal: bool) -> None:
     decoder = Decoder(4, 8, 3, depth=depth, causal=causal)
-    before, after = decoder.reach
+    before, after = decoder.receptive_field
     tokens = torch.randn(1, 120, 4)
     for frame in range(240, 248):
         matters = frames_that_matter(decoder, tokens, frame).nonzero()[:, 0]

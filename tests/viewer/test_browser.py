@@ -10,7 +10,7 @@ import torch
 
 from magnet.export.page.takes import take
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.recording import record
+from magnet.generation.trace import record
 from magnet.motion.scene import Scene
 from magnet.tasks.joint import JointFuture
 from magnet.viewer import stage

@@ -120,16 +120,16 @@ def test_a_checkpoint_that_is_removed_takes_its_checksum_along(saved: Path) -> N
 def test_a_full_disk_leaves_the_checkpoint_before(
     saved: Path, checkpoint: dict[str, Any], monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    left, write = [room], files._Hashed.write
+    left, write = [room], files.HashedFile.write
 
-    def written(self: files._Hashed, data: Any) -> int:
+    def written(self: files.HashedFile, data: Any) -> int:
         left[0] -= len(data)
         if left[0] < 0:
             self.failed = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             raise self.failed
         return write(self, data)
 
-    monkeypatch.setattr(files._Hashed, "write", written)
+    monkeypatch.setattr(files.HashedFile, "write", written)
     with pytest.raises(OSError, match=r"checkpoints: the disk is full .*then go on with --ckpt_path last"):
         IO.save_checkpoint(checkpoint | {"global_step": 13}, saved)
     monkeypatch.undo()

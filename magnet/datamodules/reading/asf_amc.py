@@ -92,9 +92,9 @@ def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecordin
             that is not a number, NaN, a truncated file or one without frames; names file and line.
     """
     path = Path(path)
-    values = _fast(path, skeleton)
+    values = parse_regular(path, skeleton)
     if values is None:
-        values = _slow(path, skeleton)
+        values = parse_any(path, skeleton)
     column, T, K = 0, len(values), len(skeleton.names)
     root, angles = np.zeros((T, 3)), np.zeros((T, K, 3))
     for k, dofs in enumerate(skeleton.dofs):
@@ -113,7 +113,7 @@ def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecordin
     return AmcRecording(skeleton, root, local, float(fps), path)
 
 
-def _fast(path: Path, skeleton: AsfSkeleton) -> Floats | None:
+def parse_regular(path: Path, skeleton: AsfSkeleton) -> Floats | None:
     """All values (T, D) of a file whose frames all list the skeleton's bones in one order; else None."""
     try:
         words = path.read_text(encoding="latin-1").split()
@@ -151,7 +151,7 @@ def _fast(path: Path, skeleton: AsfSkeleton) -> Floats | None:
     return values if np.isfinite(values).all() else None
 
 
-def _slow(path: Path, skeleton: AsfSkeleton) -> Floats:
+def parse_any(path: Path, skeleton: AsfSkeleton) -> Floats:
     """The same line by line: takes bones in any order, and says where a file is wrong."""
     moving = skeleton.moving
     starts, width = {}, 0

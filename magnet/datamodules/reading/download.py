@@ -97,7 +97,7 @@ def download_cmu(
         raise ValueError(f"base_url: got {base_url!r}, expected an address that begins with http:// or https://")
     base_url, folder, retries = base_url.rstrip("/"), Path(out).expanduser(), retries or Retries()
     folder.mkdir(parents=True, exist_ok=True)
-    manifest, tested = _read_manifest(folder / MANIFEST), _tested()
+    manifest, tested = _read_manifest(folder / MANIFEST), known_hashes()
     fetched: list[str] = []
     kept: list[str] = []
     unlike: list[str] = []
@@ -215,7 +215,7 @@ def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) 
         if total is not None and _size(part) < total:
             reason = f"{_size(part):,} of {total:,} bytes came"
             failures = 1 if _size(part) > before else failures + 1
-        elif reason := _unsound(part, target.suffix):
+        elif reason := unsound(part, target.suffix):
             part.unlink()  # nothing of it can be trusted
             failures += 1
         else:
@@ -294,7 +294,7 @@ def _give_up_or_wait(error: Exception, url: str, failures: int, retries: Retries
     ) from error
 
 
-def _unsound(path: Path, kind: str) -> str:
+def unsound(path: Path, kind: str) -> str:
     """Why a file cannot be a whole ASF or AMC file, or nothing: lengths that a site states may be wrong."""
     text = path.read_text("latin-1").splitlines()
     if len(text) > 2 * EDGE:  # the middle cannot be cut short
@@ -327,7 +327,7 @@ def _whole(path: Path, known: str | None) -> bool:
     """The file is as it was fetched; one that was put there by hand is whole if it reads like one."""
     if not path.is_file():
         return False
-    return sha256(path) == known if known else not _unsound(path, path.suffix)
+    return sha256(path) == known if known else not unsound(path, path.suffix)
 
 
 def _read_manifest(path: Path) -> dict[str, str]:
@@ -344,6 +344,6 @@ def _write_manifest(path: Path, manifest: dict[str, str]) -> None:
     os.replace(beside, path)
 
 
-def _tested() -> dict[str, str]:
+def known_hashes() -> dict[str, str]:
     """Hashes of the files that this project was tested with, by name."""
     return _hashes((resources.files("magnet.datamodules") / "cmu.sha256").read_text(encoding="utf-8"))

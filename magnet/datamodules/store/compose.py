@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import from_planar, turn
+from magnet.motion.frames import from_planar, rotate_ground
 
 
 def place_apart(
@@ -37,7 +37,7 @@ def place_apart(
         return (ground * group[:, None, :, None]).sum(dim=(1, 2)) / people[:, None]
 
     near, far = centre(ours), centre(theirs)
-    turned = turn(yaw[:, None, None], ground - far[:, None, None])
+    turned = rotate_ground(yaw[:, None, None], ground - far[:, None, None])
     # At distance d along u, a pair is |d u - offset| apart: solve for the largest d where that is `clearance`.
     offset = (ground - near[:, None, None])[:, :, :, None] - turned[:, :, None]  # (B, T, P, P, 2)
     x, z = offset.unbind(-1)
@@ -49,5 +49,5 @@ def place_apart(
     distance = torch.maximum(distance, needed)
 
     heading = torch.stack([direction.sin(), direction.cos()], dim=-1)
-    T_new_world = from_planar(yaw, near + distance[:, None] * heading - turn(yaw, far))
+    T_new_world = from_planar(yaw, near + distance[:, None] * heading - rotate_ground(yaw, far))
     return torch.where(theirs[:, None, :, None, None], T_new_world[:, None, None] @ T_world_root, T_world_root)

@@ -198,7 +198,7 @@ class MappedStore(MemoryStore):
         scenes, slots = present.nonzero()
         copies = zip(scenes.tolist(), slots.tolist(), *(x[present].tolist() for x in (shard, row, count)), strict=True)
         for b, p, number, first, n in copies:
-            out[b, :n, p] = self._shard(number)[first : first + n]
+            out[b, :n, p] = self.shard(number)[first : first + n]
             if n < frames:
                 out[b, n:, p] = out[b, n - 1, p]
 
@@ -213,7 +213,7 @@ class MappedStore(MemoryStore):
             names=self.labels(windows, frames),
         )
 
-    def _shard(self, number: int) -> NDArray[np.void]:
+    def shard(self, number: int) -> NDArray[np.void]:
         if number not in self.shards:
             self.shards[number] = np.asarray(self.part.shard(number)).view(BYTES)
         return self.shards[number]

@@ -44,11 +44,11 @@ def matrices(rotations: Tensor) -> Tensor:
         (..., 3, 3) float32 on the same device.
     """
     flat = rotations.reshape(-1, 4)
-    nine = _nine_at_once(flat) if flat.device.type != "cpu" else torch.from_numpy(_nine(flat.numpy()))
+    nine = nine_at_once(flat) if flat.device.type != "cpu" else torch.from_numpy(_nine(flat.numpy()))
     return nine.view(*rotations.shape[:-1], 3, 3)
 
 
-def _nine_at_once(rotations: Tensor) -> Tensor:
+def nine_at_once(rotations: Tensor) -> Tensor:
     """(N, 4) -> (N, 9) on any device."""
     q = rotations.T.float()
     x, y, z, w = q

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magnet.body.base import Body, load_body
 from magnet.export.page.rig import Array
 from magnet.files import load_npz
-from magnet.generation.recording import Recording
+from magnet.generation.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 
 SAMPLES = 4
@@ -41,7 +41,7 @@ class Take:
     scene: Scene
     slots: tuple[int, ...]
     known: NDArray[np.bool_]
-    recording: Recording | None = None
+    recording: DenoisingTrace | None = None
 
     @property
     def frames(self) -> int:
@@ -56,7 +56,7 @@ class Take:
         return f"given: {those}" if those else ""
 
 
-def take(label: str, scene: Scene, context: int = 0, recording: Recording | None = None) -> Take:
+def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None) -> Take:
     """A scene (B = 1) made ready to be shown.
 
     Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
@@ -118,7 +118,7 @@ def read_takes(
     return [each for _, each in found], body
 
 
-def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
+def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
     """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
 
     Raises:
@@ -127,8 +127,8 @@ def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
     """
     from magnet.export.formats import read  # late: it brings every format's code
 
-    if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_recording(path):
-        recording = Recording.load(path)
+    if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_trace(path):
+        recording = DenoisingTrace.load(path)
         if recording.scene.body != body.id:
             raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
         return recording.scene, recording
@@ -138,7 +138,7 @@ def read_scene(path: Path, body: Body) -> tuple[Scene, Recording | None]:
         raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
 
 
-def is_recording(path: Path) -> bool:
+def is_trace(path: Path) -> bool:
     """Whether an npz holds denoising steps.
 
     Raises:

@@ -19,6 +19,7 @@ from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare, read_splits
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.store.reader import STATE, StoreReader
+from tests.cases import some_slow
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
@@ -87,7 +88,7 @@ def until(true: Callable[[], bool], seconds: float = 500.0) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", some_slow([1, 2], 2))
 @pytest.mark.parametrize("during", ["conversion", "packing"])
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp_path, during, workers):
     out, reached = tmp_path / "killed", tmp_path / "reached"
@@ -137,6 +138,7 @@ def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, tmp_pa
     assert content(tmp_path / "store") == content(tmp_path / "new")
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_bytes_of_one(couples, undisturbed, tmp_path):
     told: list[tuple[int, int]] = []
     prepare(

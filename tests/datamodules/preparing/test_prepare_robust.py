@@ -131,9 +131,9 @@ def test_a_store_made_while_another_was_about_to_begin_is_gone_on_from(
 
 def full_after(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     """The disk takes so many more bytes, half of the last write, and then no more, until `undo`."""
-    left, write = [size], files._Hashed.write
+    left, write = [size], files.HashedFile.write
 
-    def written(self: files._Hashed, data: Any) -> int:
+    def written(self: files.HashedFile, data: Any) -> int:
         data = bytes(data)
         left[0] -= len(data)
         if left[0] < 0:
@@ -142,7 +142,7 @@ def full_after(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return write(self, data)
 
-    monkeypatch.setattr(files._Hashed, "write", written)
+    monkeypatch.setattr(files.HashedFile, "write", written)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.45, 0.6, 0.8, 0.97, 0.999])

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
-from magnet.datamodules.reading.asf_amc import AmcRecording, _fast, _slow, read_amc, read_asf, together
+from magnet.datamodules.reading.asf_amc import AmcRecording, parse_any, parse_regular, read_amc, read_asf, together
 from magnet.datamodules.reading.cmu_glitches import repaired, runs
 from tests.datamodules.slow_cmu import slow_ends
 
@@ -70,9 +70,9 @@ def test_a_large_file_is_read_within_a_second(cmu_root: Path) -> None:
 
 def test_reading_line_by_line_gives_the_same_values(files: tuple[Path, Path]) -> None:
     skeleton = read_asf(files[0])
-    fast = _fast(files[1], skeleton)
+    fast = parse_regular(files[1], skeleton)
     assert fast is not None
-    np.testing.assert_array_equal(fast, _slow(files[1], skeleton))
+    np.testing.assert_array_equal(fast, parse_any(files[1], skeleton))
 
 
 def test_bones_may_come_in_another_order_in_a_later_frame(files: tuple[Path, Path]) -> None:

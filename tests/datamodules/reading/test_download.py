@@ -92,7 +92,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 @pytest.fixture
 def site(database: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.setattr(download, "_tested", dict)  # nothing is known of made-up files
+    monkeypatch.setattr(download, "known_hashes", dict)  # nothing is known of made-up files
     made = Site(dict(database))
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Bound", (Handler,), {"site": made}))
     made.url = f"http://127.0.0.1:{server.server_port}"
@@ -289,7 +289,7 @@ def test_a_file_that_is_known_to_be_another_is_refused_after_the_others_unless_t
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     same, other = (hashlib.sha256(site.files[f"subjects/02/02{end}"]).hexdigest() for end in ("_01.amc", ".asf"))
-    monkeypatch.setattr(download, "_tested", lambda: {"02_01.amc": same, "02.asf": "0" * 64})
+    monkeypatch.setattr(download, "known_hashes", lambda: {"02_01.amc": same, "02.asf": "0" * 64})
     for _ in range(2):
         with pytest.raises(DownloadError, match=rf"02\.asf: its SHA-256 is {other}, expected 0{{64}}\n.*--any_version"):
             fetch(site, tmp_path)
@@ -325,11 +325,11 @@ def test_waits_grow_and_never_pass_the_longest(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_real_recordings_are_whole_and_are_the_tested_ones(cmu_root: Path) -> None:
-    tested = download._tested()
+    tested = download.known_hashes()
     paths = sorted(cmu_root.rglob("0[25]*.a*")) + sorted(cmu_root.rglob("*.asf"))
     assert len(tested) > 60
     for path in paths:
-        assert not download._unsound(path, path.suffix)
+        assert not download.unsound(path, path.suffix)
         assert tested.get(path.name) == download.sha256(path), (
             f"{path.name} is not the file this project was tested with"
         )

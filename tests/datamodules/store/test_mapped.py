@@ -15,7 +15,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.store.mapped import MappedStore, RawBatch
 from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.reader import ROW, StoreError
-from magnet.datamodules.store.rows import CACHED, SCALE, _nine_at_once, matrices
+from magnet.datamodules.store.rows import CACHED, SCALE, matrices, nine_at_once
 from tests.datamodules import made
 from tests.datamodules.fakes import FakeTrainer, Recorder, quiet
 from tests.datamodules.made import data
@@ -42,7 +42,7 @@ def test_memory_holds_only_the_index(store):
     assert all(isinstance(shard, np.memmap) for shard in mapped.part.maps.values())
     for batch in data(store, read_ahead=0).train_dataloader():
         assert batch.scenes == 8
-    assert all(np.shares_memory(shard, mapped._shard(number)) for number, shard in mapped.part.maps.items())
+    assert all(np.shares_memory(shard, mapped.shard(number)) for number, shard in mapped.part.maps.items())
 
 
 def test_a_rotation_comes_out_the_same_whatever_it_is_decoded_with(generator):
@@ -50,7 +50,7 @@ def test_a_rotation_comes_out_the_same_whatever_it_is_decoded_with(generator):
     stored = (SCALE * quat / quat.norm(dim=-1, keepdim=True)).round().to(torch.int16)
     whole = matrices(stored)
     assert torch.equal(whole[5:900], matrices(stored[5:900])) and torch.equal(whole[-1], matrices(stored[-1]))
-    assert torch.equal(whole.view(-1, 9), _nine_at_once(stored))  # what a GPU computes
+    assert torch.equal(whole.view(-1, 9), nine_at_once(stored))  # what a GPU computes
     unit = stored.double() / stored.double().norm(dim=-1, keepdim=True)
     torch.testing.assert_close(whole, roma.unitquat_to_rotmat(unit).float(), atol=6e-7, rtol=0)
     assert matrices(stored[:0]).shape == (0, 3, 3)

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.blending import go_on, hold
-from magnet.generation.conditioning import reach
+from magnet.generation.blending import freeze_after, spring_from_given
+from magnet.generation.conditioning import receptive_field
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Stage
 
 if TYPE_CHECKING:
-    from magnet.generation.world import Canvas
+    from magnet.generation.world import WorldState
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
@@ -74,34 +74,36 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
     return each[:, view_of, :, agent].permute(1, 2, 0, 3)
 
 
-def show(canvas: Canvas, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
+def finalize_bodies(
+    world: WorldState, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None
+) -> None:
     """Settle the bodies of rows up to `stop` for good: they are given from then on.
 
     Args:
-        canvas: where all rows before are shown.
+        world: where all rows before are shown.
         tokens: (B, N, P, D), of which rows up to `near` are looked at.
         stop: one past the last row to show.
         near: one past the last finished row, at least `stop`.
         expected: see `Expected.behind`, from row `near` on.
     """
-    frames = slice(canvas.shown * STRIDE, stop * STRIDE)
-    made = bodies(canvas, tokens, canvas.shown, stop, near, expected)
-    canvas.given.body_rot[:, frames] = made.body_rot
-    canvas.given.T_world_root[:, frames] = made.T_world_root
-    canvas.shown = stop
+    frames = slice(world.finalized * STRIDE, stop * STRIDE)
+    made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
+    world.given.body_rot[:, frames] = made.body_rot
+    world.given.T_world_root[:, frames] = made.T_world_root
+    world.finalized = stop
 
 
-def seen(canvas: Canvas, tokens: Tensor, first: int, stop: int) -> Scene:
+def finalized_bodies(world: WorldState, tokens: Tensor, first: int, stop: int) -> Scene:
     """Rows [first, stop) as they have been shown, and from there on as they would be."""
-    known = canvas.given.slice(first * STRIDE, max(min(canvas.shown, stop), first) * STRIDE)
-    if canvas.shown >= stop:
+    known = world.given.slice(first * STRIDE, max(min(world.finalized, stop), first) * STRIDE)
+    if world.finalized >= stop:
         return known
-    rest = bodies(canvas, tokens, max(canvas.shown, first), stop, stop)
+    rest = decode_bodies(world, tokens, max(world.finalized, first), stop, stop)
     return cat_time([known, rest]) if known.frames else rest
 
 
-def bodies(
-    canvas: Canvas,
+def decode_bodies(
+    world: WorldState,
     tokens: Tensor,
     first: int,
     stop: int,
@@ -109,32 +111,32 @@ def bodies(
     expected: tuple[Tensor, Tensor] | None = None,
 ) -> Scene:
     """Rows [first, stop) decoded from the tokens before `near` alone, as they go on from what was shown."""
-    model, options = canvas.model, canvas.options
+    model, options = world.model, world.options
     lead = LEAD if first else 0
-    low = max(first - bool(first) - reach(model)[0], 0)
-    latent, steps, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
+    low = max(first - bool(first) - receptive_field(model)[0], 0)
+    latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
     if expected is not None:
-        later, ways = continuation(canvas, latent, steps, expected)
-        latent, steps = torch.cat([latent, later], dim=1), torch.cat([steps, ways], dim=1)
+        later, ways = continuation(world, latent, deltas, expected)
+        latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * STRIDE - lead, stop * STRIDE)
-    features = model.tokenizer.decode(latent, canvas.given.betas, steps)
+    features = model.tokenizer.decode(latent, world.given.betas, deltas)
     features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
-    given, T_world_can = canvas.given.slice(frames.start, frames.stop), canvas.T_world_can[:, frames]
-    keep = canvas.by_frame(canvas.known[first:stop] & options.keep_given)
+    given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
+    keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
-        keep = torch.cat([canvas.by_frame(canvas.placed[first - 1 : first])[:lead], keep])
-    made = go_on(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
-    before = canvas.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
-    return hold(made, canvas.by_frame(canvas.placed[first:stop]), before)
+        keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
+    made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
+    before = world.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
+    return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
 
 
 def continuation(
-    canvas: Canvas, latent: Tensor, steps: Tensor, expected: tuple[Tensor, Tensor]
+    world: WorldState, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Latents and steps to decode behind the last ones; whoever nothing is expected of goes on as in the last token."""
+    """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
     tokens, told = expected
     told = told.to(latent.device)
-    later, ways, _ = canvas.model.layout.unpack(canvas.model.normalizer.denormalize(tokens))
+    later, ways, _ = world.model.layout.unpack(world.model.normalizer.denormalize(tokens))
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])
-    return later, torch.where(told[:, None, None], ways, steps[:, -1:])
+    return later, torch.where(told[:, None, None], ways, deltas[:, -1:])

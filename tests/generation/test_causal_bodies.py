@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from magnet.generation.conditioning import SamplerOptions, known_tokens, reach, scrub
-from magnet.generation.showing import Expected, bodies, own_view, show
-from magnet.generation.world import Canvas
+from magnet.generation.causal_bodies import Expected, decode_bodies, finalize_bodies, own_view
+from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, receptive_field
+from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, posed
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import LEVELS
@@ -29,13 +29,13 @@ def scene() -> Scene:
     return random_scene(2, 4 * TOKENS, 3, torch.Generator().manual_seed(3))
 
 
-def finished(model, scene: Scene, options: SamplerOptions) -> tuple[Canvas, torch.Tensor]:
-    """A canvas on which everybody is placed where they were, and their true tokens."""
+def finished(model, scene: Scene, options: SamplerOptions) -> tuple[WorldState, torch.Tensor]:
+    """A world in which everybody is placed where they were, and their true tokens."""
     schedule = MotionControl((0,)).schedule(Grid(TOKENS, 3, PAST, 2, 8, 2))
-    canvas = Canvas(model, scrub(scene, schedule.known), schedule, options, 1)
-    canvas.placed[:] = True
-    canvas.T_world_can = canonical_frame(scene.T_world_root)
-    return canvas, known_tokens(model, scene, torch.ones_like(schedule.known))
+    world = WorldState(model, mask_unknown(scene, schedule.known), schedule, options, 1)
+    world.placed[:] = True
+    world.T_world_can = canonical_frame(scene.T_world_root)
+    return world, known_tokens(model, scene, torch.ones_like(schedule.known))
 
 
 def same(a: Scene, b: Scene) -> bool:
@@ -45,10 +45,10 @@ def same(a: Scene, b: Scene) -> bool:
 @torch.no_grad()
 def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
     """As if the clip ended there."""
-    canvas, tokens = finished(model, scene, BARE)
-    made = bodies(canvas, tokens, 6, 8, 8)
-    latent, steps, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, :8]))
-    clip = posed(model.tokenizer.decode(latent, scene.betas, steps), canvas.T_world_can[:, :32], scene.slice(0, 32))
+    world, tokens = finished(model, scene, BARE)
+    made = decode_bodies(world, tokens, 6, 8, 8)
+    latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, :8]))
+    clip = posed(model.tokenizer.decode(latent, scene.betas, deltas), world.T_world_can[:, :32], scene.slice(0, 32))
     assert torch.allclose(made.body_rot, clip.body_rot[:, 24:], atol=1e-5)
     assert torch.allclose(made.T_world_root, clip.T_world_root[:, 24:], atol=1e-5)
 
@@ -56,36 +56,36 @@ def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
 @torch.no_grad()
 @pytest.mark.parametrize("options", [BARE, SamplerOptions(steps=2), SamplerOptions(steps=2, blend=3)], ids=str)
 def test_nothing_behind_a_block_reaches_its_bodies(model, scene, options):
-    canvas, tokens = finished(model, scene, options)
+    world, tokens = finished(model, scene, options)
     other, changed = finished(model, scene, options)
     changed[:, 8:] = 7.0
     other.given.T_world_root[:, 32:] += 3.0
     other.T_world_can[:, 32:] = torch.eye(4)
-    assert same(bodies(canvas, tokens, 6, 8, 8), bodies(other, changed, 6, 8, 8))
+    assert same(decode_bodies(world, tokens, 6, 8, 8), decode_bodies(other, changed, 6, 8, 8))
 
 
 @torch.no_grad()
 def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene):
-    canvas, tokens = finished(model, scene, BARE)
-    ahead = reach(model)[1]
+    world, tokens = finished(model, scene, BARE)
+    ahead = receptive_field(model)[1]
     behind = tokens[:, 8 : 8 + ahead], torch.ones(3, dtype=torch.bool)
-    expected = bodies(canvas, tokens, 6, 8, 8, behind)
-    known = bodies(canvas, tokens, 6, 8, 8 + ahead)
+    expected = decode_bodies(world, tokens, 6, 8, 8, behind)
+    known = decode_bodies(world, tokens, 6, 8, 8 + ahead)
     assert torch.allclose(expected.body_rot, known.body_rot, atol=1e-4)
-    assert not torch.allclose(bodies(canvas, tokens, 6, 8, 8).body_rot, known.body_rot, atol=1e-3)
+    assert not torch.allclose(decode_bodies(world, tokens, 6, 8, 8).body_rot, known.body_rot, atol=1e-3)
 
 
 @torch.no_grad()
 def test_what_has_been_shown_is_given_and_the_next_block_goes_on_from_there(model, scene):
-    canvas, tokens = finished(model, scene, SamplerOptions(steps=2))
-    show(canvas, tokens, 6, 6, None)
-    first = canvas.given.slice(0, 24)
+    world, tokens = finished(model, scene, SamplerOptions(steps=2))
+    finalize_bodies(world, tokens, 6, 6, None)
+    first = world.given.slice(0, 24)
     first = first.replace(body_rot=first.body_rot.clone(), T_world_root=first.T_world_root.clone())
     tokens = tokens + 0.5 * torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1))
-    show(canvas, tokens, 7, 7, None)
-    assert same(canvas.given.slice(0, 24), first)
-    assert torch.equal(canvas.given.body_rot[:, :28, 1:], scene.body_rot[:, :28, 1:])  # given, as it was
-    step = canvas.given.T_world_root[:, :28, 0, :3, 3].diff(dim=1).norm(dim=-1)
+    finalize_bodies(world, tokens, 7, 7, None)
+    assert same(world.given.slice(0, 24), first)
+    assert torch.equal(world.given.body_rot[:, :28, 1:], scene.body_rot[:, :28, 1:])  # given, as it was
+    step = world.given.T_world_root[:, :28, 0, :3, 3].diff(dim=1).norm(dim=-1)
     assert step[:, 23].max() < 2 * step[:, 16:23].max()
 
 

@@ -4,8 +4,15 @@ import pytest
 import torch
 
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import SamplerOptions, encodings, known_tokens, scrub, sight, task_sight
-from magnet.generation.world import Canvas
+from magnet.generation.conditioning import (
+    SamplerOptions,
+    encodings,
+    known_tokens,
+    lookahead_limit,
+    mask_unknown,
+    task_lookahead_limit,
+)
+from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
@@ -51,16 +58,16 @@ def replaced(scene: Scene, first: int, agent: int) -> Scene:
     return scene.replace(body_rot=body_rot, T_world_root=T_world_root)
 
 
-def sampled(model, scene: Scene, task: MotionControl) -> tuple[Canvas, torch.Tensor, torch.Tensor]:
-    """The canvas, its tokens, and those it began with."""
+def sampled(model, scene: Scene, task: MotionControl) -> tuple[WorldState, torch.Tensor, torch.Tensor]:
+    """The world, its tokens, and those it began with."""
     schedule = task.schedule(grid())
-    given = scrub(scene, schedule.known)
-    canvas = Canvas(model, given, schedule, FAST, 1)
-    start = known_tokens(model, given, schedule.known, cuts=task_sight(task, grid()))
+    given = mask_unknown(scene, schedule.known)
+    world = WorldState(model, given, schedule, FAST, 1)
+    start = known_tokens(model, given, schedule.known, limits=task_lookahead_limit(task, grid()))
     generator = torch.Generator().manual_seed(0)
     return (
-        canvas,
-        sample(model.denoise, schedule, start, given.present, model.layout, generator, canvas.make_consistent),
+        world,
+        sample(model.denoise, schedule, start, given.present, model.layout, generator, world.make_consistent),
         start,
     )
 
@@ -72,23 +79,23 @@ def sampled(model, scene: Scene, task: MotionControl) -> tuple[Canvas, torch.Ten
 @pytest.mark.parametrize("block", [1, 2, 3, 4, 8])
 def test_codes_look_to_the_end_of_their_block_and_before_it_to_where_it_begins(block, stride):
     """As they would live: what has been encoded once is not encoded anew."""
-    cuts = task_sight(MotionControl((1,), block), grid(stride))
+    limits = task_lookahead_limit(MotionControl((1,), block), grid(stride))
     row = torch.arange(TOKENS)
     end = torch.where(row < PAST, PAST, PAST + ((row - PAST) // block + 1) * block)
-    assert torch.equal(cuts[:, [0, 2]], end.clamp_max(TOKENS)[:, None].expand(-1, 2))
-    assert torch.equal(cuts[:, 1], cuts[:, 0])
+    assert torch.equal(limits[:, [0, 2]], end.clamp_max(TOKENS)[:, None].expand(-1, 2))
+    assert torch.equal(limits[:, 1], limits[:, 0])
     schedule = MotionControl((1,), block).schedule(grid(stride))
-    assert (cuts <= sight(schedule)).all()
+    assert (limits <= lookahead_limit(schedule)).all()
 
 
 @pytest.mark.parametrize("name", sorted({*registry.names()} - {"motion_control"}))
 def test_where_nothing_given_is_hidden_codes_look_to_the_end(name):
-    assert (task_sight(registry.get(name)(), grid()) == TOKENS).all()
+    assert (task_lookahead_limit(registry.get(name)(), grid()) == TOKENS).all()
 
 
 def test_every_row_that_is_wanted_is_encoded_once_with_all_that_its_code_depends_on():
-    cuts = torch.tensor([[0, 12], [4, 12], [4, 12], [4, 12], [6, 12], [6, 12], [9, 12], [9, 12], [9, 12], [12, 12]])
-    found = encodings(1, 10, [0, 1], cuts, 2)
+    limits = torch.tensor([[0, 12], [4, 12], [4, 12], [4, 12], [6, 12], [6, 12], [9, 12], [9, 12], [9, 12], [12, 12]])
+    found = encodings(1, 10, [0, 1], limits, 2)
     assert found == [(1, 1, 4, 4, [0]), (1, 4, 6, 6, [0]), (3, 6, 9, 9, [0]), (1, 9, 10, 10, [0]), (1, 1, 10, 10, [1])]
     assert encodings(1, 10, [0, 1], None, 2) == [(1, 1, 10, 10, [0, 1])]
     assert encodings(1, 10, [0], torch.zeros(10, 1, dtype=torch.long), 2) == []
@@ -96,19 +103,19 @@ def test_every_row_that_is_wanted_is_encoded_once_with_all_that_its_code_depends
 
 def test_codes_that_look_to_the_end_are_those_of_the_whole_stretch(model, recording):
     known = PartnerInpainting((0,)).schedule(grid()).known
-    given = scrub(recording, known)
-    cuts = torch.full_like(known, TOKENS, dtype=torch.long)
-    assert torch.equal(known_tokens(model, given, known), known_tokens(model, given, known, cuts=cuts))
+    given = mask_unknown(recording, known)
+    limits = torch.full_like(known, TOKENS, dtype=torch.long)
+    assert torch.equal(known_tokens(model, given, known), known_tokens(model, given, known, limits=limits))
 
 
 def test_codes_are_those_of_a_recording_that_ends_where_they_look_to(model, recording):
     task = MotionControl((0,), block=3)
     known = task.schedule(grid()).known
-    cuts = task_sight(task, grid())
-    tokens = known_tokens(model, scrub(recording, known), known, cuts=cuts)
+    limits = task_lookahead_limit(task, grid())
+    tokens = known_tokens(model, mask_unknown(recording, known), known, limits=limits)
     latent = model.layout.unpack(model.normalizer.denormalize(tokens))[0]
     for row in range(TOKENS):
-        live = model.encode(recording.slice(0, 4 * int(cuts[row, 1])))
+        live = model.encode(recording.slice(0, 4 * int(limits[row, 1])))
         assert torch.allclose(latent[:, row, 1:], live[:, row, 1:], atol=1e-5)
 
 
@@ -132,13 +139,13 @@ def test_what_the_given_do_after_a_block_changes_nothing_in_it(recording, block,
 def test_without_sight_the_encoder_would_leak(model, recording):
     """The law above can fail: this encoder looks ahead."""
     known = MotionControl((0,)).schedule(grid()).known
-    a, b = (known_tokens(model, scrub(s, known), known) for s in (recording, replaced(recording, 10, 1)))
+    a, b = (known_tokens(model, mask_unknown(s, known), known) for s in (recording, replaced(recording, 10, 1)))
     assert not torch.equal(a[:, :10, 1, : model.layout.latent], b[:, :10, 1, : model.layout.latent])
 
 
 @pytest.mark.parametrize("block", [1, 2, 4])
-@pytest.mark.parametrize("piece", [5, 64])
-def test_streams_do_not_leak_either(model, recording, block, piece):
+@pytest.mark.parametrize("chunk", [5, 64])
+def test_streams_do_not_leak_either(model, recording, block, chunk):
     end = PAST + 2 * block
     other = replaced(recording, end, 1)
     a, b = (
@@ -152,7 +159,7 @@ def test_streams_do_not_leak_either(model, recording, block, piece):
                     1,
                     FAST,
                     torch.Generator().manual_seed(0),
-                    piece=piece,
+                    chunk=chunk,
                 )
             )
         )

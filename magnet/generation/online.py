@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions, reach, scrub
+from magnet.generation.conditioning import SamplerOptions, mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
-from magnet.generation.rollout import PIECE, Generators, Stream
+from magnet.generation.rollout import CHUNK, Generators, Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from magnet.tasks.base import Task
 
 
-class FedStream(Stream):
+class OnlineRollout(Rollout):
     """A sample that goes on as far as it has been fed, bit for bit as if all had been given at once.
 
     Memory does not grow: what neither the model nor the decoder looks at any more is let go.
@@ -35,7 +35,7 @@ class FedStream(Stream):
             transforms that tell of people who are not known; or a past that `magnet.generation.inputs` refuses.
     """
 
-    fed = True
+    online = True
 
     def __init__(
         self,
@@ -52,14 +52,14 @@ class FedStream(Stream):
                 "that live; train with pairwise_noise='noisier_end'"
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
-        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, PIECE)
+        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
         self.there = past.frames // STRIDE
         self._advance()
 
     @property
     def made(self) -> int:
         """Rows whose bodies are final."""
-        return self.first + self.canvas.shown
+        return self.first + self.world.finalized
 
     def feed(self, frames: Scene) -> Scene:
         """The same frames with what the task generates in them, final.
@@ -87,7 +87,7 @@ class FedStream(Stream):
             for _ in self._ready(final):
                 pass
         made = self._decoded(begins, self.made, None, needed)
-        old = max(self.stop - reach(self.model)[0] - 1, 0) - self.base
+        old = max(self.stop - receptive_field(self.model)[0] - 1, 0) - self.base
         if old > 0:
             kept = self.scene.slice(old * STRIDE)
             self.scene = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
@@ -95,7 +95,7 @@ class FedStream(Stream):
         return made
 
     def _given(self, low: int, high: int) -> Scene:
-        return scrub(self.scene, self._known(self.base, high), low - self.base, high - self.base)
+        return mask_unknown(self.scene, self._known(self.base, high), low - self.base, high - self.base)
 
     def _known(self, first: int, stop: int) -> Tensor:
         """What is given after the context is given throughout."""

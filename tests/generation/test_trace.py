@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.recording import Recording, record
+from magnet.generation.trace import DenoisingTrace, record
 from magnet.sampling.guidance import Guidance
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.joint import JointFuture
@@ -62,7 +62,7 @@ def test_steps_may_be_left_out_but_not_the_last_of_a_window(model, start) -> Non
 
 def test_saved_and_read_back_it_is_the_same(model, start, tmp_path: Path) -> None:
     recording = record(model, start, JointFuture(), 16, 16, SamplerOptions(steps=2), generator())
-    again = Recording.load(recording.save(tmp_path / "steps"))
+    again = DenoisingTrace.load(recording.save(tmp_path / "steps"))
     assert torch.equal(again.levels, recording.levels)
     assert torch.equal(again.scene.body_rot, recording.scene.body_rot)
     torch.testing.assert_close(again.estimates.body_rot, recording.estimates.body_rot, atol=1e-3, rtol=0)
@@ -70,7 +70,7 @@ def test_saved_and_read_back_it_is_the_same(model, start, tmp_path: Path) -> Non
 
 def test_a_recording_says_what_was_given(model, start, tmp_path: Path) -> None:
     recording = record(model, start, PartnerPrediction(target=(1,)), 16, 16, SamplerOptions(steps=2), generator())
-    given = Recording.load(recording.save(tmp_path / "steps")).scene.given
+    given = DenoisingTrace.load(recording.save(tmp_path / "steps")).scene.given
     assert given is not None
     assert (
         given[0, :16].all() and given[0, 16:].any(dim=0).tolist() == recording.scene.given[0, 16:].any(dim=0).tolist()
@@ -85,7 +85,7 @@ def test_another_frame_rate_is_refused(start) -> None:
 
 def test_other_files_are_refused(tmp_path: Path, start) -> None:
     with pytest.raises(ValueError, match="not a recording"):
-        Recording.load(start.save(tmp_path / "scene.npz"))
+        DenoisingTrace.load(start.save(tmp_path / "scene.npz"))
     with pytest.raises(ValueError, match="got 2 scenes"):
         record(None, start.repeat(2), JointFuture(), 16, 16)  # type: ignore[arg-type]
 

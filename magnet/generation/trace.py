@@ -1,6 +1,6 @@
 """Samples recorded while they are denoised: what the model expected after each step, and how far each token was.
 
-`record` samples a task and keeps a `Recording`, one npz that the viewer plays.
+`record` samples a task and keeps a `DenoisingTrace`, one npz that the viewer plays.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch import Tensor
 
 from magnet.checks import require_whole
 from magnet.files import load_npz
-from magnet.generation.rollout import Stream
-from magnet.generation.showing import own_view
+from magnet.generation.causal_bodies import own_view
+from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS
@@ -27,14 +27,14 @@ from magnet.sampling.schedule import Stage, initial_levels
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
     from magnet.generation.conditioning import SamplerOptions
-    from magnet.generation.world import Canvas
+    from magnet.generation.world import WorldState
     from magnet.tasks.base import Task
 
 FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Recording:
+class DenoisingTrace:
     """A sample and its R recorded denoising steps.
 
     Attributes:
@@ -82,7 +82,7 @@ class Recording:
         return path
 
     @staticmethod
-    def load(path: str | Path) -> Recording:
+    def load(path: str | Path) -> DenoisingTrace:
         """Read what `save` wrote.
 
         Raises:
@@ -108,7 +108,7 @@ class Recording:
             estimates = scene.repeat(R).replace(
                 body_rot=arrays["estimate_body_rot"].float(), T_world_root=arrays["estimate_T_world_root"], names=()
             )
-            return Recording(scene, arrays["levels"], arrays["start"], estimates)
+            return DenoisingTrace(scene, arrays["levels"], arrays["start"], estimates)
         except (OSError, KeyError, ValueError, EOFError) as error:
             if isinstance(error, FileNotFoundError):
                 raise
@@ -127,7 +127,7 @@ def record(
     options: SamplerOptions | None = None,
     generator: torch.Generator | None = None,
     every: int = 1,
-) -> Recording:
+) -> DenoisingTrace:
     """Sample a task once (B = 1), as `Denoiser.generate` does, and keep what was expected after each step.
 
     Args:
@@ -141,9 +141,9 @@ def record(
     require_rate(scene)
     require_whole("frames", frames, 1)
     require_whole("every", every, 1)
-    stream = RecordedStream(model, scene, task, context, frames, options, generator, every)
+    stream = TracedRollout(model, scene, task, context, frames, options, generator, every)
     with torch.no_grad():
-        done = cat_time(list(stream.pieces())).to("cpu")
+        done = cat_time(list(stream.chunks())).to("cpu")
     slots = torch.arange(scene.agents)
     longest = max(window.frames for window in stream.windows)
     padded = [window.permute_agents(slots).pad_frames(longest) for window in stream.windows]
@@ -156,10 +156,10 @@ def record(
         names=(),
     )
     levels = torch.stack(stream.levels)[:, :, : scene.agents]
-    return Recording(finished, levels, torch.tensor(stream.starts), estimates)
+    return DenoisingTrace(finished, levels, torch.tensor(stream.starts), estimates)
 
 
-class RecordedStream(Stream):
+class TracedRollout(Rollout):
     """A sample in the making that keeps what the model expects after each denoising step."""
 
     def __init__(
@@ -173,7 +173,7 @@ class RecordedStream(Stream):
         generator: torch.Generator | None,
         every: int,
     ) -> None:
-        whole = -(-(context + frames) // STRIDE)  # one piece, so that no row is let go
+        whole = -(-(context + frames) // STRIDE)  # one chunk, so that no row is let go
         super().__init__(model, scene, task, context, frames, 1, options, generator, None, None, whole)
         self.every = every
         self.level = initial_levels(self.known)
@@ -205,21 +205,21 @@ class RecordedStream(Stream):
         self.starts.append(stage.start * STRIDE)
         wanted = stage.levels[-1] < LEVELS  # the others stay unknown
         self.windows.append(
-            preview(self.canvas, self.tokens, estimate, stage.start - self.first, wanted, stage.decentralized)
+            preview(self.world, self.tokens, estimate, stage.start - self.first, wanted, stage.decentralized)
         )
 
 
 def preview(
-    canvas: Canvas, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, decentralized: bool = False
+    world: WorldState, tokens: Tensor, estimate: Tensor, first: int, wanted: Tensor, decentralized: bool = False
 ) -> Scene:
-    """A window as the model expects it to end, placed in the world; the canvas stays as it is.
+    """A window as the model expects it to end, placed in the world; the world stays as it is.
 
     tokens (1, N, P, D), estimate (1, W, P, D) normalized, wanted (W, P) bool: ever to be generated; decentralized as
-    for `Canvas.make_consistent`. -> W frames
+    for `WorldState.make_consistent`. -> W frames
     """
-    shown = copy.copy(canvas)
-    shown.T_world_can, shown.placed = canvas.T_world_can.clone(), canvas.placed.clone()
-    shown.stats = type(canvas.stats)()
+    shown = copy.copy(world)
+    shown.T_world_can, shown.placed = world.T_world_can.clone(), world.placed.clone()
+    shown.stats = type(world.stats)()
     stop = first + estimate.shape[1]
     finished = torch.zeros_like(shown.placed)
     finished[first:stop] = ~shown.placed[first:stop] & wanted
