@@ -71,7 +71,9 @@ def wished_steps(changes: list[str]) -> dict[str, int]:
     for change in changes:
         stage, _, count = change.partition("=")
         if stage not in steps or not count.isdigit() or not int(count):
-            raise ValueError(f"--steps: got {change!r}, expected STAGE=N with a stage of {', '.join(STAGES)} and N over 0")
+            raise ValueError(
+                f"--steps: got {change!r}, expected STAGE=N with a stage of {', '.join(STAGES)} and N over 0"
+            )
         steps[stage] = int(count)
     return steps
 

@@ -31,7 +31,7 @@ def matmul_rate(device: torch.device, dtype: torch.dtype = torch.bfloat16, repea
 
 
 def step_operations(model: nn.Module, tokens: int) -> float:
-    """Operations of forward and backward through a model's trainable matrices, 6 for each of their numbers and token."""
+    """Operations of forward and backward through trainable matrices: 6 for each of their numbers and each token."""
     return 6.0 * tokens * sum(p.numel() for p in model.parameters() if p.requires_grad and p.dim() > 1)
 
 
@@ -51,19 +51,19 @@ class StepRate(Callback):
         self.every = every
         self.times: list[float] = []
         self.rate = 0.0
-        self._begun = 0.0
+        self._begun: float | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.rate = matmul_rate(pl_module.device)
         rank_zero_info(f"matrix products in bfloat16: {self.rate / 1e12:.2f} TFLOP/s on {_name(pl_module.device)}")
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        self._begun = _now(pl_module.device) if self._timed(trainer) else 0.0
+        self._begun = _now(pl_module.device) if self._timed(trainer) else None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if not self._begun:
+        if self._begun is None:
             return
         self.times.append(_now(pl_module.device) - self._begun)
         if trainer.global_step % self.every and trainer.global_step != trainer.max_steps:

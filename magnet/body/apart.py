@@ -1,0 +1,202 @@
+"""Moves people over the ground so far that their bodies no longer run through each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body.capsules import CAPSULES, capsule_segments
+
+ARMS = [capsule.name.endswith("arm") for capsule in CAPSULES]
+"""Capsules of arms: people hold, link arms and lay them around each other."""
+
+PELVIS = 0
+FARTHEST = 0.6
+"""Metres that two people are moved apart at most: nobody is thicker than that."""
+
+HALVINGS = 7
+"""Of `FARTHEST`, until the distance is known to half a centimetre."""
+
+BRIEF = 75
+"""Frames of an encounter, its approach and its end included, up to which it is one of people who pass each other."""
+
+SMOOTHED = 15
+"""Frames before and after over which the direction between two people is averaged."""
+
+
+@dataclass(frozen=True)
+class Apart:
+    """How people are kept apart.
+
+    Args:
+        body: depth in metres that trunks, heads and legs may have in each other.
+        arms: the same where an arm is one of the two. Arm on arm may be as deep as it likes.
+        ease: frames before and after a collision over which people make way, in two halves.
+        speed: metres a second at which anybody is pushed at most where the motion goes on from a past that stays.
+        rounds: how often all pairs are gone through; more than one matters from three people on.
+    """
+
+    body: float = 0.03
+    arms: float = 0.05
+    ease: int = 8
+    speed: float = 0.3
+    rounds: int = 2
+
+
+def nearest_points(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """The points of the segments a-b and c-d that are nearest to each other. (..., 3) x 4 -> (..., 3) x 2
+
+    >>> a, b = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+    >>> c, d = torch.tensor([2.0, 1.0, 0.0]), torch.tensor([2.0, 3.0, 0.0])
+    >>> nearest_points(a, b, c, d)
+    (tensor([1., 0., 0.]), tensor([2., 1., 0.]))
+    """
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    determinant = uu * vv - uv * uv
+    crossing = determinant > 1e-9 * uu * vv
+    s = torch.where(crossing, (uv * vw - vv * uw) / torch.where(crossing, determinant, 1.0), 0.0).clamp(0, 1)
+    t = ((uv * s + vw) / vv.clamp_min(1e-12)).clamp(0, 1)
+    s = ((uv * t - uw) / uu.clamp_min(1e-12)).clamp(0, 1)
+    return a + s[..., None] * u, c + t[..., None] * v
+
+
+def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
+    """How much deeper two bodies are in each other than they may be; below 0 what is still to spare.
+
+    joints (..., 22, 3) in the world x 2 -> (...) metres, of the capsules that are worst
+    """
+    a, b, radius = capsule_segments(one)
+    c, d, _ = capsule_segments(other)
+    first, second = nearest_points(a[..., :, None, :], b[..., :, None, :], c[..., None, :, :], d[..., None, :, :])
+    arm = torch.tensor(ARMS, device=one.device)
+    allowed = torch.where(arm[:, None] | arm, keep.arms, keep.body)
+    depth = radius[:, None] + radius - (first - second).norm(dim=-1) - allowed
+    return torch.where(arm[:, None] & arm, -torch.inf, depth).amax(dim=(-1, -2))
+
+
+def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
+    """Ground direction in which one may leave the other, of unit length.
+
+    It leads from the other's pelvis to one's, smoothed over time. People who meet for a moment pass each other, and from
+    one frame to the next are on the other side: they get one direction for the whole encounter, its mean, so that they
+    step aside.
+
+    Args:
+        one: (B, T, 22, 3) joints in the world.
+        other: the same.
+        near: (B, T) bool, frames of encounters.
+
+    Returns:
+        (B, T, 2)
+    """
+    between = (one - other)[:, :, PELVIS, [0, 2]]
+    padded = F.pad(between.transpose(1, 2), (SMOOTHED, SMOOTHED), mode="replicate")
+    smooth = F.avg_pool1d(padded, 2 * SMOOTHED + 1, stride=1).transpose(1, 2)
+    begins = near & ~F.pad(near, (1, 0))[:, :-1]
+    encounter = (begins.cumsum(dim=1) * near)[..., None]  # its number, 0 outside
+    most = int(encounter.max()) + 1
+    frames = (
+        torch.zeros_like(between[:, :1, :1]).expand(-1, most, 1).scatter_add(1, encounter, near[..., None].to(between))
+    )
+    total = torch.zeros_like(between[:, :1]).expand(-1, most, 2)
+    total = total.scatter_add(1, encounter.expand_as(between), between * near[..., None])
+    brief = (near[..., None] & (frames <= BRIEF)[:, :, 0].gather(1, encounter[..., 0])[..., None]).expand_as(between)
+    smooth = torch.where(brief, (total / frames.clamp_min(1)).gather(1, encounter.expand_as(between)), smooth)
+    length = smooth.norm(dim=-1, keepdim=True)
+    sideways = torch.zeros_like(smooth)
+    sideways[..., 0] = 1.0
+    return torch.where(length > 1e-6, smooth / length.clamp_min(1e-6), sideways)
+
+
+def distance_needed(one: Tensor, other: Tensor, away: Tensor, keep: Apart) -> Tensor:
+    """How far one body must move along a ground direction until it is out of the other, frame by frame.
+
+    joints (n, 22, 3) x 2, away (n, 2) of unit length -> (n,) metres, 0 where nothing is in the way
+    """
+    needed = one.new_zeros(len(one))
+    stuck = (excess_depth(one, other, keep) > 0).nonzero()[:, 0]
+    if not len(stuck):
+        return needed
+    one, other, way = one[stuck], other[stuck], lifted(away[stuck])[:, None]
+    near, far = one.new_zeros(len(stuck)), one.new_full((len(stuck),), FARTHEST)
+    for _ in range(HALVINGS):
+        middle = (near + far) / 2
+        inside = excess_depth(one + middle[:, None, None] * way, other, keep) > 0
+        near, far = torch.where(inside, middle, near), torch.where(inside, far, middle)
+    needed[stuck] = far
+    return needed
+
+
+def widened(mask: Tensor, frames: int) -> Tensor:
+    """True as well so many frames before and after. (B, T) bool -> (B, T) bool"""
+    return F.max_pool1d(F.pad(mask.float(), (frames, frames))[:, None], 2 * frames + 1, stride=1)[:, 0] > 0
+
+
+def eased(needed: Tensor, ease: int) -> Tensor:
+    """A smooth distance that is never less than what is needed. (B, T) -> (B, T)"""
+    width = 2 * ease + 1
+    most = F.max_pool1d(F.pad(needed, (ease, ease))[:, None], width, stride=1)
+    return F.avg_pool1d(F.pad(most, (ease, ease), mode="replicate"), width, stride=1)[:, 0]
+
+
+def kept_apart(
+    joints: Tensor,
+    present: Tensor,
+    fixed: Tensor | None = None,
+    keep: Apart | None = None,
+    begun: bool = False,
+    fps: float = 30.0,
+) -> Tensor:
+    """Ground offsets that keep people out of each other; where nobody is in anybody's way, exactly 0.
+
+    Two people make way along the line between them, half each, or he alone who may be moved.
+
+    Args:
+        joints: (B, T, P, 22, 3) in the world, metres.
+        present: (B, P) bool.
+        fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
+        keep: depths and times.
+        begun: the motion goes on from a past that stays where it is, so that offsets grow from 0.
+        fps: frames a second.
+
+    Returns:
+        (B, T, P, 2) metres along x and z.
+    """
+    keep = keep or Apart()
+    B, T, P = joints.shape[:3]
+    offsets = joints.new_zeros(B, T, P, 2)
+    free = present[:, None].expand(B, T, P).clone()
+    if fixed is not None:
+        free &= ~fixed.to(joints.device)
+    for _ in range(keep.rounds if P > 2 else 1):
+        moved = joints + lifted(offsets)[..., None, :]
+        for i, j in combinations(range(P), 2):
+            one, other = moved[:, :, i], moved[:, :, j]
+            inside = (excess_depth(one, other, keep) > 0) & (present[:, i] & present[:, j])[:, None]
+            if not bool(inside.any()):
+                continue
+            away = direction(one, other, widened(inside, 2 * keep.ease))
+            needed = distance_needed(*(x.flatten(0, 1) for x in (one, other, away)), keep).view(B, T)
+            movable = free[:, :, i].int() + free[:, :, j].int()
+            needed = eased(
+                torch.where((present[:, i] & present[:, j])[:, None] & (movable > 0), needed, 0.0), keep.ease
+            )
+            if begun:
+                ramp = keep.speed / fps * torch.arange(1, T + 1, device=joints.device, dtype=joints.dtype)
+                needed = torch.minimum(needed, ramp * movable)
+            push = (needed / movable.clamp_min(1))[..., None] * away
+            offsets[:, :, i] += torch.where(free[:, :, i, None], push, 0.0)
+            offsets[:, :, j] -= torch.where(free[:, :, j, None], push, 0.0)
+    return offsets
+
+
+def lifted(ground: Tensor) -> Tensor:
+    """Ground vectors as vectors in the world. (..., 2) -> (..., 3)"""
+    x, z = ground.unbind(-1)
+    return torch.stack([x, torch.zeros_like(x), z], dim=-1)
