@@ -233,7 +233,7 @@ def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
 def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(copy, capsys):
     file = min((copy / "dl").rglob("*_00.npy"))
     file.write_bytes(file.read_bytes()[:100])
-    assert cli.main(["data", "check", "dl", "--picture", "none", "--body", "dl/body.npz"]) == 1
+    assert cli.main(["data", "check", "dl", "--picture", "none", "--workers", "1", "--body", "dl/body.npz"]) == 1
     said = capsys.readouterr()
     assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out
 
