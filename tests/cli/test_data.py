@@ -147,7 +147,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("check nowhere", "is not a folder"),
         ("check empty", "neither a prepared store nor a download"),
         ("fake dd100 dl", "is not empty"),
-        ("prepare cmu --root dl --out o", "cmu has no files to prepare"),
+        ("prepare synthetic --root dl --out o", "synthetic has no files to prepare"),
         ("fake dd100", "out is missing"),
         ("fake dd100 new --takes 0", "takes: got 0"),
         ("fake cmu new --frames 0", "frames: got 0"),
