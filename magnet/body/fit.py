@@ -26,7 +26,7 @@ TORSO, CHEST, PELVIS = (0, 1, 2, 3, 6, 9, 12, 16, 17), (9, 12, 13, 14, 16, 17), 
 
 
 @dataclass(frozen=True)
-class Fit:
+class BodyFit:
     """A fitted scene (B = 1) and how far its joints are from the targets."""
 
     scene: Scene
@@ -98,7 +98,7 @@ def fit_body(
     refuse_above: float = 0.04,
     settings: FitSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Fit:
+) -> BodyFit:
     """Poses and shapes of `body` whose joints lie at the targets.
 
     Args:
@@ -153,7 +153,7 @@ def fit_body(
     )
     residual = (body.joints(scene)[0][:, :, list(joints)] - targets).norm(dim=-1)
     _refuse_bad(residual, weights > 0, joints, refuse_above)
-    return Fit(scene, residual)
+    return BodyFit(scene, residual)
 
 
 def _refuse_bad(residual: Tensor, counts: Tensor, joints: Sequence[int], refuse_above: float) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.family import title
-from magnet.body.fit import Fit, fit_body, floor_height
+from magnet.body.fit import BodyFit, fit_body, floor_height
 from magnet.datamodules.clip import Clip, Split
 from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
@@ -261,7 +261,7 @@ def fit_positions(
     body: Body,
     up: Axis = "+y",
     progress: Callable[[int, int], None] | None = None,
-) -> Fit:
+) -> BodyFit:
     """A body fitted to a recording's positions and to the rotations that it may know.
 
     Args:

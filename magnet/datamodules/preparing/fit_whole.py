@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.fit import Fit, floor_height
+from magnet.body.fit import BodyFit, floor_height
 from magnet.datamodules.preparing.canonicalize import fit_positions
 from magnet.datamodules.reading.asf_amc import AmcRecording
 from magnet.datamodules.reading.cmu_glitches import Glitches
@@ -29,7 +29,7 @@ HELD = 0.20
 class Fitted:
     """A take as a scene, and the numbers for its report."""
 
-    fit: Fit
+    fit: BodyFit
     glitches: tuple[Glitches, ...]
     limb_error: float  # metres, mean over limb joints, valid frames and people
     wrist_error: float  # the same over both wrists
@@ -76,7 +76,7 @@ def fit_whole(
     wrists = [joints.index(20), joints.index(21)]
     recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, 20:22]))
     return Fitted(
-        fit=Fit(scene, fit.residual),
+        fit=BodyFit(scene, fit.residual),
         glitches=glitches,
         limb_error=float(fit.residual[good][:, limbs].mean()),
         wrist_error=float(fit.residual[good][:, wrists].mean()),
