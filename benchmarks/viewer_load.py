@@ -27,7 +27,7 @@ from magnet.export.page.rig import VIEWS, Style
 from magnet.export.page.takes import take
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
-from magnet.viewer.troupe import Look
+from magnet.viewer.scene_view import RenderOptions
 from magnet.viewer.watch import Viewer
 
 FLAGS = (
@@ -139,9 +139,9 @@ def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Style) ->
     """One line of the table."""
     before = memory()
     rich = asked.marks
-    look = Look(style="skeleton", trails=rich, contacts=rich, collisions=rich, shadows=asked.shadows)
-    viewer = Viewer([take("crowd", scene)], body, port=0, look=look)
-    viewer.dress(dataclasses.replace(look, style=style))
+    render = RenderOptions(style="skeleton", trails=rich, contacts=rich, collisions=rich, shadows=asked.shadows)
+    viewer = Viewer([take("crowd", scene)], body, port=0, render=render)
+    viewer.set_style(dataclasses.replace(render, style=style))
     listener = Listener(viewer.port)
     listener.start()
     begun, packets, cpu = listener.quiet(), listener.packets, time.process_time()

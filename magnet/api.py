@@ -151,7 +151,7 @@ class Motion(Scene):
         whole = (self.given | ~self.present[:, None]).all(dim=0).all(dim=1)
         return int(whole.long().cumprod(dim=0).sum())
 
-    def show(self, scene: int | None = None, player: Player = "page", **options: Any) -> Shown:
+    def show(self, scene: int | None = None, player: Player = "page", **options: Any) -> NotebookView:
         """Something a notebook plays inline.
 
         Args:
@@ -169,14 +169,14 @@ class Motion(Scene):
             if player == "film":
                 options = {"style": "skeleton", "fps": 15.0, **options}
             path = shown.save(Path(folder) / f"scene{kind}", **options)
-            return Shown(path.read_bytes(), kind)
+            return NotebookView(path.read_bytes(), kind)
 
     def _body(self) -> Body:
         return self.model or load_body("open")
 
 
 @dataclass(frozen=True, repr=False)
-class Shown:
+class NotebookView:
     """A page or a film: notebooks play it inline, elsewhere `save` it."""
 
     data: bytes

@@ -22,16 +22,16 @@ SMALLEST = 1e-3
 """Deviation under which a number counts as constant: z-scoring must not blow up rounding."""
 
 
-class Look(NamedTuple):
+class ContextFeatures(NamedTuple):
     """What is compared of a stretch's beginning."""
 
     own: Tensor  # (M, P, K): of each agent
     pair: Tensor  # (M, P, P, K'): of each agent and partner, 0 on the diagonal
 
-    def seated(self, slots: Tensor) -> Look:
+    def in_slots(self, slots: Tensor) -> ContextFeatures:
         """Of some agents only. slots: (M, n) int"""
         rows = torch.arange(len(slots), device=slots.device)[:, None]
-        return Look(self.own[rows, slots], self.pair[rows[..., None], slots[:, :, None], slots[:, None, :]])
+        return ContextFeatures(self.own[rows, slots], self.pair[rows[..., None], slots[:, :, None], slots[:, None, :]])
 
 
 class NearestNeighbour(Retrieval):
@@ -48,8 +48,8 @@ class NearestNeighbour(Retrieval):
     def __init__(self, train: Scene, aligned: bool = True) -> None:
         super().__init__(train, aligned)
         self._frames = 0
-        self._looks = Look(torch.empty(0), torch.empty(0))
-        self._scales = Look(torch.empty(0), torch.empty(0))
+        self._features = ContextFeatures(torch.empty(0), torch.empty(0))
+        self._scales = ContextFeatures(torch.empty(0), torch.empty(0))
 
     def __call__(
         self, context: Scene, horizon: int, samples: int = 1, generator: torch.Generator | None = None
@@ -69,12 +69,13 @@ class NearestNeighbour(Retrieval):
         for n in sorted(set(people.tolist())):
             for scenes in (people == n).nonzero()[:, 0].split(QUERIES):
                 here = present[scenes].nonzero()[:, 1].view(len(scenes), n)
-                look = _look(context.select(scenes.to(context.device)).to(self.train.device))
-                query = Look(look.own * self._scales.own, look.pair * self._scales.pair).seated(here)
+                features = context_features(context.select(scenes.to(context.device)).to(self.train.device))
+                scaled = ContextFeatures(features.own * self._scales.own, features.pair * self._scales.pair)
+                query = scaled.in_slots(here)
                 chosen[scenes], slots[scenes[:, None], here] = self._search(query, self.candidates(n))
         return chosen, slots
 
-    def _search(self, query: Look, among: Tensor) -> tuple[Tensor, Tensor]:
+    def _search(self, query: ContextFeatures, among: Tensor) -> tuple[Tensor, Tensor]:
         """The nearest stretch, and the slots that play the query's people. Query of n agents -> (Q,), (Q, n) int"""
         Q, n = query.own.shape[:2]
         everyone = torch.arange(n, device=among.device)
@@ -84,7 +85,7 @@ class NearestNeighbour(Retrieval):
         slots = everyone.repeat(Q, 1)
         for part in among.split(CHUNK):
             seats = self.train.present[part].nonzero()[:, 1].view(len(part), n)
-            found = Look(self._looks.own[part], self._looks.pair[part]).seated(seats)
+            found = ContextFeatures(self._features.own[part], self._features.pair[part]).in_slots(seats)
             own = _squares(query.own.flatten(0, 1), found.own.flatten(0, 1)).view(Q, n, len(part), n)
             pair = _squares(query.pair.flatten(0, 2), found.pair.flatten(0, 2)).view(Q, n, n, len(part), n, n)
             cost = torch.empty(Q, len(part), len(orders), dtype=torch.float64, device=among.device)
@@ -104,19 +105,19 @@ class NearestNeighbour(Retrieval):
         if frames == self._frames:
             return
         begin = self.train.slice(0, frames)
-        looks = [_look(begin.select(slice(i, i + CHUNK))) for i in range(0, begin.scenes, CHUNK)]
-        own, pair = torch.cat([look.own for look in looks]), torch.cat([look.pair for look in looks])
+        features = [context_features(begin.select(slice(i, i + CHUNK))) for i in range(0, begin.scenes, CHUNK)]
+        own, pair = torch.cat([each.own for each in features]), torch.cat([each.pair for each in features])
         present = self.train.present
         other = ~torch.eye(self.train.agents, dtype=torch.bool, device=present.device)
         both = present[:, :, None] & present[:, None, :] & other
         steps = (frames + STRIDE - 1) // STRIDE
         own_weights = torch.cat([torch.full((135,), 135**-0.5), torch.full((9,), 9**-0.5)]).repeat(steps)
-        self._scales = Look(own_weights.to(own) / _deviation(own, present), 9**-0.5 / _deviation(pair, both))
-        self._looks = Look(own.mul_(self._scales.own), pair.mul_(self._scales.pair))
+        self._scales = ContextFeatures(own_weights.to(own) / _deviation(own, present), 9**-0.5 / _deviation(pair, both))
+        self._features = ContextFeatures(own.mul_(self._scales.own), pair.mul_(self._scales.pair))
         self._frames = frames
 
 
-def _look(begin: Scene) -> Look:
+def context_features(begin: Scene) -> ContextFeatures:
     """(M, T, P) scene -> (M, P, N * 144), (M, P, P, N * 9), N compared frames"""
     back = torch.arange(begin.frames - 1, -1, -STRIDE, device=begin.device).flip(0)
     T_world_can = canonical_frame(begin.T_world_root)
@@ -128,7 +129,7 @@ def _look(begin: Scene) -> Look:
     if agents > 1:
         self_ = torch.arange(agents, device=begin.device)[:, None]
         pair[:, :, self_, partners(agents, begin.device)] = to_9d(pairwise(T_world_can[:, back]))
-    return Look(own.transpose(1, 2).flatten(2), pair.permute(0, 2, 3, 1, 4).flatten(3))
+    return ContextFeatures(own.transpose(1, 2).flatten(2), pair.permute(0, 2, 3, 1, 4).flatten(3))
 
 
 def _deviation(values: Tensor, counts: Tensor) -> Tensor:

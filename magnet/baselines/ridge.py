@@ -33,7 +33,7 @@ CHUNK = 64
 """Windows whose joints are held together, to bound memory."""
 
 
-class Fit(NamedTuple):
+class RidgeFit(NamedTuple):
     """A linear function of features x (D,): offset + (x - mean) @ weights."""
 
     mean: Tensor  # (D,)
@@ -64,7 +64,7 @@ class RidgeRegression:
                 "expected at least 1 each"
             )
         self.train = train
-        self._fits: dict[int, Fit] = {}
+        self._fits: dict[int, RidgeFit] = {}
 
     def __call__(self, context: Scene, horizon: int) -> Tensor:
         """Joints in the context's world, 0 where nobody is. -> (B, horizon, P, 22, 3)
@@ -97,7 +97,7 @@ class RidgeRegression:
             answer[scenes[:, None], :, slots] = made.to(answer)
         return answer
 
-    def fit(self, people: int) -> Fit:
+    def fit(self, people: int) -> RidgeFit:
         """The regression for so many people.
 
         Raises:
@@ -109,7 +109,7 @@ class RidgeRegression:
 
     # -- fitting -------------------------------------------------------------------------------
 
-    def _fitted(self, people: int) -> Fit:
+    def _fitted(self, people: int) -> RidgeFit:
         windows, horizon = self.train.of_people(people), self.train.horizon
         if not len(windows):
             have = sorted(set(self.train.present.sum(dim=1).tolist()) - {0})
@@ -131,7 +131,7 @@ class RidgeRegression:
         penalty = torch.tensor(PENALTIES, dtype=torch.float64)[best[nearest]].to(windows.device)
         everything = self._sums(windows, people, torch.arange(horizon))
         weights = everything.spectrum().weights(penalty.repeat_interleave(everything.xy.shape[1] // horizon))
-        return Fit(everything.mean_x, everything.mean_y, weights, penalty)
+        return RidgeFit(everything.mean_x, everything.mean_y, weights, penalty)
 
     def fold_numbers(self, windows: Tensor) -> Tensor:
         """Which fold each window is left out in: by recording, or runs of windows of the only one. (m,) int"""

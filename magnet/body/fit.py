@@ -26,7 +26,7 @@ TORSO, CHEST, PELVIS = (0, 1, 2, 3, 6, 9, 12, 16, 17), (9, 12, 13, 14, 16, 17), 
 
 
 @dataclass(frozen=True)
-class Fit:
+class BodyFit:
     """A fitted scene (B = 1) and how far its joints are from the targets."""
 
     scene: Scene
@@ -98,7 +98,7 @@ def fit_body(
     refuse_above: float = 0.04,
     settings: FitSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Fit:
+) -> BodyFit:
     """Poses and shapes of `body` whose joints lie at the targets.
 
     Args:
@@ -120,9 +120,8 @@ def fit_body(
     valid = _checked(targets, joints, rotations, valid)
     T, P, M = targets.shape[:3]
     targets = targets.float()
-    if weights is None:
-        weights = torch.ones(M, device=targets.device)
-    weights = weights.to(targets).expand(T, P, M) * valid[..., None]
+    weights = torch.ones(M, device=targets.device) if weights is None else weights.to(targets)
+    weights = weights.expand(T, P, M) * valid[..., None]
     hints = None if rotations is None else rotations.to(targets)
     fit_shape = betas is None
     total = settings.steps + (settings.shape_steps if fit_shape or grounded else 0)
@@ -134,17 +133,15 @@ def fit_body(
         # An even choice of frames is enough for ten numbers and a height, and far cheaper than all of them.
         good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
         some = good[torch.linspace(0, len(good) - 1, min(settings.shape_frames, len(good))).long()]
-        few = _Problem(
-            body, targets[some], joints, weights[some], None if hints is None else hints[some], settings, 0.0
-        )
+        near = None if hints is None else hints[some]
+        few = _Problem(body, targets[some], joints, weights[some], near, settings, 0.0)
         R, t, betas = few.solve(betas, settings.shape_steps, fit_shape, lambda done: tell(done, total))
         if grounded:
             found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
             floor = float(floor_height(found, body, betas).median())
     smooth = settings.smooth * (fps / 30.0) ** 4
     problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor)
-    done_before = total - settings.steps
-    R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(done_before + done, total))
+    R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(total - settings.steps + done, total))
     scene = Scene(
         body_rot=R[None, :, :, 1:],
         T_world_root=rigid(R[:, :, 0], t)[None],
@@ -155,7 +152,11 @@ def fit_body(
         valid=valid.all(dim=1)[None],
     )
     residual = (body.joints(scene)[0][:, :, list(joints)] - targets).norm(dim=-1)
-    counts = weights > 0
+    _refuse_bad(residual, weights > 0, joints, refuse_above)
+    return BodyFit(scene, residual)
+
+
+def _refuse_bad(residual: Tensor, counts: Tensor, joints: Sequence[int], refuse_above: float) -> None:
     mean = float(residual[counts].mean())
     if not mean <= refuse_above:
         worst = JOINT_NAMES[joints[int((residual * counts).sum(dim=(0, 1)).argmax())]]
@@ -163,7 +164,6 @@ def fit_body(
             f"the body fits with a mean error of {100 * mean:.1f} cm, expected at most {100 * refuse_above:.1f} cm; "
             f"worst is {worst}: check units (metres), the up axis (y) and which target is which joint"
         )
-    return Fit(scene, residual)
 
 
 def _checked(targets: Tensor, joints: Sequence[int], rotations: Tensor | None, valid: Tensor | None) -> Tensor:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli.data_list import add_list, run_list
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
-    bar,
     clips_by_people,
     file_bars,
     show_gaps,
@@ -231,10 +230,8 @@ def run_check(given: argparse.Namespace) -> int:
         found, body = checked_store(given, path)
     elif not path.is_dir():
         raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
-    elif (name := given.name or check.recognise(path)) == "cmu":
-        found, body = checked_cmu(given, path)
     else:
-        found, body = checked_download(given, name, path)
+        found, body = checked_download(given, given.name or check.recognise(path), path)
     show_splits(list(check.lines(found)), title=found.title)
     show_notes(found.notes)
     show_skipped(found.skipped)
@@ -251,32 +248,24 @@ def checked_store(given: argparse.Namespace, path: Path) -> tuple[CheckReport, B
     """What was found, and the body to draw."""
     from magnet.body import load_body
     from magnet.datamodules.preparing import check
+    from magnet.datamodules.preparing.progress import progress_bar
     from magnet.datamodules.store.reader import StoreReader
 
     refuse_unused(given, "a store, which is checked whole, as it was prepared,")
     body = load_body(given.body) if given.body != "open" else None
-    with bar() as tell:
+    with progress_bar() as tell:
         return check.check_store(StoreReader(path), body, tell), body
-
-
-def checked_cmu(given: argparse.Namespace, path: Path) -> tuple[CheckReport, Body]:
-    """What was found, and the body to draw."""
-    from magnet.datamodules.cmu import CMU
-    from magnet.datamodules.preparing import check
-
-    refuse_unused(given, "CMU's recordings, all of which are fitted once and kept,", "name")
-    data = CMU(str(path), body_model=given.body)
-    return check.check_cmu(data), data.body
 
 
 def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[CheckReport, Body]:
     """What was found, and the body to draw."""
     from magnet.datamodules.preparing import check
     from magnet.datamodules.preparing.prepare import read_splits
+    from magnet.datamodules.preparing.progress import progress_bar
 
     job = job_of(given, name, str(path))
     body, splits = job.body(), read_splits(given.splits) if given.splits else None
-    with bar() as tell:
+    with progress_bar() as tell:
         return check.check_download(job, given.workers, splits, given.limit, tell), body
 
 
@@ -295,6 +284,7 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import registry
     from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
+    from magnet.datamodules.preparing.progress import progress_bar
 
     if given.place and given.out and given.place != given.out:
         raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
@@ -302,7 +292,7 @@ def run_prepare(given: argparse.Namespace) -> int:
     name, root, out = needed(given, "name", "root", "out")
     job = job_of(given, name, root)
     splits = read_splits(given.splits) if given.splits else None
-    with bar() as tell:
+    with progress_bar() as tell:
         report = prepare(job, out, workers=given.workers, splits=splits, limit=given.limit, progress=tell)
     m = report.folder.manifest
     for line in job.reader().summary():
@@ -331,21 +321,16 @@ def run_fake(given: argparse.Namespace) -> int:
 
     name, out = needed(given, "name", "out")
     folder = Path(out).expanduser()
-    if name == "cmu":
-        from magnet.datamodules.fakes.cmu import write
-
-        then = f"train on it:\n  magnet fit --model Tokenizer --data CMU --data.root {folder}"
-    else:
-        write = registry.reader(name).write_fake
-        body = "" if name == "bvh" else f" --body {folder / 'body.npz'}"
-        then = f"prepare it:\n  magnet data prepare {name} --root {folder} --out STORE{body}"
+    kind = registry.reader(name)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
     at_least(1, takes=given.takes, frames=given.frames)
     with writing(folder, "choose another --out"):
-        write(folder, takes=given.takes, frames=given.frames, seed=given.seed)
+        kind.write_fake(folder, given.takes, given.frames, given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
-    print(f"{len(files)} files of a made-up {name} are in {folder}. To {then}")
+    body = f" --body {folder / 'body.npz'}" if (folder / "body.npz").is_file() else ""
+    print(f"{len(files)} files of a made-up {name} are in {folder}. To prepare it:")
+    print(f"  magnet data prepare {name} --root {folder} --out STORE{body}")
     return 0
 
 

@@ -83,31 +83,14 @@ def show_persons(groups: list[tuple[list[str], int]]) -> None:
         print(f"  ... and {len(groups) - PERSONS_SHOWN} more groups, all of them in the store's manifest.json")
 
 
-def on_a_terminal() -> dict[str, Any]:
-    """Options of a bar: elsewhere it would leave an empty line in front of what is said."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    return {"console": console, "transient": True, "disable": not console.is_terminal}
-
-
-@contextmanager
-def bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar with what is being done and how long it will take."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, **on_a_terminal()) as progress:
-        task = progress.add_task("", total=None)
-        yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)
-
-
 @contextmanager
 def file_bars() -> Iterator[Callable[[str, int, int | None], None]]:
     """A progress bar of the file that is being fetched."""
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
     columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TextColumn("{task.description}"))
+    from magnet.datamodules.preparing.progress import on_a_terminal
+
     with Progress(*columns, **on_a_terminal()) as progress:
         task = progress.add_task("", total=None)
         yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)

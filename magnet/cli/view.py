@@ -170,7 +170,7 @@ def _write_page(options: argparse.Namespace) -> int:
 def _watch(options: argparse.Namespace) -> Any:
     from magnet.export.page.takes import read_takes
     from magnet.viewer.server import free_port, require_viser
-    from magnet.viewer.watch import Viewer, first_look
+    from magnet.viewer.watch import Viewer, default_render_options
 
     require_viser()
     free_port(options.host, options.port)  # before reading, which may take long
@@ -179,8 +179,8 @@ def _watch(options: argparse.Namespace) -> Any:
         _record(options, takes[0].scene)
         takes, _ = read_takes([options.record], body, options.context)
     truth = _truth(options, body, takes[0].scene.fps)
-    look = first_look(takes, options.style, not options.no_shadows)
-    return Viewer(takes, body, truth, options.host, options.port, look)
+    render = default_render_options(takes, options.style, not options.no_shadows)
+    return Viewer(takes, body, truth, options.host, options.port, render)
 
 
 def _record(options: argparse.Namespace, scene: Any) -> None:
@@ -219,8 +219,8 @@ def _live(options: argparse.Namespace) -> Any:
     from magnet.denoiser.module import Denoiser
     from magnet.generation.live import Live
     from magnet.tasks import registry
-    from magnet.viewer.play import Playground
-    from magnet.viewer.troupe import Look
+    from magnet.viewer.live_app import LiveApp
+    from magnet.viewer.scene_view import RenderOptions
 
     registry.get(options.task)
     start = None
@@ -232,5 +232,5 @@ def _live(options: argparse.Namespace) -> Any:
     live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
     live.settings.task, live.settings.sampler = options.task, sampler_options(options)
     live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
-    look = Look(style=options.style or "body", shadows=not options.no_shadows)
-    return Playground(live, body, options.host, options.port, look)
+    render = RenderOptions(style=options.style or "body", shadows=not options.no_shadows)
+    return LiveApp(live, body, options.host, options.port, render)

@@ -19,10 +19,10 @@ from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.datamodules.registry import register_reader
-from magnet.datamodules.resample import resample_points, resample_rotations
 from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood
+from magnet.motion.resample import resample_points, resample_rotations
 from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm", "mm", "inch", "foot"]

@@ -19,7 +19,7 @@ from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.registry import register_reader
-from magnet.datamodules.resample import resample_points, resample_rotations, resample_valid
+from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
 

@@ -129,7 +129,7 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
         ]
     lengths = sorted({scene.frames for _, scene in pairs})
     if len(lengths) != 1 or lengths[0] == 0:
-        raise ValueError(f"got scenes of {lengths or 'no'} frames, expected one length; cut them with Scene.cut")
+        raise ValueError(f"got scenes of {lengths or 'no'} frames, expected one length; cut them with Scene.slice")
     return pairs
 
 

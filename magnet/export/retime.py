@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import roma
 import torch
 from torch import Tensor
 
 from magnet.motion.frames import rigid
+from magnet.motion.resample import slerp
 from magnet.motion.scene import Scene
 
 
@@ -56,9 +56,8 @@ def _slerp(rotation: Tensor, low: Tensor, high: Tensor, share: Tensor) -> Tensor
     if not bool(between.any()):
         return start
     first = start[:, between]
-    step = roma.rotmat_to_rotvec(first.transpose(-1, -2) @ rotation[:, high[between]])
-    part = share[between].reshape(1, -1, *[1] * (step.dim() - 2))
-    start[:, between] = first @ roma.rotvec_to_rotmat(step * part)
+    part = share[between].reshape(1, -1, *[1] * (first.dim() - 4))
+    start[:, between] = slerp(first, rotation[:, high[between]], part)
     return start
 
 

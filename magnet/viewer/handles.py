@@ -13,10 +13,10 @@ from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
 from magnet.motion.frames import canonical_frame
-from magnet.viewer.people import People, add_people
+from magnet.viewer.people import PeopleView, add_people
 
 if TYPE_CHECKING:
-    from magnet.viewer.play import Playground
+    from magnet.viewer.live_app import LiveApp
 
 NOBODY = "nobody"
 NO_KEYS = "no keyframe"
@@ -52,10 +52,10 @@ def people_names(slots: int) -> tuple[str, ...]:
 class Steering:
     """Whom to steer, and the handle of that person's goal."""
 
-    def __init__(self, playground: Playground) -> None:
-        self.playground, self.live = playground, playground.live
+    def __init__(self, app: LiveApp) -> None:
+        self.app, self.live = app, app.live
         self.handle: Any = None
-        gui = playground.server.gui
+        gui = app.server.gui
         with gui.add_folder("Steer"):
             slots = self.live.model.layout.agents
             self.who = gui.add_dropdown("whom", (NOBODY, *people_names(slots)), initial_value=NOBODY)
@@ -71,7 +71,7 @@ class Steering:
         agent = -1 if self.who.value == NOBODY else int(self.who.value.split()[1]) - 1
         if 0 <= agent < self.live.scene.agents:
             self.steer(agent)
-        self.playground.steered(agent)
+        self.app.steered(agent)
 
     def steer(self, agent: int) -> None:
         """Put a handle where somebody stands and heads, and let it be that person's goal."""
@@ -81,7 +81,7 @@ class Steering:
                 self.live.settings.goals = {agent: goal}
 
         goal = Goal.of(canonical_frame(self.live.scene.T_world_root[:, -1:])[0, 0, agent])
-        self.handle = floor_handle(self.playground.server, "/stage/goal", goal, moved)
+        self.handle = floor_handle(self.app.server, "/stage/goal", goal, moved)
         moved(goal)
 
     def nobody(self) -> None:
@@ -90,26 +90,26 @@ class Steering:
 
 
 @dataclass
-class Entry:
+class KeyframeRow:
     """A keyframe on the stage."""
 
     key: Keyframe
     handle: Any
-    statue: People
+    preview: PeopleView
 
     @property
     def label(self) -> str:
         return f"person {self.key.agent + 1} at {self.key.frame}"
 
 
-class Keys:
+class KeyframePanel:
     """Keyframes: added where the clock stands, dragged, moved in time, removed, and gone through by in-betweening."""
 
-    def __init__(self, playground: Playground) -> None:
-        self.playground, self.live = playground, playground.live
-        self.entries: list[Entry] = []
+    def __init__(self, app: LiveApp) -> None:
+        self.app, self.live = app, app.live
+        self.rows: list[KeyframeRow] = []
         self.made = 0
-        gui = playground.server.gui
+        gui = app.server.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
             self.of = gui.add_dropdown("of", people_names(self.live.model.layout.agents))
             self.pose = gui.add_number(
@@ -139,117 +139,117 @@ class Keys:
 
     def _add(self) -> None:
         agent, pose = int(self.of.value.split()[1]) - 1, int(self.pose.value)
-        self.add(keyframe(self.live.scene, agent, self.playground.clock.frame, None if pose == HERE else pose))
+        self.add(keyframe(self.live.scene, agent, self.app.clock.frame, None if pose == HERE else pose))
 
     def add(self, key: Keyframe) -> None:
         """Put a keyframe on the stage; one of the same person and frame makes room."""
-        for entry in self.entries:
-            if (entry.key.agent, entry.key.frame) == (key.agent, key.frame):
-                self._drop(entry)
+        for row in self.rows:
+            if (row.key.agent, row.key.frame) == (key.agent, key.frame):
+                self._drop(row)
         self.made += 1
-        server, name = self.playground.server, f"/stage/key_{self.made}"
+        server, name = self.app.server, f"/stage/key_{self.made}"
         scene = self.live.scene.slice(0, 1).permute_agents(key_slot(key))
-        statue = add_people(
-            server, f"{name}_pose", self.playground.body, scene, "skeleton", agent_colours((key.agent,)), opacity=0.55
+        preview = add_people(
+            server, f"{name}_pose", self.app.body, scene, "skeleton", agent_colours((key.agent,)), opacity=0.55
         )
-        entry = Entry(key, None, statue)
+        row = KeyframeRow(key, None, preview)
 
         def moved(goal: Goal) -> None:
-            self._change(entry, goal=goal)
+            self._change(row, goal=goal)
 
-        entry.handle = floor_handle(server, f"{name}_handle", key.goal, moved, scale=0.5)
-        self.entries.append(entry)
-        self._pose(entry)
-        self._listed(entry)
+        row.handle = floor_handle(server, f"{name}_handle", key.goal, moved, scale=0.5)
+        self.rows.append(row)
+        self._pose(row)
+        self._listed(row)
 
     def _remove(self) -> None:
-        entry = self._chosen()
-        if entry is None:
+        row = self._chosen()
+        if row is None:
             raise ValueError("no keyframe to remove")
-        self._drop(entry)
+        self._drop(row)
         self._listed()
 
     def clear(self) -> None:
         """Remove all."""
-        for entry in list(self.entries):
-            self._drop(entry)
+        for row in list(self.rows):
+            self._drop(row)
         self._listed()
 
-    def _drop(self, entry: Entry) -> None:
-        entry.handle.remove()
-        entry.statue.show(False)
-        self.entries = [each for each in self.entries if each is not entry]
+    def _drop(self, row: KeyframeRow) -> None:
+        row.handle.remove()
+        row.preview.show(False)
+        self.rows = [each for each in self.rows if each is not row]
 
     def _moved_in_time(self, event: Any) -> None:
-        entry = self._chosen()
-        if event.client_id is None or entry is None:  # by the panel itself
+        row = self._chosen()
+        if event.client_id is None or row is None:  # by the panel itself
             return
         frame = max(int(self.at.value), 0) // 4 * 4
-        taken = any(e is not entry and (e.key.agent, e.key.frame) == (entry.key.agent, frame) for e in self.entries)
-        if frame != entry.key.frame and not taken:
-            self._change(entry, frame=frame)
-            self._listed(entry)
+        taken = any(e is not row and (e.key.agent, e.key.frame) == (row.key.agent, frame) for e in self.rows)
+        if frame != row.key.frame and not taken:
+            self._change(row, frame=frame)
+            self._listed(row)
 
     def _generate(self) -> None:
         start = self.live.between_from()
-        last = max(entry.key.frame for entry in self.entries) + 4
+        last = max(row.key.frame for row in self.rows) + 4
         with self.live.lock:
             self.live.asked = True
         self.go.disabled = True
-        self.playground.say(f"in-betweening makes frames {start} to {last - 1} anew ...")
-        self.playground.worker.wake()
+        self.app.say(f"in-betweening makes frames {start} to {last - 1} anew ...")
+        self.app.worker.wake()
 
     # -- what is shown -------------------------------------------------------------------------
 
-    def _chosen(self) -> Entry | None:
-        return next((entry for entry in self.entries if entry.label == self.which.value), None)
+    def _chosen(self) -> KeyframeRow | None:
+        return next((row for row in self.rows if row.label == self.which.value), None)
 
-    def _change(self, entry: Entry, **changes: Any) -> None:
-        entry.key = dataclasses.replace(entry.key, **changes)
-        self._pose(entry)
+    def _change(self, row: KeyframeRow, **changes: Any) -> None:
+        row.key = dataclasses.replace(row.key, **changes)
+        self._pose(row)
         self._tell()
 
-    def _pose(self, entry: Entry) -> None:
-        """Stand the statue where the keyframe is."""
-        first = dataclasses.replace(entry.key, agent=0, frame=0)
-        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(entry.key)).pad_frames(4).slice(0, 4)
-        turns, places = bone_poses(self.playground.body, with_keyframes(scene, [first]).slice(0, 1))
-        with self.playground.server.atomic():
-            entry.statue.pose(turns[0], places[0])
+    def _pose(self, row: KeyframeRow) -> None:
+        """Put the preview where the keyframe is."""
+        first = dataclasses.replace(row.key, agent=0, frame=0)
+        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(row.key)).pad_frames(4).slice(0, 4)
+        turns, places = bone_poses(self.app.body, with_keyframes(scene, [first]).slice(0, 1))
+        with self.app.server.atomic():
+            row.preview.pose(turns[0], places[0])
 
-    def _listed(self, chosen: Entry | None = None) -> None:
+    def _listed(self, chosen: KeyframeRow | None = None) -> None:
         """Bring lists up to date, and choose a keyframe in them."""
-        self.entries.sort(key=lambda entry: (entry.key.frame, entry.key.agent))
-        chosen = chosen or (self.entries[-1] if self.entries else None)
-        self.which.options = tuple(entry.label for entry in self.entries) or (NO_KEYS,)
+        self.rows.sort(key=lambda row: (row.key.frame, row.key.agent))
+        chosen = chosen or (self.rows[-1] if self.rows else None)
+        self.which.options = tuple(row.label for row in self.rows) or (NO_KEYS,)
         self.which.value = NO_KEYS if chosen is None else chosen.label
         self._shown()
         self._tell()
 
     def _shown(self) -> None:
-        entry = self._chosen()
-        self.at.value = 0 if entry is None else entry.key.frame
+        row = self._chosen()
+        self.at.value = 0 if row is None else row.key.frame
 
     def _tell(self) -> None:
         """Hand the keyframes to the engine, and say how fast people must go to reach them."""
         with self.live.lock:
-            self.live.keys = [entry.key for entry in self.entries]
+            self.live.keys = [row.key for row in self.rows]
             try:
                 start, scene = self.live.between_from(), self.live.scene
                 needed = speeds(self.live.keys, scene, start - 1)
             except ValueError as error:
-                self.list.content = "" if not self.entries else f"**{error}**"
+                self.list.content = "" if not self.rows else f"**{error}**"
                 return
         lines = []
-        for entry in self.entries:
-            speed = needed[entry.key.agent, entry.key.frame]
-            text = f"{entry.label}: {entry.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
+        for row in self.rows:
+            speed = needed[row.key.agent, row.key.frame]
+            text = f"{row.label}: {row.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
             lines.append(f"**{text}: too far**" if speed > HURRIED else text)
         self.list.content = "  \n".join([*lines, f"from frame {start} on all is made anew"])
 
 
 def key_slot(key: Keyframe) -> Any:
-    """The keyframe's person alone, for `Scene.order`."""
+    """The keyframe's person alone, for `Scene.permute_agents`."""
     import torch
 
     return torch.tensor([key.agent])

@@ -26,7 +26,7 @@ Poser = Callable[[Array, Array], None]
 """Takes turns (22, 4) wxyz and places (22, 3) in metres."""
 
 
-class People(Protocol):
+class PeopleView(Protocol):
     """The P people of a take as they stand in the browser."""
 
     def pose(self, turns: Array, places: Array) -> None:
@@ -41,15 +41,15 @@ class People(Protocol):
 
 def add_people(
     server: Any, name: str, body: Body, scene: Scene, style: Style, colours: Colours, opacity: float | None = None
-) -> People:
+) -> PeopleView:
     """Put the people of a scene (B = 1) into the browser's scene below the node `name`."""
     if style in ("body", "light"):
-        return Skinned(server, name, rigs(body, scene.betas[0], style), colours, opacity)
+        return SkinnedPeople(server, name, rigs(body, scene.betas[0], style), colours, opacity)
     rest = body.rest_joints(scene.betas[0].float().cpu()).numpy()
-    return Jointed(server, name, rest, CAPSULES if style == "capsules" else STICKS, colours, opacity)
+    return LimbPeople(server, name, rest, CAPSULES if style == "capsules" else STICKS, colours, opacity)
 
 
-class Skinned:
+class SkinnedPeople:
     """One skinned mesh a person; of each frame only the poses of the bones are sent."""
 
     def __init__(self, server: Any, name: str, people: list[Rig], colours: Colours, opacity: float | None) -> None:
@@ -122,7 +122,7 @@ def quick_poser(mesh: Any) -> Poser | None:
     return pose
 
 
-class Jointed:
+class LimbPeople:
     """Everybody's same limb is one batch of tapered capsules: a frame costs two messages a limb for any crowd."""
 
     def __init__(

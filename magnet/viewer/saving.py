@@ -8,14 +8,14 @@ import zipfile
 from pathlib import Path
 
 from magnet.body.base import Body
-from magnet.export.page.takes import Take
+from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
 
 FORMATS = ("npz", "html", "glb", "bvh", "csv", "gif", "mp4", "png")
 """What a take can be saved as; see `magnet.export.formats.WRITTEN`."""
 
 
-def saved(take: Take, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
+def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
     """A take as a file: its suffix without the dot and its content. Several files, as one BVH a person, come as a zip.
 
     Raises:

@@ -6,14 +6,14 @@ from typing import Any
 
 from magnet.body.base import Body
 from magnet.export.page.rig import CROWD, Style, first_style
-from magnet.export.page.takes import Take, in_a_row, numbered, same_length
+from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length
+from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
 from magnet.viewer.levels import level_image
-from magnet.viewer.stage import Stage
-from magnet.viewer.troupe import Look, Troupe
+from magnet.viewer.scene_view import RenderOptions, SceneView
 
 
-class Viewer(Stage):
+class Viewer(ViewerBase):
     """Watch takes side by side.
 
     Args:
@@ -23,33 +23,33 @@ class Viewer(Stage):
 
     def __init__(
         self,
-        takes: list[Take],
+        takes: list[ShownTake],
         body: Body,
-        truth: Take | None = None,
+        truth: ShownTake | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
-        look: Look | None = None,
+        render: RenderOptions | None = None,
     ) -> None:
         takes = numbered(takes)
-        look = look or first_look(takes)
-        super().__init__(body, look, host, port, takes[0].label if len(takes) == 1 else "magnet")
+        render = render or default_render_options(takes)
+        super().__init__(body, render, host, port, takes[0].label if len(takes) == 1 else "magnet")
         self.clock = Clock(max(each.frames for each in takes), takes[0].scene.fps)
         with self.server.atomic():
             for each, offset in zip(takes, in_a_row(takes), strict=True):
                 ghost = None if truth is None else same_length(truth, each)
-                self.troupes.append(Troupe(self.server, "/stage", body, each, offset, self.look, ghost))
+                self.views.append(SceneView(self.server, "/stage", body, each, offset, self.render, ghost))
             self.frame_all()
             self.add_timeline()
             if any(each.recording is not None for each in takes):
                 self._add_denoising(next(i for i, each in enumerate(takes) if each.recording is not None))
-            self.add_looks(truth is not None)
+            self.add_render_controls(truth is not None)
             self.add_saving()
         self.draw()
 
     # -- denoising steps -----------------------------------------------------------------------
 
     def _add_denoising(self, index: int) -> None:
-        troupe, recording = self.troupes[index], self.troupes[index].take.recording
+        view, recording = self.views[index], self.views[index].take.recording
         assert recording is not None
         gui = self.server.gui
         with gui.add_folder("Denoising"):
@@ -61,7 +61,7 @@ class Viewer(Stage):
             at = int(step.value)
             with self.lock:
                 done = at >= recording.steps
-                troupe.estimate = None if done else recording.at(at)
+                view.estimate = None if done else recording.at(at)
                 self.shown = -1
             picture.image = level_image(recording, min(at, recording.steps - 1))
             text.content = "finished" if done else f"expected after step {at + 1} of {recording.steps}"
@@ -70,9 +70,9 @@ class Viewer(Stage):
         step.on_update(show)
 
 
-def first_look(takes: list[Take], style: Style | None = None, shadows: bool = True) -> Look:
+def default_render_options(takes: list[ShownTake], style: Style | None = None, shadows: bool = True) -> RenderOptions:
     """What is shown at first: of a crowd what is light, unless a style is asked for."""
     crowd = sum(len(each.slots) for each in takes) > CROWD
     style = style or first_style(sum(len(each.slots) for each in takes))
     rich = not crowd
-    return Look(style=style, trails=rich, contacts=rich, collisions=rich, shadows=shadows and rich)
+    return RenderOptions(style=style, trails=rich, contacts=rich, collisions=rich, shadows=shadows and rich)

@@ -147,7 +147,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("check nowhere", "is not a folder"),
         ("check empty", "neither a prepared store nor a download"),
         ("fake dd100 dl", "is not empty"),
-        ("prepare cmu --root dl --out o", "cmu has no files to prepare"),
+        ("prepare synthetic --root dl --out o", "synthetic has no files to prepare"),
         ("fake dd100", "out is missing"),
         ("fake dd100 new --takes 0", "takes: got 0"),
         ("fake cmu new --frames 0", "frames: got 0"),
@@ -233,7 +233,7 @@ def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
 def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(copy, capsys):
     file = min((copy / "dl").rglob("*_00.npy"))
     file.write_bytes(file.read_bytes()[:100])
-    assert cli.main(["data", "check", "dl", "--picture", "none", "--body", "dl/body.npz"]) == 1
+    assert cli.main(["data", "check", "dl", "--picture", "none", "--workers", "1", "--body", "dl/body.npz"]) == 1
     said = capsys.readouterr()
     assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out
 

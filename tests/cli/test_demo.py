@@ -1,5 +1,7 @@
 """The demo's shows, each at a few frames."""
 
+from pathlib import Path
+
 import pytest
 
 from magnet.cli import demo
@@ -10,19 +12,23 @@ from magnet.testing import tiny_denoiser
 
 
 @pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=4, window=16)
+def performed(tmp_path_factory) -> tuple[Path, dict[str, list[str]]]:
+    """The folder of all shows, and what was said of each."""
+    folder, model = tmp_path_factory.mktemp("demo"), tiny_denoiser(max_agents=4, window=16)
+    options = SamplerOptions(steps=4)
+    said = {show.name: demo.perform(show, model, Synthetic(), options, folder, minute=24) for show in demo.SHOWS}
+    return folder, said
 
 
 @pytest.mark.parametrize("show", demo.SHOWS, ids=lambda show: show.name)
-def test_a_show_writes_its_scene_a_strip_and_a_moving_picture(show, model, tmp_path):
-    lines = demo.perform(show, model, Synthetic(), SamplerOptions(steps=4), tmp_path, minute=24)
-    scene = Scene.load(tmp_path / f"{show.name}.npz")
+def test_a_show_writes_its_scene_a_strip_and_a_moving_picture(show, performed):
+    folder, said = performed
+    scene = Scene.load(folder / f"{show.name}.npz")
     assert scene.frames == show.context + 24
     assert int(scene.present.sum()) == show.scene[1]
-    assert (tmp_path / f"{show.name}.png").exists()
-    assert (tmp_path / f"{show.name}.gif").exists()
-    assert show.words in lines[0]
+    assert (folder / f"{show.name}.png").exists()
+    assert (folder / f"{show.name}.gif").exists()
+    assert show.words in said[show.name][0]
 
 
 def test_the_shows_are_what_a_newcomer_is_promised():
@@ -33,11 +39,8 @@ def test_the_shows_are_what_a_newcomer_is_promised():
     assert max(show.frames for show in demo.SHOWS) == 1800
 
 
-def test_the_pictures_tell_what_was_given(model, tmp_path):
-    given = {}
-    for show in demo.SHOWS:
-        demo.perform(show, model, Synthetic(), SamplerOptions(steps=4), tmp_path, minute=24)
-        given[show.name] = Scene.load(tmp_path / f"{show.name}.npz").given[0]
+def test_the_pictures_tell_what_was_given(performed):
+    given = {show.name: Scene.load(performed[0] / f"{show.name}.npz").given[0] for show in demo.SHOWS}
     assert given["duet"].sum() == 0
     assert given["joint_future"][:32, :3].all() and not given["joint_future"][32:].any()
     assert given["partner"][:, 1].all() and not given["partner"][:, 0].any()

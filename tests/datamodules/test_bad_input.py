@@ -237,7 +237,9 @@ in a user's folder anybody may be alone, or beside somebody who was recorded lon
 
 def test_every_kind_of_bad_input_is_tried_on_every_data_set() -> None:
     lacking = {(form, kind) for form, damages in DAMAGES.items() for kind in set(SAID) - set(damages)}
-    assert {form.split(",")[0] for form in DAMAGES} == set(registry.readers())
+    assert {form.split(",")[0] for form in DAMAGES} == set(registry.readers()) - {
+        "cmu"
+    }  # its files are tried in test_cmu.py
     assert lacking == LACKING
 
 

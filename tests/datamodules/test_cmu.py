@@ -12,10 +12,16 @@ import pytest
 import torch
 
 from magnet.datamodules import cmu
-from magnet.datamodules.cmu import CMU
+from magnet.datamodules.cmu import CMU, CMUReader, is_couple
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
+from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
+from magnet.datamodules.preparing.convert import PrepareJob
+from magnet.datamodules.preparing.fit_whole import fit_recordings, wrists_apart
+from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
-from magnet.datamodules.reading.cmu_fit import ENDS, check_rate, fit_recordings, wrists_apart
+from magnet.datamodules.reading.cmu_joints import ENDS, check_rate
+from magnet.datamodules.reading.recording import DataError
+from magnet.motion.scene import Scene
 from tests.datamodules.slow_cmu import slow_ends
 
 
@@ -66,7 +72,7 @@ def test_batches_come_out(filled: CMU) -> None:
 
 def test_a_filled_cache_is_read_and_not_made_again(filled: CMU, monkeypatch: pytest.MonkeyPatch) -> None:
     again = CMU(filled.root, filled.cache, max_agents=2)
-    monkeypatch.setattr(cmu, "fit_take", None)
+    monkeypatch.setattr(cmu, "fit_whole", None)
     again.prepare_data()
     for ours, theirs in zip(again.clips("train"), filled.clips("train"), strict=True):
         assert torch.equal(ours.scene.body_rot, theirs.scene.body_rot)
@@ -74,10 +80,8 @@ def test_a_filled_cache_is_read_and_not_made_again(filled: CMU, monkeypatch: pyt
 
 def test_the_same_files_give_the_same_scene_bit_for_bit(filled: CMU, made: Path, tmp_path: Path) -> None:
     data = CMU(str(made), str(tmp_path), singles=False, test_takes=(), val_takes=())
-    take = next(take for take in data.takes() if take.name == "60_01+61_01")
-    data._convert([take])
-    again = data.clips("train")[0].scene
-    first = next(clip.scene for clip in filled.clips("train") if clip.name == take.name)
+    again = next(clip.scene for clip in data.clips("train") if clip.name == "60_01+61_01")
+    first = next(clip.scene for clip in filled.clips("train") if clip.name == "60_01+61_01")
     assert torch.equal(again.body_rot, first.body_rot) and torch.equal(again.T_world_root, first.T_world_root)
 
 
@@ -86,7 +90,7 @@ def test_changed_files_body_rate_or_version_make_another_cache_entry(
 ) -> None:
     def entry(**arguments: object) -> str:
         data = CMU(str(copied(made, tmp_path)), str(tmp_path), **arguments)  # type: ignore[arg-type]
-        return data._file(data.takes()[0]).name
+        return data.fits.file(data.recordings.found()[0]).name
 
     first = entry()
     assert entry() == first
@@ -96,7 +100,7 @@ def test_changed_files_body_rate_or_version_make_another_cache_entry(
         assert entry() != first
     data = CMU(str(tmp_path), str(tmp_path))
     write_amc(tmp_path / "60_01.amc", 100)
-    assert data._file(data.takes()[0]).name != first
+    assert data.fits.file(data.recordings.found()[0]).name != first
 
 
 def test_reports_lie_beside_the_scenes_and_nothing_half_written(filled: CMU) -> None:
@@ -107,13 +111,13 @@ def test_reports_lie_beside_the_scenes_and_nothing_half_written(filled: CMU) -> 
     assert report["frames"] == 61 and report["limb error cm"] < 4 and len(report["glitches"]) == 2
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
-    def half(path: Path) -> None:
-        path.write_text("half")
+def test_an_interrupted_write_leaves_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(scene: Scene, path: Path) -> Path:
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(Scene, "save", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        cmu._write(tmp_path / "scene.npz", half)
+        CMU(str(made), str(tmp_path)).prepare_data()
     assert not list(tmp_path.iterdir())
 
 
@@ -157,8 +161,8 @@ def test_couples_are_as_the_database_has_them(tmp_path: Path) -> None:
     for file in files:
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).touch()
-    data = CMU(str(tmp_path), fps={"1": 30.0, "01": 60.0})
-    takes = {take.name: data._rates(take) for take in data.takes()}
+    reader = CMUReader(tmp_path, fps={"1": 30.0, "01": 60.0})
+    takes = {take.name: reader.rates(take) for take in reader.found()}
     assert takes == {
         "01_02": [60.0],
         "18_15+19_15": [120.0, 120.0],
@@ -167,8 +171,8 @@ def test_couples_are_as_the_database_has_them(tmp_path: Path) -> None:
         "33_01": [60.0],
         "60_04+61_04": [60.0, 60.0],
     }
-    assert {name for name in takes if "+" in name} == {take.name for take in CMU(str(tmp_path), singles=False).takes()}
-    assert [take.name for take in data.takes() if data.split_of(take) == "test"] == ["18_15+19_15"]
+    assert {name for name in takes if "+" in name} == {take.name for take in CMUReader(tmp_path, singles=False).found()}
+    assert [take.name for take in reader.found() if take.split == "test"] == ["18_15+19_15"]
 
 
 # -- bad input ---------------------------------------------------------------------------------
@@ -212,13 +216,13 @@ def test_an_empty_folder_no_folder_and_none_say_where_recordings_are(
 ) -> None:
     monkeypatch.delenv("MAGNET_CMU", raising=False)
     for root in (str(tmp_path), str(tmp_path / "nowhere"), None):
-        with pytest.raises(FileNotFoundError, match=r"mocap\.cs\.cmu\.edu.*NSF EIA-0196217"):
+        with pytest.raises(DataError, match=r"mocap\.cs\.cmu\.edu.*NSF EIA-0196217"):
             CMU(root, str(tmp_path / "cache")).prepare_data()
 
 
-def test_a_take_in_two_splits_is_an_error() -> None:
+def test_a_take_in_two_splits_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"takes \[5\] are in both val and test"):
-        CMU(val_takes=(3, 5))
+        CMUReader(tmp_path, val_takes=(3, 5))
 
 
 def test_speeds_that_nobody_reaches_are_refused(tmp_path: Path) -> None:
@@ -254,8 +258,33 @@ def test_in_every_real_skeleton_the_bone_called_wrist_goes_on_where_the_forearm_
 
 
 def test_takes_of_the_real_recordings(cmu_root: Path) -> None:
-    data = CMU(str(cmu_root))
-    split = {take.name: data.split_of(take) for take in data.takes() if take.couple}
+    takes = CMUReader(cmu_root).found()
+    split = {take.name: take.split for take in takes if is_couple(take)}
     assert [name for name, part in split.items() if part == "test"] == ["60_05+61_05", "60_10+61_10", "60_15+61_15"]
     assert [name for name, part in split.items() if part == "val"] == ["60_03+61_03"]
-    assert len(split) == 11 and sum(not take.couple for take in data.takes()) == 62
+    assert len(split) == 11 and len(takes) - len(split) == 62
+
+
+# -- prepared ----------------------------------------------------------------------------------
+
+
+def test_a_prepared_store_holds_the_fits_of_the_cache_on_a_floor_of_its_own(filled: CMU, tmp_path: Path) -> None:
+    """The same poses and shapes as the cache's; the floor's height and the origin follow the rule for all stores."""
+    job = PrepareJob("cmu", filled.root or "", {}, "open", CanonicalizeOptions())
+    manifest = prepare(job, tmp_path / "store").folder.manifest
+    assert manifest["skipped"] == [] and {entry["persons"][0] for entry in manifest["persons"]} == {
+        "subject 60",
+        "subject 02",
+    }
+    data = CMU(path=str(tmp_path / "store"))
+    for split in ("train", "val", "test"):
+        whole = {clip.name: clip.scene for clip in filled.clips(split)}
+        for clip in data.clips(split):
+            ours, theirs = clip.scene, whole[clip.name]
+            assert torch.allclose(ours.body_rot, theirs.body_rot, atol=2e-4) and torch.equal(ours.betas, theirs.betas)
+            moved = theirs.T_world_root[..., :3, 3] - ours.T_world_root[..., :3, 3]
+            assert (moved - moved[:, :1, :1]).abs().max() < 1e-5 and moved[..., 1].abs().max() < 0.03
+    batch = next(iter(data.train_dataloader()))
+    assert batch.T_world_root.shape[1:3] == (data.window_frames, 2)
+    with pytest.raises(ValueError, match=r"got the store .* beside speeds, which is for recordings"):
+        CMU(path=str(tmp_path / "store"), speeds=(0.9,))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from magnet.body import Body
-from magnet.export.page.takes import Take
+from magnet.export.page.takes import ShownTake
 from magnet.generation.live import Live
 from magnet.testing import tiny_denoiser
 
@@ -96,12 +96,14 @@ def shown(stage: Any, page: Any) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def watched(page: Any, takes: list[Take], body: Body, truth: Take | None = None, style: Any = None) -> Iterator[Any]:
+def watched(
+    page: Any, takes: list[ShownTake], body: Body, truth: ShownTake | None = None, style: Any = None
+) -> Iterator[Any]:
     """A viewer of takes, without true shadows, and its page loaded."""
     pytest.importorskip("viser")
-    from magnet.viewer.watch import Viewer, first_look
+    from magnet.viewer.watch import Viewer, default_render_options
 
-    viewer = Viewer(takes, body, truth, port=0, look=first_look(takes, style, shadows=False))
+    viewer = Viewer(takes, body, truth, port=0, render=default_render_options(takes, style, shadows=False))
     with shown(viewer, page):
         yield viewer
 
@@ -111,13 +113,13 @@ def played(page: Any, live: Live, body: Body) -> Iterator[Any]:
     """A model that plays live and has gone on from its first frames, without true shadows, and its page loaded."""
     pytest.importorskip("viser")
     from magnet.generation.live import FIRST
-    from magnet.viewer.play import Playground
-    from magnet.viewer.troupe import Look
+    from magnet.viewer.live_app import LiveApp
+    from magnet.viewer.scene_view import RenderOptions
 
-    playground = Playground(live, body, port=0, look=Look(shadows=False))
-    with shown(playground, page):
+    app = LiveApp(live, body, port=0, render=RenderOptions(shadows=False))
+    with shown(app, page):
         wait(lambda: live.scene.frames > FIRST)
-        yield playground
+        yield app
 
 
 class Panel:

@@ -13,7 +13,7 @@ from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.trace import record
 from magnet.motion.scene import Scene
 from magnet.tasks.joint import JointFuture
-from magnet.viewer import stage
+from magnet.viewer import base
 from magnet.viewer.saving import FORMATS
 from tests.viewer.browser import blue, grey, orange, pale_orange, seen, shipped, shot, upright, wait, watched
 
@@ -43,10 +43,10 @@ def test_files_play_pause_step_and_scrub(page, panel, handshake, body) -> None:
         seen(page, "watch_body", lambda image: blue(image).sum() > 500 and grey(image).sum() > GHOSTS)
         assert page.get_by_text("standing feet").is_visible()
         panel.tick("ground truth")
-        wait(lambda: not viewer.look.ghosts)
+        wait(lambda: not viewer.render.ghosts)
         seen(page, "watch_without_ghosts", lambda image: upright(orange(image)) and grey(image).sum() < GHOSTS)
         panel.tick("shadows")
-        wait(lambda: viewer.look.shadows)
+        wait(lambda: viewer.render.shadows)
 
 
 def test_the_look_changes_and_the_scene_is_saved(page, panel, handshake, body, tmp_path) -> None:
@@ -55,10 +55,10 @@ def test_the_look_changes_and_the_scene_is_saved(page, panel, handshake, body, t
         viewer.clock.playing = False
         viewer.clock.seek(64)
         panel.choose("people", "capsules")
-        wait(lambda: viewer.look.style == "capsules")
+        wait(lambda: viewer.render.style == "capsules")
         full = blue(seen(page, "watch_capsules", lambda image: blue(image).sum() > 300)).sum()
         panel.choose("people", "skeleton")
-        wait(lambda: viewer.look.style == "skeleton")
+        wait(lambda: viewer.render.style == "skeleton")
         seen(page, "watch_skeleton", lambda image: 60 < blue(image).sum() < 0.8 * full)
         (client,) = viewer.server.get_clients().values()
         page.get_by_text("above", exact=True).click()
@@ -103,7 +103,7 @@ def test_what_cannot_be_saved_is_said_and_nothing_is_downloaded(page, panel, han
     def refuses(*_: object) -> tuple[str, bytes]:
         raise ImportError('films need av: pip install "magnet-motion[video]"')
 
-    monkeypatch.setattr(stage, "saved", refuses)
+    monkeypatch.setattr(base, "saved", refuses)
     files = []
     page.on("download", lambda download: files.append(download))
     with watched(page, [take("dance", handshake.slice(40, 64))], body, style="skeleton"):

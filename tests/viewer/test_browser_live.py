@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, panel, body, tmp_path) -> None:
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
     live.settings.steps = 10
-    with played(page, live, body) as playground:
+    with played(page, live, body) as app:
         panel.choose("task", "motion_control")
         wait(lambda: live.settings.task == "motion_control")
         panel.choose("whom", "person 2")
@@ -23,11 +23,11 @@ def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, pa
         assert live.task().target == (0,)
         grown = live.scene.frames
         wait(lambda: live.scene.frames > grown)
-        playground.clock.playing = False
-        playground.clock.seek(live.scene.frames - 1)  # the handle stands where the newest frames were
+        app.clock.playing = False
+        app.clock.seek(live.scene.frames - 1)  # the handle stands where the newest frames were
         goal = live.settings.goals[1]
         drag_handle(page, "live_handle", lambda: live.settings.goals[1] != goal)
-        playground.clock.playing = True
+        app.clock.playing = True
         grown = live.scene.frames
         wait(lambda: live.scene.frames > grown + 32)
         seen(page, "live_steered", lambda image: orange(image).sum() > 300)
@@ -43,7 +43,7 @@ def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, pa
         version = live.version
         panel.press("Restart from this frame")
         wait(lambda: live.version > version)
-        playground.clock.playing = False
+        app.clock.playing = False
         seen(page, "live", lambda image: blue(image).sum() + orange(image).sum() > 500)
         panel.enter("smoothing", 0.05)
         wait(lambda: live.settings.guidance.smooth == 0.05)
@@ -58,13 +58,13 @@ def test_a_model_plays_live_switches_task_is_steered_restarts_and_saves(page, pa
 
 def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(page, panel, body) -> None:
     live = Live(shipped(), people=2, generator=torch.Generator().manual_seed(1))
-    with played(page, live, body) as playground:
+    with played(page, live, body) as app:
         panel.tick("loop")
-        wait(lambda: playground.worker.paused and playground.clock.loop)
+        wait(lambda: app.worker.paused and app.clock.loop)
         panel.press("Pause")
-        wait(lambda: not playground.clock.playing)
-        playground.clock.seek(64)
-        wait(lambda: playground.shown == 64)
+        wait(lambda: not app.clock.playing)
+        app.clock.seek(64)
+        wait(lambda: app.shown == 64)
         page.get_by_text("Keyframes", exact=True).click()
         panel.press("Add keyframe here")
         wait(lambda: len(live.keys) == 1)
@@ -84,17 +84,17 @@ def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(pa
         panel.press("Generate between")
         page.get_by_text("in-betweening made").wait_for()
         assert live.scene.frames == 116
-        wait(lambda: playground.clock.playing)
+        wait(lambda: app.clock.playing)
         for (agent, frame), key in keys.items():
             at = live.scene.T_world_root[0, frame, agent, [0, 2], 3]
             assert (at - torch.tensor([key.goal.x, key.goal.z])).norm() < 1e-3
         assert live.scene.given[0, 64 - REACH :].sum() == 8
-        wait(lambda: playground.clock.frame < 40)  # round from the end to the start
+        wait(lambda: app.clock.frame < 40)  # round from the end to the start
         assert live.scene.frames == 116
-        playground.clock.playing = False
-        playground.clock.seek(65)
+        app.clock.playing = False
+        app.clock.seek(65)
         page.get_by_text("given: person 1").wait_for()
         seen(page, "live_between", lambda image: orange(image).sum() > 300)
         panel.tick("loop")
-        playground.clock.playing = True
+        app.clock.playing = True
         wait(lambda: live.scene.frames > 116)

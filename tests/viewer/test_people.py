@@ -11,7 +11,7 @@ from magnet.body import Body
 from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
 from magnet.motion.scene import Scene
-from magnet.viewer.people import Skinned, add_people, poser, quick_poser
+from magnet.viewer.people import SkinnedPeople, add_people, poser, quick_poser
 
 
 def told(mesh: Any, pose: Any, turns: Any, places: Any, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
@@ -25,7 +25,7 @@ def told(mesh: Any, pose: Any, turns: Any, places: Any, monkeypatch: pytest.Monk
 
 def test_the_quick_way_tells_viser_what_the_handles_tell(server, duet: Scene, body: Body, monkeypatch) -> None:
     people = add_people(server, "/a", body, duet, "light", agent_colours((0, 1)))
-    assert isinstance(people, Skinned)
+    assert isinstance(people, SkinnedPeople)
     turns, places = bone_poses(body, duet)
     mesh = people.meshes[0]
     quick = quick_poser(mesh)

@@ -15,7 +15,7 @@ from magnet.export.page.rig import VIEWS, Style
 from magnet.export.page.takes import take
 from magnet.motion.scene import BODY_JOINTS
 from magnet.testing import random_scene
-from magnet.viewer.troupe import Look
+from magnet.viewer.scene_view import RenderOptions
 
 MOST_BESIDES = 10
 """Messages of a frame that are not poses: slider, caption, label, the floor's place, discs."""
@@ -28,8 +28,8 @@ def told(body: Body, people: int, frames: int, style: Style, rich: bool = False)
     from magnet.viewer.watch import Viewer
 
     scene = random_scene(1, frames, people, torch.Generator().manual_seed(1))
-    look = Look(style=style, trails=rich, contacts=rich, collisions=rich, shadows=False)
-    viewer = Viewer([take("crowd", scene)], body, port=0, look=look)
+    render = RenderOptions(style=style, trails=rich, contacts=rich, collisions=rich, shadows=False)
+    viewer = Viewer([take("crowd", scene)], body, port=0, render=render)
     heard = []
     try:
         viewer.clock.seek(10)

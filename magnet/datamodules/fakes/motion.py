@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from magnet.body import Body, load_body
 from magnet.datamodules.fakes.body import Kind, write_body
 from magnet.datamodules.reading.recording import Axis
+from magnet.motion.resample import slerp_quat
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 from magnet.synthesis.generate import FEWEST_FRAMES
@@ -90,10 +91,7 @@ def people(frames: int, persons: int, fps: float = 30.0, seed: int = 0, kind: Ki
     share = time - before
     world = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2).double()
     quat = roma.rotmat_to_unitquat(world)
-    step = share[:, None, None].expand(frames, persons, 22)
-    # roma's slerp takes one list of steps for all: each frame has its own, so the relative rotation is scaled instead
-    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(quat[before]), quat[before + 1]))
-    between = roma.quat_product(quat[before], roma.rotvec_to_unitquat(turn * step[..., None]))
+    between = slerp_quat(quat[before], quat[before + 1], share[:, None, None])
     root = scene.T_world_root[0, :, :, :3, 3].double()
     pelvis = torch.lerp(root[before], root[before + 1], share[:, None, None])
     betas = scene.betas[0].double().numpy()

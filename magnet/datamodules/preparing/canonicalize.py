@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,13 +14,13 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.family import title
-from magnet.body.fit import fit_body, floor_height
+from magnet.body.fit import BodyFit, fit_body, floor_height
 from magnet.datamodules.clip import Clip, Split
 from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
-from magnet.datamodules.resample import FPS, resample_points, resample_rotations, resample_valid
 from magnet.motion.frames import rigid
+from magnet.motion.resample import FPS, resample_points, resample_rotations, resample_valid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 CANONICALIZE_VERSION = 3
@@ -242,7 +242,7 @@ def _fitted(
             scene = _side_by_side(people)
             residual = torch.stack(offs, dim=1)
         else:
-            fit = fit_body(targets, recording.joints, body, valid=torch.from_numpy(good), grounded=True, fps=FPS)
+            fit = fit_positions(recording, targets, good, body, up)
             scene, residual = fit.scene, fit.residual
     except ValueError as error:
         raise DataError(str(error)) from error
@@ -252,6 +252,45 @@ def _fitted(
     notes = (f"body {body.id} fitted to {'skeletons' if recording.skeletons else 'positions'}: {said}",)
     pelvis = scene.T_world_root[0, :, :, :3, 3].double()
     return WorldMotion(rotations, pelvis, scene.betas[0].double(), good, body.joints(scene)[0], notes), flags
+
+
+def fit_positions(
+    recording: Recording,
+    targets: Tensor,
+    valid: NDArray[np.bool_],
+    body: Body,
+    up: Axis = "+y",
+    progress: Callable[[int, int], None] | None = None,
+) -> BodyFit:
+    """A body fitted to a recording's positions and to the rotations that it may know.
+
+    Args:
+        recording: whose joints and hints they are.
+        targets: (T, P, M, 3) its positions at 30 fps, y up.
+        valid: (T, P) at 30 fps.
+        body: to fit.
+        up: axis of the file's world, which hints are in.
+        progress: is told of steps done, and of how many there are.
+
+    Raises:
+        ValueError: the body does not fit.
+    """
+    rotations = weights = None
+    if recording.hints is not None:
+        rotations, weights = recording.hints(body.rest_joints(torch.zeros(10)))
+        if up != "+y":
+            rotations = R_WORLD_FILE[up] @ rotations
+    return fit_body(
+        targets,
+        recording.joints,
+        body,
+        rotations=rotations,
+        weights=weights,
+        valid=torch.from_numpy(valid),
+        grounded=True,
+        fps=FPS,
+        progress=progress,
+    )
 
 
 def _side_by_side(people: Sequence[Scene]) -> Scene:

@@ -7,16 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import mean
 
 import numpy as np
-import roma
 import torch
 
 from magnet.body import Body, load_body
 from magnet.datamodules import registry
 from magnet.datamodules.clip import SPLITS, Split, at_least
-from magnet.datamodules.cmu import CMU
 from magnet.datamodules.preparing import check_people
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all
 from magnet.datamodules.preparing.prepare import absent_note, select_takes
@@ -202,8 +199,6 @@ def recognise(root: Path) -> str:
         ValueError: none does, or several do, or a table of a user's own recordings is wrong.
     """
     found = _readable(root, [name for name, kind in registry.readers().items() if not kind.own])
-    with suppress(OSError):
-        found += ["cmu"] if CMU(str(root)).takes() else []
     found = found or _own(root)
     if len(found) == 1:
         return found[0]
@@ -283,46 +278,6 @@ def check_download(
     found.notes += [noted(note, takes) for note, takes in notes.items()]
     found.count_skipped(len(takes))
     return found
-
-
-def check_cmu(data: CMU) -> CheckReport:
-    """Every recording of CMU fitted as for training, into its cache; a second check only reads that.
-
-    Raises:
-        FileNotFoundError: the folder holds no recordings.
-    """
-    found = CheckReport("cmu", "CMU Graphics Lab Motion Capture Database")
-    found.skipped = list(data.fit_takes().items())
-    for split in SPLITS:
-        clips = data.clips(split)
-        for clip in clips:
-            tally(found.counts, split, [clip.frames], [clip.agents])
-            flags = _flags(clip.scene, data.body)
-            found.notes += [f"{clip.name}, {said}" for said in check_people.described(flags, (), 30.0, met=False)]
-        seen = {clip.agents: clip for clip in clips}.values()  # one of each number of people
-        found.scenes += [(clip.name, clip.scene.slice(0, min(SHOWN_FRAMES, clip.frames))) for clip in seen]
-    found.scenes = found.scenes[:SHOWN]
-    takes = data.takes()
-    reports = [report for take in takes if "frames" in (report := data.report(take))]
-    if limbs := [report["limb error cm"] for report in reports if report["limb error cm"] is not None]:
-        found.notes.append(f"body {data.body.id} fitted: limbs {mean(limbs):.1f} cm off, {max(limbs):.1f} at worst")
-    masked, frames = (sum(report[key] for report in reports) for key in ("frames masked", "frames"))
-    found.notes.append(f"{masked} of {frames} frames are masked; each take's report lies in {data.cache_folder}")
-    found.count_skipped(len(takes))
-    return found
-
-
-def _flags(scene: Scene, body: Body) -> list[check_people.Flag]:
-    """Who is held, and what jumps, in a scene (B = 1)."""
-    T_world_root = scene.T_world_root[0]
-    rotations = torch.cat([T_world_root[:, :, None, :3, :3], scene.body_rot[0]], dim=2)
-    valid = torch.ones(scene.frames, dtype=torch.bool) if scene.valid is None else scene.valid[0]
-    return check_people.seen(
-        roma.rotmat_to_unitquat(rotations).numpy(),
-        T_world_root[..., :3, 3].numpy(),
-        valid[:, None].expand(-1, scene.agents).numpy(),
-        body.joints(scene)[0].numpy(),
-    )
 
 
 # -- the picture -------------------------------------------------------------------------------

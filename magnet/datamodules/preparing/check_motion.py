@@ -16,7 +16,7 @@ from magnet.datamodules.reading.recording import Axis, DataError, Recording
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-HEAD, ANKLES, HIPS, SHOULDERS = 15, (7, 8), (1, 2), (16, 17)
+HEAD, NECK, ANKLES, HIPS, SHOULDERS = 15, 12, (7, 8), (1, 2), (16, 17)
 FEET = ((7, 10), (8, 11))
 WALKING = [0, 7, 10, 8, 11]
 """Joints that tell the frame rate: the pelvis, then each foot's two."""
@@ -109,9 +109,9 @@ def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
 
 
 def up_vector(joints: Array, valid: Bools) -> Array:
-    """Head minus ankles, mean over people and valid frames; shoulders minus hips where these are not known. -> (3,)"""
+    """Head minus ankles, mean over people and valid frames; else neck minus ankles, or shoulders minus hips. -> (3,)"""
     people = joints[valid]
-    for high, low in (((HEAD,), ANKLES), (SHOULDERS, HIPS)):
+    for high, low in (((HEAD,), ANKLES), ((NECK,), ANKLES), (SHOULDERS, HIPS)):
         up = people[:, list(high)].mean(axis=1) - people[:, list(low)].mean(axis=1)
         if np.isfinite(up).all():
             return up.mean(axis=0)

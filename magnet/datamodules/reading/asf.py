@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.errors import DataError
+
 Floats = NDArray[np.float64]
 
 INCH = 0.0254
@@ -71,13 +73,13 @@ def said_lines(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 def numbers(where: str, words: Sequence[str], count: int) -> list[float]:
     if len(words) != count:
-        raise ValueError(f"{where}: got {len(words)} numbers, expected {count}")
+        raise DataError(f"{where}: got {len(words)} numbers, expected {count}")
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f"{where}: {error}; expected {count} numbers") from error
+        raise DataError(f"{where}: {error}; expected {count} numbers") from error
     if not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{where}: holds NaN or infinity; download the file again or leave it out")
+        raise DataError(f"{where}: holds NaN or infinity; download the file again or leave it out")
     return numbers
 
 
@@ -96,13 +98,13 @@ def _dofs(where: str, words: Sequence[str]) -> tuple[str, ...]:
     dofs = tuple(word.lower() for word in words)
     unknown = sorted(set(dofs) - {*TRANSLATIONS, *ROTATIONS})
     if unknown:
-        raise ValueError(f"{where}: unknown degree of freedom {unknown}, expected some of tx ty tz rx ry rz")
+        raise DataError(f"{where}: unknown degree of freedom {unknown}, expected some of tx ty tz rx ry rz")
     return dofs
 
 
 def _order(where: str, word: str) -> str:
     if sorted(word.lower()) != ["x", "y", "z"]:
-        raise ValueError(f"{where}: axis order {word!r}, expected XYZ in some order")
+        raise DataError(f"{where}: axis order {word!r}, expected XYZ in some order")
     return word.lower()
 
 
@@ -138,14 +140,14 @@ def read_asf(path: str | Path) -> AsfSkeleton:
         elif section == "hierarchy" and key not in ("begin", "end"):
             for name in words:
                 if name not in bones:
-                    raise ValueError(f"{where}: unknown bone {name!r}; the skeleton has {', '.join(bones)}")
+                    raise DataError(f"{where}: unknown bone {name!r}; the skeleton has {', '.join(bones)}")
             for name in rest:
                 bones[name].parent = words[0]
                 children += 1
     if not children or not root.dofs:
-        raise ValueError(f"{path}: not an ASF skeleton: lacks :root order or :hierarchy; the file may be truncated")
+        raise DataError(f"{path}: not an ASF skeleton: lacks :root order or :hierarchy; the file may be truncated")
     if not unit > 0:
-        raise ValueError(f"{path}: :units length is {unit}, expected a positive number")
+        raise DataError(f"{path}: :units length is {unit}, expected a positive number")
     return _assembled(path, bones, unit, degrees)
 
 
@@ -155,7 +157,7 @@ def _root_line(where: str, key: str, rest: list[str], root: _Bone) -> None:
     elif key == "axis":
         root.order = _order(where, rest[0] if rest else "")
     elif key in ("position", "orientation") and any(numbers(where, rest, 3)):
-        raise ValueError(f"{where}: a root {key} other than 0 0 0 is not supported")
+        raise DataError(f"{where}: a root {key} other than 0 0 0 is not supported")
 
 
 def _bone_line(where: str, key: str, rest: list[str], bone: _Bone) -> None:
@@ -170,7 +172,7 @@ def _bone_line(where: str, key: str, rest: list[str], bone: _Bone) -> None:
     elif key == "dof":
         bone.dofs = _dofs(where, rest)
         if set(bone.dofs) & set(TRANSLATIONS):
-            raise ValueError(f"{where}: bone {bone.name!r} moves along its parent, which is not supported")
+            raise DataError(f"{where}: bone {bone.name!r} moves along its parent, which is not supported")
 
 
 def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) -> AsfSkeleton:
@@ -180,7 +182,7 @@ def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) 
         order += [child for child, bone in bones.items() if bone.parent == name and child not in order]
     lost = sorted(set(bones) - set(order))
     if lost:
-        raise ValueError(f"{path}: bones {lost} hang on nothing; the :hierarchy is incomplete")
+        raise DataError(f"{path}: bones {lost} hang on nothing; the :hierarchy is incomplete")
     chosen = [bones[name] for name in order]
     angles = np.array([bone.angles for bone in chosen], dtype=np.float64)
     angles = np.radians(angles) if degrees else angles

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 
@@ -25,6 +24,8 @@ from magnet.datamodules.reading.asf import (
     read_asf,
     said_lines,
 )
+from magnet.datamodules.reading.recording import DataError
+from magnet.motion.resample import slerp
 
 __all__ = ["AmcRecording", "AsfSkeleton", "Bools", "Floats", "euler", "read_amc", "read_asf", "together"]
 
@@ -69,15 +70,9 @@ class AmcRecording:
         local = self.local[low]
         between = share > 1e-9
         if between.any():
-            local[between] = _slerp(local[between], self.local[high[between]], share[between])
+            first, second = (torch.from_numpy(self.local[index[between]]) for index in (low, high))
+            local[between] = slerp(first, second, torch.from_numpy(share[between])[:, None]).numpy()
         return replace(self, root=root, local=local)
-
-
-def _slerp(a: Floats, b: Floats, share: Floats) -> Floats:
-    """(T, K, 3, 3) x 2, (T,) -> (T, K, 3, 3)"""
-    start, step = torch.from_numpy(a), torch.from_numpy(np.swapaxes(a, -1, -2) @ b)
-    vector = roma.rotmat_to_rotvec(step) * torch.from_numpy(share)[:, None, None]
-    return (start @ roma.rotvec_to_rotmat(vector)).numpy()
 
 
 # -- motion ------------------------------------------------------------------------------------
@@ -88,7 +83,7 @@ def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecordin
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a bone that the skeleton lacks, a frame without a bone it has, a wrong number of values, something
+        DataError: a bone that the skeleton lacks, a frame without a bone it has, a wrong number of values, something
             that is not a number, NaN, a truncated file or one without frames; names file and line.
     """
     path = Path(path)
@@ -164,32 +159,32 @@ def parse_any(path: Path, skeleton: AsfSkeleton) -> Floats:
     def close(where: str) -> None:
         missing = [name for name in moving if name not in seen]
         if rows and missing:
-            raise ValueError(f"{where}: frame {len(rows)} ends without {', '.join(missing)}; the file may be truncated")
+            raise DataError(f"{where}: frame {len(rows)} ends without {', '.join(missing)}; the file may be truncated")
 
     for where, words in said_lines(path):
         if words[0].startswith(":"):
             if words[0].upper() == ":RADIANS" and skeleton.degrees:
-                raise ValueError(f"{where}: angles in radians, but {skeleton.path.name} says degrees")
+                raise DataError(f"{where}: angles in radians, but {skeleton.path.name} says degrees")
             continue
         if len(words) == 1 and words[0].isdigit():
             close(where)
             if int(words[0]) != len(rows) + 1:
-                raise ValueError(f"{where}: frame {words[0]} follows frame {len(rows)}; frames are missing")
+                raise DataError(f"{where}: frame {words[0]} follows frame {len(rows)}; frames are missing")
             rows.append([math.nan] * width)
             seen.clear()
             continue
         if not rows:
-            raise ValueError(f"{where}: {words[0]!r} before the first frame number; not an AMC motion")
+            raise DataError(f"{where}: {words[0]!r} before the first frame number; not an AMC motion")
         if words[0] not in moving:
-            raise ValueError(f"{where}: unknown bone {words[0]!r}; {skeleton.path.name} has {', '.join(moving)}")
+            raise DataError(f"{where}: unknown bone {words[0]!r}; {skeleton.path.name} has {', '.join(moving)}")
         if words[0] in seen:
-            raise ValueError(f"{where}: bone {words[0]!r} twice in frame {len(rows)}")
+            raise DataError(f"{where}: bone {words[0]!r} twice in frame {len(rows)}")
         seen.add(words[0])
         start, count = starts[words[0]], moving[words[0]]
         rows[-1][start : start + count] = numbers(where, words[1:], count)
     close(where)
     if not rows:
-        raise ValueError(f"{path}: holds no frames; the file may be truncated")
+        raise DataError(f"{path}: holds no frames; the file may be truncated")
     return np.array(rows)
 
 
@@ -197,14 +192,14 @@ def together(recordings: Sequence[AmcRecording], trim: bool = False) -> list[Amc
     """Recordings of people captured together, which must be equally long; `trim` cuts them to the shortest.
 
     Raises:
-        ValueError: lengths or frame rates differ.
+        DataError: lengths or frame rates differ.
     """
     first = recordings[0]
     for other in recordings[1:]:
         if other.fps != first.fps:
-            raise ValueError(f"{first.path.name} has {first.fps} fps, {other.path.name} {other.fps}; give one rate")
+            raise DataError(f"{first.path.name} has {first.fps} fps, {other.path.name} {other.fps}; give one rate")
         if other.frames != first.frames and not trim:
-            raise ValueError(
+            raise DataError(
                 f"{first.path.name} has {first.frames} frames, {other.path.name} {other.frames}; "
                 "cut them to the shortest with trim=True"
             )

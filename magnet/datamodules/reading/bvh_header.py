@@ -14,7 +14,7 @@ from magnet.unpickle import contents
 
 
 @dataclass(frozen=True)
-class BvhHeader:
+class BvhSkeleton:
     """K joints in the file's order, parents first; an end site is a joint called after its parent, such as HeadEnd."""
 
     names: tuple[str, ...]
@@ -34,7 +34,7 @@ class BvhHeader:
         return order
 
 
-def read_bvh_header(path: Path) -> BvhHeader:
+def read_bvh_header(path: Path) -> BvhSkeleton:
     """Read a BVH file's hierarchy; of its motion, only that all frames are there.
 
     Raises:
@@ -58,7 +58,7 @@ def read_bvh_header(path: Path) -> BvhHeader:
     if lacking := [name for name, joint in zip(names, said.joints, strict=True) if joint.offset is None]:
         raise DataError(f"{path}: {lacking[0]} has no OFFSET; {AGAIN}")
     turns = [[channel[0].lower() for channel in j.channels if channel.endswith("rotation")] for j in said.joints]
-    return BvhHeader(
+    return BvhSkeleton(
         names=tuple(names),
         parents=tuple(joint.parent for joint in said.joints),
         offsets=np.array([joint.offset for joint in said.joints], dtype=np.float64),

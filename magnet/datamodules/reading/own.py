@@ -15,7 +15,7 @@ from magnet.datamodules.reading.arrays import hashed_split
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own_files import TABLE, PersonFile, SceneFiles, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.resample import FPS
+from magnet.motion.resample import FPS
 
 FEW = 4
 """Fewer scenes than these are each split in time: whole ones would leave next to nothing to train on."""

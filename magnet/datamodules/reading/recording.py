@@ -60,6 +60,21 @@ class PosedSkeleton(Protocol):
         ...
 
 
+class FitHints(Protocol):
+    """What a recording knows of joints besides their places; it depends on the body that is fitted."""
+
+    def __call__(self, rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations from a body's rest pose, and weights of the positions.
+
+        Args:
+            rest: (22, 3) joints of the body in its mean shape.
+
+        Returns:
+            (T, P, 22, 3, 3) in the file's world, NaN where they are not known; (T, P, M) how much each position counts.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Recording:
     """One take of P people at its native rate, axes and units already in metres and radians.
@@ -81,6 +96,7 @@ class Recording:
     shapes_of: str = ""  # family of bodies (`magnet.body.family`) that `betas` belong to, where only the files tell it
     positions: Floats | None = None  # (T, P, M, 3) world
     joints: tuple[int, ...] = ()  # (M,) which of the 22 joints `positions` are of
+    hints: FitHints | None = None  # rotations beside `positions` at 30 frames a second, for the fit
     valid: NDArray[np.bool_] | None = None  # (T, P), False where tracking failed
     persons: tuple[str, ...] = ()  # names or roles, such as "leader", which a store keeps
     notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt

@@ -12,7 +12,7 @@ import numpy as np
 
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length
 from magnet.datamodules.reading.asf import euler
-from magnet.datamodules.reading.bvh_header import BvhHeader, read_bvh_header
+from magnet.datamodules.reading.bvh_header import BvhSkeleton, read_bvh_header
 from magnet.datamodules.reading.fields import mapping
 from magnet.datamodules.reading.recording import DataError
 from magnet.unpickle import contents, load_pickle
@@ -81,7 +81,7 @@ class _Table:
             raise DataError(f"{self.path}: no columns of {joint}; it has {', '.join(self.names[:8])}..; {AGAIN}")
         return self.values[:, self.names.index(joint)]
 
-    def named(self, header: BvhHeader) -> list[_Table]:
+    def named(self, header: BvhSkeleton) -> list[_Table]:
         """With the names that its columns may stand for: its own, or those of the BVH in either direction."""
         if self.names:
             return [self]
@@ -128,7 +128,7 @@ def _table(path: Path) -> tuple[_Table, Doubles]:
     return _Table(path, values[:, 1:].reshape(len(values), -1, 3), names), values[:, 0]
 
 
-def _misfit(header: BvhHeader, table: _Table) -> float:
+def _misfit(header: BvhSkeleton, table: _Table) -> float:
     """How far bones are from their lengths in the BVH, in the files' unit, were the columns these joints."""
     off = []
     for name, parent, offset in zip(header.names, header.parents, header.offsets, strict=True):
@@ -138,7 +138,7 @@ def _misfit(header: BvhHeader, table: _Table) -> float:
     return float(np.mean(off)) if off else 0.0
 
 
-def _proof(folder: Path, header: BvhHeader, table: _Table, scale: float) -> str:
+def _proof(folder: Path, header: BvhSkeleton, table: _Table, scale: float) -> str:
     """Find the Euler order by which rotations and offsets lead to the positions.
 
     Raises:
@@ -172,7 +172,7 @@ def _proof(folder: Path, header: BvhHeader, table: _Table, scale: float) -> str:
 
 
 def _order(
-    header: BvhHeader,
+    header: BvhSkeleton,
     offsets: Doubles,
     namings: list[dict[int, Doubles]],
     positions: dict[int, Doubles],
@@ -200,7 +200,7 @@ def _order(
     return best, error
 
 
-def _offsets(folder: Path, header: BvhHeader) -> tuple[Doubles, str]:
+def _offsets(folder: Path, header: BvhSkeleton) -> tuple[Doubles, str]:
     """Each joint's place in its parent's frame. (K, 3), and the file they are from"""
     paths = sorted(folder.glob("*offsets.pkl"))
     if not paths:
@@ -218,7 +218,7 @@ def _offsets(folder: Path, header: BvhHeader) -> tuple[Doubles, str]:
     return offsets, paths[0].name
 
 
-def _far(header: BvhHeader, offsets: Doubles, local: dict[int, Doubles], positions: dict[int, Doubles]) -> float:
+def _far(header: BvhSkeleton, offsets: Doubles, local: dict[int, Doubles], positions: dict[int, Doubles]) -> float:
     """Largest distance of a joint from where the chain leads, over frames and joints, in the files' unit."""
     turned: list[Doubles] = []
     reached: list[Doubles] = []

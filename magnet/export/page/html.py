@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magnet.body.base import PARENTS, Body
 from magnet.export.page.palette import GHOST, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
-from magnet.export.page.takes import Take, in_a_row, numbered, same_length, take, takes
+from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes
 from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
@@ -27,7 +27,7 @@ CHUNK = 512
 
 
 def save_html(
-    scene: Scene | Sequence[Take],
+    scene: Scene | Sequence[ShownTake],
     path: str | Path,
     body: Body,
     *,
@@ -64,7 +64,7 @@ def save_html(
 
 
 def page(
-    scene: Scene | Sequence[Take],
+    scene: Scene | Sequence[ShownTake],
     body: Body,
     *,
     context: int = 0,
@@ -105,7 +105,7 @@ def _packaged(name: str) -> str:
 
 
 def _contents(
-    shown: Sequence[Take], body: Body, truth: Take | None, styles: tuple[Style, ...]
+    shown: Sequence[ShownTake], body: Body, truth: ShownTake | None, styles: tuple[Style, ...]
 ) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """What the player reads: facts, and arrays by name."""
     longest = max(shown, key=lambda each: each.frames)
@@ -145,7 +145,7 @@ def _contents(
     return meta, arrays
 
 
-def _people(group: Take, number: int, ghosts: bool) -> list[dict[str, Any]]:
+def _people(group: ShownTake, number: int, ghosts: bool) -> list[dict[str, Any]]:
     """Facts about the people of a take."""
     colours = np.array([GHOST] * len(group.slots), dtype=np.uint8) if ghosts else agent_colours(group.slots)
     paler = colours if ghosts else pale(colours)

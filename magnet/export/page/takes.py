@@ -28,7 +28,7 @@ WIDEST = 8.0
 
 
 @dataclass(frozen=True)
-class Take:
+class ShownTake:
     """One scene (B = 1, present people only) as it is shown.
 
     Attributes:
@@ -56,7 +56,7 @@ class Take:
         return f"given: {those}" if those else ""
 
 
-def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None) -> Take:
+def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None) -> ShownTake:
     """A scene (B = 1) made ready to be shown.
 
     Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
@@ -77,10 +77,10 @@ def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace |
         past = torch.arange(scene.frames) < context
         shown = shown.replace(given=past[None, :, None].expand(1, -1, len(slots)))
     given = np.zeros((scene.frames, len(slots)), dtype=bool) if shown.given is None else shown.given[0].numpy()
-    return Take(label, shown, tuple(slots.tolist()), given, recording)
+    return ShownTake(label, shown, tuple(slots.tolist()), given, recording)
 
 
-def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[Take]:
+def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[ShownTake]:
     """The first of a file's B scenes, each a take."""
     names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
     many = scene.scenes > 1
@@ -92,7 +92,7 @@ def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLE
 
 def read_takes(
     paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
-) -> tuple[list[Take], Body]:
+) -> tuple[list[ShownTake], Body]:
     """All that several files hold, and the body it is shown on.
 
     body: the user's; by default the open one.
@@ -102,7 +102,7 @@ def read_takes(
         ValueError: a file that cannot be read, files of different frame rates or bodies; says which and what to do.
     """
     body = body or load_body("open")
-    found: list[tuple[Path, Take]] = []
+    found: list[tuple[Path, ShownTake]] = []
     for path in map(Path, paths):
         scene, recording = read_scene(path, body)
         here = takes(scene, path.stem, context, samples)
@@ -151,14 +151,14 @@ def is_trace(path: Path) -> bool:
         raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error
 
 
-def same_length(one: Take, other: Take) -> Scene:
+def same_length(one: ShownTake, other: ShownTake) -> Scene:
     """The scene of `one`, cut or held so that it has the frames of `other`."""
     frame = torch.arange(other.frames).clamp(max=one.frames - 1)
     scene = one.scene
     return scene.frames_at(frame)
 
 
-def in_a_row(takes: Sequence[Take]) -> list[Array]:
+def in_a_row(takes: Sequence[ShownTake]) -> list[Array]:
     """Offsets that put takes side by side along x around the origin, each (3,)."""
     edges = []
     for each in takes:
@@ -175,7 +175,7 @@ def in_a_row(takes: Sequence[Take]) -> list[Array]:
     return offsets
 
 
-def numbered(takes: list[Take]) -> list[Take]:
+def numbered(takes: list[ShownTake]) -> list[ShownTake]:
     """The takes with labels that differ, for they name nodes of the scene."""
     labels = [each.label for each in takes]
     return [

@@ -18,7 +18,7 @@ from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canon
 from magnet.datamodules.preparing.check_people import true_runs
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.recording import DataError
-from magnet.datamodules.resample import resample_rotations, resample_valid, times
+from magnet.motion.resample import resample_rotations, resample_valid, times
 from magnet.synthesis import synthesize
 from tests.datamodules.made import SPOILED, in_degrees, recorded, tracked
 

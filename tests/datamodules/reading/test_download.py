@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from magnet.datamodules.cmu import CMU
+from magnet.datamodules.cmu import CMUReader
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.reading import download
 from magnet.datamodules.reading.download import DownloadError, Retries, download_cmu
+from magnet.datamodules.reading.recording import DataError
 
 QUICK = Retries(attempts=3, backoff=0.001, timeout=5.0, pause=0.0)
 
@@ -124,7 +125,7 @@ def test_files_lie_where_the_cmu_data_set_reads_them(site: Site, tmp_path: Path)
     assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.a*c")} == {
         "salsa/60_01.amc", "salsa/60_02.amc", "salsa/61_01.amc", "salsa/61_02.amc", "singles/02_01.amc",
     }  # fmt: skip
-    assert [take.name for take in CMU(str(tmp_path)).takes()] == ["02_01", "60_01+61_01", "60_02+61_02"]
+    assert [take.name for take in CMUReader(tmp_path).found()] == ["02_01", "60_01+61_01", "60_02+61_02"]
 
 
 def test_progress_is_told_to_the_last_byte(site: Site, tmp_path: Path) -> None:
@@ -193,8 +194,8 @@ def test_a_stopped_run_goes_on_where_it_was(site: Site, tmp_path: Path) -> None:
     part = tmp_path / "singles" / "02_01.amc.part"
     assert part.stat().st_size == len(site.files[AMC]) // 2
     assert not (tmp_path / "singles" / "02_01.amc").exists()
-    with pytest.raises(FileNotFoundError, match=r"holds no files named NN_TT\.amc"):
-        CMU(str(tmp_path)).takes()
+    with pytest.raises(DataError, match=r"holds no files named NN_TT\.amc"):
+        CMUReader(tmp_path).found()
     fetch(site, tmp_path)
     assert site.requests(AMC)[-1] == f"bytes={len(site.files[AMC]) // 2}-"
     check(site, tmp_path)
@@ -310,7 +311,7 @@ def test_partners_go_to_a_folder_of_couples_unless_they_lie_among_singles(site: 
     done = fetch(site, tmp_path, 18, 19)
     assert done.kept == ("singles/18.asf",)
     assert {name.split("/")[0] for name in done.fetched} == {"couples"}
-    assert [take.name for take in CMU(str(tmp_path)).takes()] == ["18_01+19_01", "18_02+19_02"]
+    assert [take.name for take in CMUReader(tmp_path).found()] == ["18_01+19_01", "18_02+19_02"]
 
 
 def test_waits_grow_and_never_pass_the_longest(monkeypatch: pytest.MonkeyPatch) -> None:

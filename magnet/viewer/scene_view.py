@@ -11,9 +11,9 @@ import torch
 from magnet.body.base import Body
 from magnet.export.page.palette import GHOST, agent_colours, pale
 from magnet.export.page.rig import Array, Style, bone_poses
-from magnet.export.page.takes import Take
+from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
-from magnet.viewer.people import People, add_people
+from magnet.viewer.people import PeopleView, add_people
 from magnet.viewer.scenery import Marks, Shades, Trails
 
 HEAD_HIGH = 2.1
@@ -22,7 +22,7 @@ EVEN = 1.2
 
 
 @dataclass(frozen=True)
-class Look:
+class RenderOptions:
     """What is shown."""
 
     style: Style = "body"
@@ -34,7 +34,7 @@ class Look:
     seconds: float = 2.0  # of the trails
 
 
-class Troupe:
+class SceneView:
     """A take on the stage at `offset` metres.
 
     Args:
@@ -49,20 +49,20 @@ class Troupe:
         server: Any,
         parent: str,
         body: Body,
-        take: Take,
+        take: ShownTake,
         offset: Array,
-        look: Look,
+        render: RenderOptions,
         truth: Scene | None = None,
         label: bool = True,
     ) -> None:
-        self.server, self.body, self.take, self.truth, self.look = server, body, take, truth, look
+        self.server, self.body, self.take, self.truth, self.render = server, body, take, truth, render
         self.name = f"{parent}/{_node(take.label)}"
         self.offset = offset
         self.root = server.scene.add_frame(self.name, show_axes=False, position=tuple(float(x) for x in offset))
         self.own = agent_colours(take.slots)
-        self.wardrobe: dict[tuple[Style, bool], People] = {}  # people and ghosts in the styles shown so far
-        self.people: People
-        self.ghosts: People | None = None
+        self.mesh_cache: dict[tuple[Style, bool], PeopleView] = {}  # people and ghosts in the styles shown so far
+        self.people: PeopleView
+        self.ghosts: PeopleView | None = None
         self.trails: Trails | None = None
         self.marks = Marks(server, f"{self.name}/marks", len(take.slots), take.scene.fps)
         self.shades = Shades(server, f"{self.name}/shades", len(take.slots))
@@ -70,36 +70,36 @@ class Troupe:
         self.facts: dict[str, float] = {}
         self.plainly_lit = False
         self.estimate: Scene | None = None
-        self.dress(look)
+        self.set_style(render)
 
-    def dress(self, look: Look) -> None:
-        """Take another look."""
-        self.look = look
-        self.people = self._dressed(look.style, False)
-        wanted = look.ghosts and self.truth is not None
-        self.ghosts = self._dressed(look.style, True) if wanted else None
-        for people in self.wardrobe.values():
+    def set_style(self, render: RenderOptions) -> None:
+        """Show it with other options."""
+        self.render = render
+        self.people = self._people_in(render.style, False)
+        wanted = render.ghosts and self.truth is not None
+        self.ghosts = self._people_in(render.style, True) if wanted else None
+        for people in self.mesh_cache.values():
             people.show(people is self.people or people is self.ghosts)
-        if look.trails and self.trails is None:
+        if render.trails and self.trails is None:
             self.trails = Trails(self.server, f"{self.name}/trails", self.own)
-        elif not look.trails and self.trails is not None:
+        elif not render.trails and self.trails is not None:
             self.trails.remove()
             self.trails = None
-        self.marks.clear(not look.contacts, not look.collisions)
-        if look.shadows:
+        self.marks.clear(not render.contacts, not render.collisions)
+        if render.shadows:
             self.shades.clear()
-        if (look.style == "body") == self.plainly_lit:
+        if (render.style == "body") == self.plainly_lit:
             self.plainly_lit = not self.plainly_lit
             light_up(self.server, self.plainly_lit)
 
-    def _dressed(self, style: Style, ghosts: bool) -> People:
-        if (style, ghosts) not in self.wardrobe:
+    def _people_in(self, style: Style, ghosts: bool) -> PeopleView:
+        if (style, ghosts) not in self.mesh_cache:
             scene = self.truth if ghosts and self.truth is not None else self.take.scene
             colours = np.tile(np.array(GHOST, dtype=np.uint8), (scene.agents, 1)) if ghosts else self.own
             name = f"{self.name}/{'ghosts' if ghosts else 'people'}_{style}"
             opacity = 0.35 if ghosts else None
-            self.wardrobe[style, ghosts] = add_people(self.server, name, self.body, scene, style, colours, opacity)
-        return self.wardrobe[style, ghosts]
+            self.mesh_cache[style, ghosts] = add_people(self.server, name, self.body, scene, style, colours, opacity)
+        return self.mesh_cache[style, ghosts]
 
     def show(self, frame: int) -> None:
         """Put everybody where they are in a frame; after the last one they stay as they were."""
@@ -116,12 +116,12 @@ class Troupe:
             self.ghosts.pose(ghost_turns[-1], ghost_places[-1])
         if self.trails is not None:
             self.trails.show(self._ways(scene, now))
-        if not self.look.shadows:
+        if not self.render.shadows:
             self.shades.show(places[-1])
-        if self.look.contacts:
+        if self.render.contacts:
             feet, hands = self.marks.contacts(places[0], places[-1])
             self.facts |= {"feet": feet, "hands": hands}
-        if self.look.collisions:
+        if self.render.collisions:
             self.facts["deepest"] = self.marks.collisions(places[-1])
         if self.label is not None:
             middle = places[-1][:, 0].mean(axis=0)
@@ -129,7 +129,7 @@ class Troupe:
 
     def _ways(self, scene: Scene, now: int) -> Array:
         assert self.trails is not None
-        back = np.linspace(-self.look.seconds * scene.fps, 0, self.trails.pieces + 1).round().astype(int)
+        back = np.linspace(-self.render.seconds * scene.fps, 0, self.trails.pieces + 1).round().astype(int)
         frames = torch.from_numpy(np.clip(now + back, 0, None))
         return scene.T_world_root[0, frames, :, :3, 3].cpu().numpy()
 
@@ -139,7 +139,7 @@ class Troupe:
         at = min(frame, scene.frames - 1)
         return scene.T_world_root[0, at, :, :3, 3].mean(dim=0).cpu().numpy() + self.offset
 
-    def appear(self, on: bool) -> None:
+    def set_visible(self, on: bool) -> None:
         """Leave the stage, or come back."""
         self.root.visible = on
 

@@ -13,9 +13,9 @@ from magnet.body.base import Body
 from magnet.export.page.rig import VIEWS, Array
 from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
+from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start
-from magnet.viewer.troupe import Look, Troupe
 
 RATE = 30.0
 """Frames a second that are sent at most."""
@@ -27,7 +27,7 @@ AIM = 0.85
 FIELD = 0.70
 
 
-class Stage:
+class ViewerBase:
     """Server, floor, clock, the people, and their controls.
 
     Args:
@@ -36,14 +36,14 @@ class Stage:
     """
 
     def __init__(
-        self, body: Body, look: Look, host: str = "127.0.0.1", port: int = 8080, title: str = "magnet"
+        self, body: Body, render: RenderOptions, host: str = "127.0.0.1", port: int = 8080, title: str = "magnet"
     ) -> None:
         self.body = body
         self.server = start(host, port, title)
         self.port = self.server.get_port()
         self.clock = Clock(1, 30.0)
-        self.look = look
-        self.troupes: list[Troupe] = []
+        self.render = render
+        self.views: list[SceneView] = []
         self.lock = threading.RLock()
         self.follow, self.centre = True, np.zeros(3)
         self.shown = -1
@@ -52,7 +52,7 @@ class Stage:
         self._stop = threading.Event()
         scene = self.server.scene
         scene.set_up_direction("+y")
-        scene.configure_default_lights(True, cast_shadow=look.shadows)
+        scene.configure_default_lights(True, cast_shadow=render.shadows)
         self.root = scene.add_frame("/stage", show_axes=False)
         self.floor = Floor(self.server, "/stage")
         self.server.gui.main_panel.dock_right()
@@ -110,31 +110,31 @@ class Stage:
         self.play.label = "Pause" if self.clock.playing else "Play"
         self.play.icon = "player-pause" if self.clock.playing else "player-play"
 
-    def add_looks(self, ghosts: bool | None) -> None:
+    def add_render_controls(self, ghosts: bool | None) -> None:
         """What is shown, and from where. ghosts: None where there can be no ground truth at all."""
         gui = self.server.gui
         with gui.add_folder("Look"):
-            style = gui.add_dropdown("people", VIEWS, initial_value=self.look.style)
-            shown = {"ghosts": gui.add_checkbox("ground truth", self.look.ghosts)} if ghosts else {}
+            style = gui.add_dropdown("people", VIEWS, initial_value=self.render.style)
+            shown = {"ghosts": gui.add_checkbox("ground truth", self.render.ghosts)} if ghosts else {}
             if ghosts is False:
                 hint = "magnet view FILE --truth RECORDED.npz shows it as ghosts"
                 gui.add_checkbox("ground truth: none given", False, disabled=True, hint=hint)
             shown |= {
-                "shadows": gui.add_checkbox("shadows", self.look.shadows, hint="off where there is no GPU"),
-                "trails": gui.add_checkbox("trails", self.look.trails),
-                "contacts": gui.add_checkbox("contacts", self.look.contacts, hint="green: stands, orange: slides"),
-                "collisions": gui.add_checkbox("collisions", self.look.collisions, hint="red: capsules overlap"),
+                "shadows": gui.add_checkbox("shadows", self.render.shadows, hint="off where there is no GPU"),
+                "trails": gui.add_checkbox("trails", self.render.trails),
+                "contacts": gui.add_checkbox("contacts", self.render.contacts, hint="green: stands, orange: slides"),
+                "collisions": gui.add_checkbox("collisions", self.render.collisions, hint="red: capsules overlap"),
             }
         with gui.add_folder("Camera"):
             follow = gui.add_checkbox("follow the people", self.follow)
             presets = gui.add_button_group("from", tuple(CAMERAS))
 
-        def dress(_: Any) -> None:
+        def set_style(_: Any) -> None:
             values = {name: bool(box.value) for name, box in shown.items()}
-            self.dress(dataclasses.replace(self.look, style=style.value, **values))
+            self.set_style(dataclasses.replace(self.render, style=style.value, **values))
 
         for control in (style, *shown.values()):
-            control.on_update(dress)
+            control.on_update(set_style)
 
         def set_follow(_: Any) -> None:
             self.follow = bool(follow.value)
@@ -142,13 +142,13 @@ class Stage:
         follow.on_update(set_follow)
         presets.on_click(lambda event: self._move_cameras(presets.value, event.client))
 
-    def dress(self, look: Look) -> None:
-        """Take another look."""
+    def set_style(self, render: RenderOptions) -> None:
+        """Show it with other options."""
         with self.lock, self.server.atomic():
-            self.look = look
-            self.server.scene.configure_default_lights(True, cast_shadow=look.shadows)
-            for troupe in self.troupes:
-                troupe.dress(look)
+            self.render = render
+            self.server.scene.configure_default_lights(True, cast_shadow=render.shadows)
+            for view in self.views:
+                view.set_style(render)
             self.shown = -1
 
     # -- saving --------------------------------------------------------------------------------
@@ -156,18 +156,18 @@ class Stage:
     def add_saving(self) -> None:
         """Downloads of a take."""
         gui = self.server.gui
-        names = tuple(troupe.take.label or "scene" for troupe in self.troupes)
+        names = tuple(view.take.label or "scene" for view in self.views)
         with gui.add_folder("Save", expand_by_default=False):
             which = gui.add_dropdown("take", names, initial_value=names[0]) if len(names) > 1 else None
             kind = gui.add_dropdown("format", FORMATS, initial_value=FORMATS[0])
             button = gui.add_button("Download", icon="download")
 
         def save(event: Any) -> None:
-            troupe = self.troupes[names.index(which.value) if which is not None else 0]
+            view = self.views[names.index(which.value) if which is not None else 0]
             button.disabled = True
             try:
-                suffix, content = saved(troupe.take, self.body, kind.value, troupe.truth)
-                name = "".join(c if c.isalnum() else "_" for c in troupe.take.label) or "scene"
+                suffix, content = saved(view.take, self.body, kind.value, view.truth)
+                name = "".join(c if c.isalnum() else "_" for c in view.take.label) or "scene"
                 event.client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
             except (ValueError, OSError, ImportError) as error:
                 event.client.add_notification("Not saved", str(error), color="red", auto_close_seconds=15.0)
@@ -201,11 +201,11 @@ class Stage:
         for share in (0.0, 0.5, 1.0):
             moment = [
                 t.take.scene.T_world_root[0, round(share * (t.take.frames - 1)), :, :3, 3].cpu().numpy() + t.offset
-                for t in self.troupes
+                for t in self.views
             ]
             wide.append(np.ptp(np.concatenate(moment)[:, [0, 2]], axis=0).max())
         half = float(np.median(wide)) / 2 + 0.7
-        self._look_from("three quarters" if len(self.troupes) == 1 else "front", max(4.2, 2.4 * half))
+        self._look_from("three quarters" if len(self.views) == 1 else "front", max(4.2, 2.4 * half))
 
     # -- showing -------------------------------------------------------------------------------
 
@@ -213,12 +213,12 @@ class Stage:
         """Show the clock's frame, if it is not shown already."""
         with self.lock:
             frame = self.clock.frame
-            if frame == self.shown or not self.troupes:
+            if frame == self.shown or not self.views:
                 return
             jump = abs(frame - self.shown) > 5
             with self.server.atomic():
-                for troupe in self.troupes:
-                    troupe.show(frame)
+                for view in self.views:
+                    view.show(frame)
                 self._follow(frame, jump)
                 self.slider.value = frame
                 self.clock_text.content = self.caption(frame)
@@ -226,7 +226,7 @@ class Stage:
             self.sent += 1
 
     def _follow(self, frame: int, jump: bool) -> None:
-        middle = np.mean([troupe.centre(frame) for troupe in self.troupes], axis=0)
+        middle = np.mean([view.centre(frame) for view in self.views], axis=0)
         self.floor.under(middle)
         if self.follow:
             goal = middle * np.array([1.0, 0.0, 1.0])
@@ -236,14 +236,14 @@ class Stage:
     def caption(self, frame: int) -> str:
         """What the panel says about a frame."""
         lines = [f"{frame / self.clock.fps:.2f} s of {self.clock.frames / self.clock.fps:.1f} s"]
-        for troupe in self.troupes:
-            state = troupe.take.said(frame)
-            facts = troupe.facts
-            if self.look.contacts:
+        for view in self.views:
+            state = view.take.said(frame)
+            facts = view.facts
+            if self.render.contacts:
                 state += f" · standing feet: {facts.get('feet', 0):.0f} · touching hands: {facts.get('hands', 0):.0f}"
-            if self.look.collisions and facts.get("deepest", 0.0) > 0:
+            if self.render.collisions and facts.get("deepest", 0.0) > 0:
                 state += f" · **{100 * facts['deepest']:.0f} cm inside each other**"
-            label = f"{troupe.take.label}: " if len(self.troupes) > 1 else ""
+            label = f"{view.take.label}: " if len(self.views) > 1 else ""
             lines.append(f"{label}{state.removeprefix(' · ')}")
         return "  \n".join(lines)
 

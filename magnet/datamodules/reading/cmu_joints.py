@@ -1,10 +1,9 @@
-"""From CMU's skeleton to a body: which bone is which joint, how the rest poses differ, where the floor is."""
+"""CMU's skeleton as joints of a body: which bone is which joint, how the rest poses differ, what counts in a fit."""
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from magnet.body import PARENTS, Body
-from magnet.body.fit import Fit, fit_body, floor_height, swing
+from magnet.body import PARENTS
+from magnet.body.fit import swing
 from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
 from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
+from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.rotations import geodesic
-from magnet.motion.scene import Scene
 
 FPS = 30.0
 ENDS = {
@@ -31,13 +30,10 @@ ENDS = {
 The bone `wrist` is the last third of the forearm: it lies in one line with `radius` and only rolls. The hand bends at
 its end, and so there is the wrist (`radius` ends 7 to 10 cm before it).
 """
-LIMBS = (1, 2, 4, 5, 7, 8, 10, 11, 16, 17, 18, 19, 20, 21)
 WEIGHT = {12: 0.1, 20: 3.0, 21: 3.0}
 """The neck's joint differs too, and so only leans on the fit; dancers hold hands, so that wrists matter."""
 TOUCH, TOUCH_WEIGHT = 0.12, 25.0
 """Metres within which two people's wrists count as touching, and what their weights grow by."""
-HELD = 0.20
-"""Metres within which two people's wrists say that they may hold hands."""
 TURNS = {
     0: "root", 1: "lfemur", 2: "rfemur", 3: "lowerback", 4: "ltibia", 5: "rtibia", 6: "upperback", 7: "lfoot",
     8: "rfoot", 9: "thorax", 10: "ltoes", 11: "rtoes", 12: "upperneck", 15: "head", 16: "lhumerus", 17: "rhumerus",
@@ -56,21 +52,6 @@ ROLL_LIMIT, WRIST_LIMIT = 120.0, 85.0
 """The same for a hand against its forearm: about the forearm's length and away from it."""
 FASTEST_PELVIS, FASTEST_HAND, SLOWEST_HAND, LIKELY_FALL = 4.5, 11.5, 0.1, 24.0
 """Metres a second at the 99th percentile (3.1, 8.3 and 1.8 in the recordings); and m/s2 downwards at the 1st."""
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """A take as a scene, and the numbers for its report."""
-
-    fit: Fit
-    glitches: tuple[Glitches, ...]
-    limb_error: float  # metres, mean over limb joints, valid frames and people
-    wrist_error: float  # the same over both wrists
-    wrist_recorded: float  # metres between two people's nearest wrists over the take; NaN for one person
-    wrist_fitted: float
-    held_recorded: float  # share of frames with two people's wrists closer than HELD; NaN for one person
-    held_fitted: float
-    floor: float  # metres that the recording's ground lay above its y = 0
 
 
 def _about(letter: str, degrees: float) -> Tensor:
@@ -145,54 +126,58 @@ def _half_roll(hand: Tensor) -> tuple[Tensor, Tensor]:
     return roma.rotvec_to_rotmat(axis), wrong
 
 
-def fit_recordings(
-    recordings: Sequence[AmcRecording],
-    body: Body,
-    *,
-    trim: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Fitted:
-    """People captured together as bodies in one scene at 30 fps, standing on y = 0.
+@dataclass(frozen=True)
+class CMUHints:
+    """Rotations of a take's people at 30 fps, and how much each of `ENDS` counts in a fit."""
+
+    recordings: tuple[AmcRecording, ...]
+    targets: Tensor  # (T, P, M, 3)
+
+    def __call__(self, rest: Tensor) -> tuple[Tensor, Tensor]:
+        """As `FitHints` says."""
+        joints = list(ENDS)
+        turn = torch.stack([hints(recording, rest) for recording in self.recordings], dim=1)
+        weights = torch.tensor([WEIGHT.get(j, 1.0) for j in joints], dtype=torch.float64)
+        weights = weights * touching(self.targets, joints)
+        for ankle, ball in ((7, 10), (8, 11)):
+            # A foot turned the wrong way round has its ball on the wrong side.
+            weights[:, :, joints.index(ball)] *= turn[:, :, ankle].isfinite().all(dim=-1).all(dim=-1)
+        return turn, weights
+
+
+def measured(recordings: Sequence[AmcRecording], trim: bool = False) -> tuple[Recording, tuple[Glitches, ...]]:
+    """People captured together as joints at 30 fps, with hints for the fit; and what was mended on the way.
 
     Raises:
-        ValueError: lengths differ, or the body does not fit.
+        ValueError: lengths differ.
     """
     recordings = together(recordings, trim)
     mended, glitches = zip(*(repaired(recording) for recording in recordings), strict=True)
-    resampled = [recording.resampled(FPS) for recording in mended]
-    joints = list(ENDS)
-    ends, turns, valid = [], [], []
-    rest = body.rest_joints(torch.zeros(10))
+    resampled = tuple(recording.resampled(FPS) for recording in mended)
+    ends, valid = [], []
     for recording, glitch in zip(resampled, glitches, strict=True):
         _, end = recording.world()
-        ends.append(torch.from_numpy(end[:, [recording.skeleton.names.index(ENDS[j]) for j in joints]]))
-        turns.append(hints(recording, rest))
+        ends.append(torch.from_numpy(end[:, [recording.skeleton.names.index(ENDS[j]) for j in ENDS]]))
         valid.append(~_seen(glitch.masked, recording.frames, recordings[0].fps))
-    targets, turn, good = torch.stack(ends, dim=1), torch.stack(turns, dim=1), torch.stack(valid, dim=1)
-    weights = torch.tensor([WEIGHT.get(j, 1.0) for j in joints], dtype=torch.float64)
-    weights = weights * touching(targets, joints)
-    for ankle, ball in ((7, 10), (8, 11)):
-        # A foot turned the wrong way round has its ball on the wrong side.
-        weights[:, :, joints.index(ball)] *= turn[:, :, ankle].isfinite().all(dim=-1).all(dim=-1)
-    fit = fit_body(
-        targets, joints, body, rotations=turn, weights=weights, valid=good, grounded=True, fps=FPS, progress=progress
+    targets, good = torch.stack(ends, dim=1), torch.stack(valid, dim=1)
+    notes = [
+        f"{recording.path.name}: {int(glitch.repaired.sum())} frames are glitches, {int(glitch.masked.sum())} of them"
+        " too long to be interpolated"
+        for recording, glitch in zip(recordings, glitches, strict=True)
+        if glitch.repaired.any()
+    ]
+    recording = Recording(
+        fps=FPS,
+        up="+y",
+        positions=targets.numpy(),
+        joints=tuple(ENDS),
+        hints=CMUHints(resampled, targets),
+        valid=good.numpy(),
+        persons=tuple(f"subject {each.path.name.split('_')[0]}" for each in recordings),
+        notes=tuple(notes),
+        said_fps=recordings[0].fps,
     )
-    limbs = [joints.index(j) for j in LIMBS]
-    found = body.joints(fit.scene)[0]
-    scene, floor = on_floor(fit.scene, found, body)
-    wrists = [joints.index(20), joints.index(21)]
-    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, 20:22]))
-    return Fitted(
-        fit=Fit(scene, fit.residual),
-        glitches=tuple(glitches),
-        limb_error=float(fit.residual[good][:, limbs].mean()),
-        wrist_error=float(fit.residual[good][:, wrists].mean()),
-        wrist_recorded=float(recorded.amin()) if len(recorded) else math.nan,
-        wrist_fitted=float(fitted.amin()) if len(fitted) else math.nan,
-        held_recorded=float((recorded < HELD).double().mean()),
-        held_fitted=float((fitted < HELD).double().mean()),
-        floor=floor,
-    )
+    return recording, tuple(glitches)
 
 
 def _seen(masked: np.ndarray, frames: int, fps: float) -> Tensor:
@@ -214,34 +199,6 @@ def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
             near = torch.cdist(targets[:, p, wrists], theirs).amin(dim=-1)
             grown[:, p, wrists] += TOUCH_WEIGHT * torch.exp(-((near / TOUCH) ** 2))
     return grown
-
-
-def wrists_apart(wrists: Tensor, valid: Tensor) -> Tensor:
-    """Metres between the nearest wrists of two people, in frames with two who are valid; none for one person.
-
-    (T, P, 2, 3), (T, P) -> (frames,)
-    """
-    pairs = [(p, q) for p in range(wrists.shape[1]) for q in range(p)]
-    nearest = torch.full((len(wrists), 1), torch.inf, dtype=wrists.dtype)
-    for p, q in pairs:
-        apart = torch.cdist(wrists[:, p], wrists[:, q]).amin(dim=(-1, -2))
-        nearest = torch.cat([nearest, torch.where(valid[:, p] & valid[:, q], apart, torch.inf)[:, None]], dim=1)
-    nearest = nearest.amin(dim=1)
-    return nearest[nearest.isfinite()]
-
-
-def on_floor(scene: Scene, found: Tensor, body: Body) -> tuple[Scene, float]:
-    """The scene moved up or down so that resting feet rest at y = 0; and the height that the floor was at.
-
-    Of the lower sole of each person and frame, the median over valid frames is taken as resting: people stand on at
-    least one foot for most of a take. One height serves everybody, for they stand on one floor.
-    """
-    lowest = floor_height(found, body, scene.betas[0])
-    good = slice(None) if scene.valid is None else scene.valid[0]
-    floor = float(lowest[good].median())
-    T_world_root = scene.T_world_root.clone()
-    T_world_root[..., 1, 3] -= floor
-    return scene.replace(T_world_root=T_world_root), floor
 
 
 def check_rate(recording: AmcRecording) -> None:
@@ -267,8 +224,8 @@ def check_rate(recording: AmcRecording) -> None:
         f"and the pelvis falls with {fall:.0f} m/s2"
     )
     if hand < SLOWEST_HAND:
-        raise ValueError(f"{found}: somebody stands still, which nobody does for long; leave the recording out")
+        raise DataError(f"{found}: somebody stands still, which nobody does for long; leave the recording out")
     if speed > FASTEST_PELVIS or hand > FASTEST_HAND:
-        raise ValueError(f"{found}, which nobody does; give the frame rate of its subject with `fps`")
+        raise DataError(f"{found}, which nobody does; give the frame rate of its subject with `fps`")
     if fall > LIKELY_FALL:
         warnings.warn(f"{found}, which is unlikely; check the frame rate of its subject (`fps`)", stacklevel=2)

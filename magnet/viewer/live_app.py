@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
-from magnet.export.page.takes import Take, take
+from magnet.export.page.takes import ShownTake, take
 from magnet.generation.live import Live, LiveChunk
 from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
+from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
-from magnet.viewer.handles import Keys, Steering
-from magnet.viewer.stage import Stage
-from magnet.viewer.troupe import Look, Troupe
+from magnet.viewer.handles import KeyframePanel, Steering
+from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.worker import Worker
 
 KINDS = ("none", "history", "self", "partner")
@@ -25,7 +25,7 @@ WHAT = {
 }
 
 
-class Playground(Stage):
+class LiveApp(ViewerBase):
     """Watch a model that plays on and on, and interfere.
 
     Args:
@@ -39,47 +39,47 @@ class Playground(Stage):
         body: Body,
         host: str = "127.0.0.1",
         port: int = 8080,
-        look: Look | None = None,
+        render: RenderOptions | None = None,
         ahead: int = 32,
     ) -> None:
-        super().__init__(body, look or Look(), host, port, "magnet live")
+        super().__init__(body, render or RenderOptions(), host, port, "magnet live")
         self.live = live
         self.version = live.version
         self.clock = Clock(live.scene.frames, live.scene.fps, growing=True, loop=False)
         self.worker = Worker(live, ahead, self._refused, self._made)
         self.refusal, self.news = "", ""
         self.again: int | None = None  # the frame to play from, once what has been made anew is on the stage
-        self.casts: dict[tuple[float, ...], Troupe] = {}
+        self.casts: dict[tuple[float, ...], SceneView] = {}
         with self.server.atomic():
             self._cast()
             self.frame_all()
             self.add_timeline()
             self._add_model()
             self.steering = Steering(self)
-            self.keys = Keys(self)
-            self.add_looks(ghosts=None)
+            self.keys = KeyframePanel(self)
+            self.add_render_controls(ghosts=None)
             self.add_saving()
         self.draw()
         self.worker.start()
 
     # -- the growing scene ---------------------------------------------------------------------
 
-    def _take(self) -> Take:
+    def _take(self) -> ShownTake:
         return take("", self.live.scene)
 
     def _cast(self) -> None:
         """Bring the people of the scene onto the stage, who may have been there before."""
         scene = self.live.scene
         key = tuple(scene.betas.flatten().tolist())
-        for troupe in self.troupes:
-            troupe.appear(False)
+        for view in self.views:
+            view.set_visible(False)
         if key not in self.casts:
             first = dataclasses.replace(self._take(), label=f"cast {len(self.casts)}")
-            self.casts[key] = Troupe(self.server, "/stage", self.body, first, np.zeros(3), self.look, label=False)
-        self.troupes = [self.casts[key]]
-        self.troupes[0].take = self._take()
-        self.troupes[0].dress(self.look)
-        self.troupes[0].appear(True)
+            self.casts[key] = SceneView(self.server, "/stage", self.body, first, np.zeros(3), self.render, label=False)
+        self.views = [self.casts[key]]
+        self.views[0].take = self._take()
+        self.views[0].set_style(self.render)
+        self.views[0].set_visible(True)
 
     def before_draw(self) -> None:
         """Take in what has been generated meanwhile."""
@@ -92,8 +92,8 @@ class Playground(Stage):
                 self.again = None
                 self.slider.max = scene.frames - 1
                 self._cast()
-            if scene.frames != self.troupes[0].take.frames:
-                self.troupes[0].take = self._take()
+            if scene.frames != self.views[0].take.frames:
+                self.views[0].take = self._take()
                 self.clock.frames = scene.frames
                 self.slider.max = scene.frames - 1
             self.worker.watch(self.clock.frame)

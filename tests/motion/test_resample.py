@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.datamodules.speeds import at_speed
+from magnet.motion.resample import at_speed
 from magnet.motion.rotations import geodesic
 from magnet.testing import random_scene
 

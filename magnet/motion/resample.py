@@ -1,0 +1,92 @@
+"""Motion at other times: another frame rate, or another speed. Rotations by slerp, places on straight lines."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from magnet.motion.frames import rigid
+from magnet.motion.scene import FPS, Scene
+
+
+def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+    """Rotations between two, along the shorter arc.
+
+    Args:
+        first: (..., 3, 3)
+        second: (..., 3, 3)
+        share: how far on, from 0 to 1; broadcasts against (...).
+    """
+    turn = roma.rotmat_to_rotvec(first.transpose(-1, -2) @ second)
+    return first @ roma.rotvec_to_rotmat(turn * share[..., None])
+
+
+def slerp_quat(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+    """The same of unit quaternions (..., 4)."""
+    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(first), second))
+    return roma.quat_product(first, roma.rotvec_to_unitquat(turn * share[..., None]))
+
+
+def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:
+    """Which two frames each new frame i at time i / target lies between, and how far on: before, after, share."""
+    count = math.floor((frames - 1) * target / fps + 1e-9) + 1
+    place = torch.arange(count, dtype=torch.float64) * (fps / target)
+    before = (place + 1e-9).floor().long().clamp_max(frames - 1)
+    share = (place - before).clamp(0.0, 1.0)
+    share[share < 1e-9] = 0.0  # exact frames stay exact, and need no valid neighbour
+    return before, (before + 1).clamp_max(frames - 1), share
+
+
+def resample_rotations(quat: Tensor, fps: float, target: float = FPS) -> Tensor:
+    """Rotations at exact times, by slerp along the shorter arc. (T, ..., 4) unit quaternions -> (T', ..., 4)"""
+    before, after, share = times(len(quat), fps, target)
+    if not bool(share.any()):
+        return quat[before]
+    return slerp_quat(quat[before], quat[after], share.view(-1, *[1] * (quat.dim() - 2)))
+
+
+def resample_points(points: Tensor, fps: float, target: float = FPS) -> Tensor:
+    """Points at exact times, linearly. (T, ..., 3) -> (T', ..., 3)
+
+    >>> height = torch.arange(5.0, dtype=torch.float64)[:, None].expand(5, 3)  # one metre more each frame, at 60 fps
+    >>> resample_points(height, fps=60.0)[:, 0]
+    tensor([0., 2., 4.], dtype=torch.float64)
+    """
+    before, after, share = times(len(points), fps, target)
+    return torch.lerp(points[before], points[after], share.view(-1, *[1] * (points.dim() - 1)))
+
+
+def resample_valid(valid: NDArray[np.bool_], fps: float, target: float = FPS) -> NDArray[np.bool_]:
+    """A new frame is valid when all frames that it is made of are. (T, P) -> (T', P)"""
+    before, after, share = times(len(valid), fps, target)
+    return valid[before.numpy()] & (valid[after.numpy()] | (share.numpy() == 0)[:, None])
+
+
+def at_speed(scene: Scene, speed: float) -> Scene:
+    """Play a scene at another speed, at the same frames a second; rotations between frames by slerp.
+
+    Raises:
+        ValueError: the speed is not positive.
+    """
+    if speed <= 0:
+        raise ValueError(f"speed: got {speed}, expected a positive number such as 0.9 or 1.1")
+    if speed == 1 or scene.frames < 2:
+        return scene
+    frames = int((scene.frames - 1) / speed) + 1
+    time = (torch.arange(frames, dtype=torch.float64, device=scene.device) * speed).clamp(max=scene.frames - 1)
+    before = time.long().clamp(max=scene.frames - 2)
+    share = (time - before).to(scene.T_world_root.dtype)
+    rotations = torch.cat([scene.T_world_root[..., None, :3, :3], scene.body_rot], dim=-3)  # (B, T, P, 22, 3, 3)
+    first, second = rotations[:, before], rotations[:, before + 1]
+    turned = slerp(first, second, share[:, None, None])
+    ground = scene.T_world_root[..., :3, 3]
+    position = torch.lerp(ground[:, before], ground[:, before + 1], share[:, None, None])
+    valid = None if scene.valid is None else scene.valid[:, before] & scene.valid[:, before + 1]
+    return scene.replace(
+        body_rot=turned[..., 1:, :, :], T_world_root=rigid(turned[..., 0, :, :], position), valid=valid
+    )
