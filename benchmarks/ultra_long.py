@@ -22,7 +22,7 @@ from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import cat_time
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.world import SamplingStats
+from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.schedule import Grid

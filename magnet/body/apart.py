@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -47,6 +48,15 @@ class Apart:
     rounds: int = 2
 
 
+Separation = Literal["off", "light", "firm"]
+
+APART: dict[str, Apart] = {
+    "light": Apart(body=0.06, arms=0.08, speed=0.2),
+    "firm": Apart(),
+}
+"""By name: `light` lets people lean on each other, `firm` leaves them touch."""
+
+
 def nearest_points(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     """The points of the segments a-b and c-d that are nearest to each other. (..., 3) x 4 -> (..., 3) x 2
 
@@ -83,9 +93,8 @@ def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
 def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
     """Ground direction in which one may leave the other, of unit length.
 
-    It leads from the other's pelvis to one's, smoothed over time. People who meet for a moment pass each other, and from
-    one frame to the next are on the other side: they get one direction for the whole encounter, its mean, so that they
-    step aside.
+    It leads from pelvis to pelvis, smoothed over time. People who meet for a moment only pass, and from one frame to
+    the next are on the other side: they get one direction for the whole encounter, its mean, and so step aside.
 
     Args:
         one: (B, T, 22, 3) joints in the world.

@@ -19,7 +19,7 @@ from magnet.body import Body
 from magnet.checks import require_whole
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import SamplerOptions, occupied, planning_grid
-from magnet.generation.world import SamplingStats
+from magnet.generation.stats import SamplingStats
 from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
 from magnet.metrics.interval import Unit, independent_units
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar

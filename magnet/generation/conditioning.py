@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from magnet.body.apart import Separation
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.frames import Placement, canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, empty_scene
@@ -45,6 +46,8 @@ class SamplerOptions:
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
             (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
+        apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
+            is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
             does. None: if codes are what the model was trained to generate (`target` of the denoiser).
         keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
@@ -66,6 +69,7 @@ class SamplerOptions:
     pyramid_offset: int | None = None
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
+    apart: Separation = "off"
     requantize: bool | None = None
     keep_given: bool = True
     blend: int = 10
@@ -81,6 +85,7 @@ class SamplerOptions:
         if not isinstance(self.guidance, Guidance):
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         require_choice("placement", self.placement, Placement)
+        require_choice("apart", self.apart, Separation)
         require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)

@@ -23,7 +23,8 @@ from magnet.generation.conditioning import (
 )
 from magnet.generation.inputs import check_given, check_request
 from magnet.generation.plan import periodic_plan, planned
-from magnet.generation.world import SamplingStats, WorldState
+from magnet.generation.stats import SamplingStats
+from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS, NoiseStream

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,6 +11,8 @@ from torch import Tensor
 from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
 from magnet.generation.causal_bodies import finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
+from magnet.generation.separation import separated
+from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
     Placement,
     align_planar,
@@ -33,61 +34,6 @@ from magnet.sampling.schedule import MaskSchedule
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
     from magnet.generation.conditioning import SamplerOptions
-
-
-@dataclass
-class SamplingStats:
-    """How consistent sampled tokens are and what they cost; filled while sampling.
-
-    `quantization_error`: distance of a sampled latent to its code, as a share of the code's length.
-    `pairwise_drift`: metres between a sampled pairwise transform and what the placed agents imply.
-    `calls`: how often the network ran, a batch at a time. `evaluations`: how often it ran for each scene, views and
-    guidance branches counted one by one.
-    """
-
-    quantization_error_sum: float = 0.0
-    quantization_errors: int = 0
-    pairwise_drift_sum: float = 0.0
-    pairwise_drifts: int = 0
-    runs: int = 0
-    calls: int = 0
-    scenes: int = 0
-    rows: int = 0  # windows that went through the network
-
-    @property
-    def evaluations(self) -> float:
-        return self.rows / max(self.scenes, 1)
-
-    def means(self) -> dict[str, float]:
-        """Means of what was seen; `calls` is that of a run of the sampler."""
-        return {
-            "quantization_error": self.quantization_error_sum / max(self.quantization_errors, 1),
-            "pairwise_drift": self.pairwise_drift_sum / max(self.pairwise_drifts, 1),
-            "calls": self.calls / max(self.runs, 1),
-            "evaluations": self.evaluations,
-        }
-
-    def begin(self, scenes: int) -> None:
-        """A run of the sampler starts."""
-        self.runs += 1
-        self.scenes += scenes
-
-    def add_call(self, rows: int) -> None:
-        """The network runs on so many windows."""
-        self.calls += 1
-        self.rows += rows
-
-    def add_quantization_error(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
-        """latent, code (B, n, P, C), counts (B, n, P) bool"""
-        away = ((latent - code).norm(dim=-1) / code.norm(dim=-1).clamp_min(1e-6))[counts]
-        self.quantization_error_sum += float(away.sum())
-        self.quantization_errors += len(away)
-
-    def add_pairwise_drift(self, pairs: Tensor, implied: Tensor, counts: Tensor) -> None:
-        """pairs, implied (B, n, P, slots, 4, 9), counts (B, n, P, slots) bool"""
-        away = (pairs - implied)[..., 6:].norm(dim=-1).mean(dim=-1)[counts]
-        self.pairwise_drift_sum += float(away.sum())
-        self.pairwise_drifts += len(away)
 
 
 class WorldState:
@@ -166,6 +112,8 @@ class WorldState:
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
+        if self.options.apart != "off" and not decentralized:
+            self._separate(tokens, latent, finished, first, stop)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
@@ -183,6 +131,25 @@ class WorldState:
         changed = layout.spread(changed_groups)
         tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
         return self._enter(tokens, begin, stop)
+
+    def _separate(self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int) -> None:
+        """Move the newly placed out of others' bodies, but for those on their way to a keyframe."""
+        lead = min(1, first)  # a row more in front, so that the decoder knows where poses come from
+        if lead:
+            before = self.model.normalizer.denormalize(tokens[:, first - 1 : first])
+            latent = torch.cat([self.model.layout.unpack(before)[0], latent], dim=1)
+        low, frames = first - lead, slice((first - lead) * STRIDE, stop * STRIDE)
+        new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
+        self.T_world_can[:, frames] = separated(
+            self.model.tokenizer.decode,
+            latent,
+            self._deltas(low, stop),
+            self.T_world_can[:, frames],
+            self.given.slice(frames.start, frames.stop),
+            new,
+            self.options.apart,
+            bool(lead),
+        )
 
     def _deltas(self, first: int, stop: int) -> Tensor:
         """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""

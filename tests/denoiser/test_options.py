@@ -7,7 +7,7 @@ from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.generation.conditioning import SamplerOptions
-from magnet.generation.world import SamplingStats
+from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture

@@ -3,7 +3,7 @@ import torch
 
 from magnet.generation.blending import seam_weights
 from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, stretches
-from magnet.generation.world import SamplingStats
+from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_transforms

@@ -5,7 +5,8 @@ import torch
 
 from magnet.generation.blending import cat_time
 from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, occupied, planning_grid
-from magnet.generation.world import SamplingStats, WorldState
+from magnet.generation.stats import SamplingStats
+from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.sampler import sample

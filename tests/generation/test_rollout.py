@@ -16,7 +16,8 @@ from magnet.generation.conditioning import (
 )
 from magnet.generation.plan import first_changed, periodic_plan
 from magnet.generation.rollout import Rollout
-from magnet.generation.world import SamplingStats, WorldState
+from magnet.generation.stats import SamplingStats
+from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream

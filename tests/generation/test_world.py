@@ -5,7 +5,8 @@ import torch
 
 from magnet.generation.blending import freeze_after
 from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown
-from magnet.generation.world import SamplingStats, WorldState
+from magnet.generation.stats import SamplingStats
+from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.sampling.sampler import sample
