@@ -32,7 +32,7 @@ from magnet.sampling.schedule import MaskSchedule
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
 
 
 @dataclass
