@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 TASK_GRIDS = (
-    Grid(46, 2, 8, steps=6),
-    Grid(20, 3, 4, steps=5, window=8, stride=3),
+    Grid(30, 2, 8, steps=4),
+    Grid(20, 3, 4, steps=4, window=8, stride=3),
     Grid(16, 4, 8, steps=3),
     Grid(24, 1, 1, steps=2),
     Grid(12, 2, 0, steps=3, window=8, stride=2),
