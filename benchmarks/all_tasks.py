@@ -12,23 +12,24 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import lightning as L
 import torch
+from torch import Tensor
 
+from magnet.baselines.predictor import Generators
 from magnet.cli import run_folder
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import TRUTH, Evaluation, Predictor
+from magnet.evaluation.evaluator import TRUTH, Evaluator
 from magnet.evaluation.results import Results, machine
-from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.base import Task
 from magnet.tasks.inbetweening import Inbetweening
@@ -39,7 +40,6 @@ METRICS = ["fd", "div", "mi", "fs", "ip_ratio", "mpjpe@1s", "mpjpe@5s", "mpjpe_b
 PARTNER = "one person: "
 REPLACED = ", all else replaced"
 LEAK = ", pairs leak"
-Generators = torch.Generator | Sequence[torch.Generator]
 
 
 def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
@@ -76,29 +76,23 @@ def rows(options: SamplerOptions) -> dict[str, tuple[Task, SamplerOptions]]:
     }
 
 
-class Replaced(Evaluation):
+class Replaced(Evaluator):
     """The sampler sees other motion in place of all that the task does not give: scores must not notice."""
 
-    def _model(self, model: Denoiser) -> Predictor:
-        predict = super()._model(model)
-
-        def blind(scene: Scene, samples: int, generator: Generators) -> Scene:
-            known = self.schedule(model, self.context, self.horizon).known.repeat_interleave(STRIDE, dim=0)
-            keep = (
-                known[: scene.frames, : scene.agents, None, None].to(scene.device)
-                | ~scene.present[:, None, :, None, None]
-            )
-            other = scene.select(torch.arange(scene.scenes).roll(1))
-            return predict(
-                scene.replace(
-                    body_rot=torch.where(keep[..., None], scene.body_rot, other.body_rot.flip(1)),
-                    T_world_root=torch.where(keep, scene.T_world_root, other.T_world_root.flip(1)),
-                ),
-                samples,
-                generator,
-            )
-
-        return blind
+    def predict_joints(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
+        known = self.schedule(self.context, self.horizon).known.repeat_interleave(STRIDE, dim=0)
+        keep = (
+            known[: scene.frames, : scene.agents, None, None].to(scene.device) | ~scene.present[:, None, :, None, None]
+        )
+        other = scene.select(torch.arange(scene.scenes).roll(1))
+        return super().predict_joints(
+            scene.replace(
+                body_rot=torch.where(keep[..., None], scene.body_rot, other.body_rot.flip(1)),
+                T_world_root=torch.where(keep, scene.T_world_root, other.T_world_root.flip(1)),
+            ),
+            samples,
+            generators,
+        )
 
 
 def measure(
@@ -111,14 +105,13 @@ def measure(
     replaced: bool = False,
 ) -> Results:
     """One row, with the ground truth's beside it."""
-    evaluation = (Replaced if replaced else Evaluation)(task, samples, options, baselines=False)
-    model.configure_test(evaluation)
+    evaluator = (Replaced if replaced else Evaluator)(model, task, options, samples, baselines=False)
     callbacks = [run_folder.progress_bar(sampling=True)]
     silent = {"logger": False, "enable_checkpointing": False, "enable_model_summary": False}
     trainer = L.Trainer(accelerator="auto", precision=precision, callbacks=callbacks, **silent)  # type: ignore[arg-type]
-    trainer.test(model, datamodule=data, verbose=False)
-    assert evaluation.results is not None
-    return evaluation.results
+    trainer.test(evaluator, datamodule=data, verbose=False)
+    assert evaluator.results is not None
+    return evaluator.results
 
 
 def leaking(model: Denoiser) -> Denoiser:

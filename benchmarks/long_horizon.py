@@ -31,11 +31,12 @@ from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import aligned
 from magnet.evaluation.results import machine
 from magnet.export.picture import contact_sheet
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
 from magnet.metrics.frechet import moments
 from magnet.motion.scene import Scene, concatenate
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import JointFuture
 
 CONTEXT, WINDOW = 4, 150
@@ -138,7 +139,7 @@ def main() -> None:
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):
-        long = model.generate(concatenate(chosen), JointFuture(), CONTEXT, given.frames, 1, options, generator)
+        long = generate(model, concatenate(chosen), JointFuture(), CONTEXT, given.frames, 1, options, generator)
     seconds = time.perf_counter() - began
 
     real, training = windows(data, "test"), windows(data, "train")

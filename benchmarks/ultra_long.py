@@ -21,10 +21,11 @@ import torch
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import stream
 from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import Task, registry
 from magnet.testing import random_scene, tiny_denoiser
@@ -73,7 +74,8 @@ def measure(options: argparse.Namespace) -> None:
     scene = recorded(options, frames if given_later(task, context) else context)
     empty = resident()
     began = time.perf_counter()
-    chunks = model.stream(
+    chunks = stream(
+        model,
         scene,
         task,
         context,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from magnet.version import __version__
+
 if TYPE_CHECKING:
     from magnet.api import Model, Motion, load, read
     from magnet.body import load_body, on_floor
@@ -12,8 +14,6 @@ if TYPE_CHECKING:
     from magnet.motion.scene import Scene
     from magnet.tasks.registry import register_task
     from magnet.tokenizer.module import Tokenizer
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Denoiser",

@@ -18,10 +18,11 @@ from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.partner import Partner
+from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
 from magnet.motion.tokens import STRIDE
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 
 if TYPE_CHECKING:
@@ -351,7 +352,7 @@ class Model:
         chosen: Task = kind(**fields)
         generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
-        sampled = self.denoiser.generate(plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
+        sampled = generate(self.denoiser, plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
         return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
 

@@ -15,8 +15,8 @@ import magnet
 from magnet.api import Model, Motion
 from magnet.body import load_body
 from magnet.export import resampled, save_bvh
-from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene, cat_time, concatenate
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser

@@ -11,10 +11,11 @@ from torch.utils.data import DataLoader
 
 from magnet.body import load_body
 from magnet.denoiser.module import Denoiser
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.precision import Float32
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 
@@ -33,7 +34,7 @@ def sampled(dtype: torch.dtype, task: str, guidance: Guidance | None = None) -> 
     scene = random_scene(1, 40, 2, torch.Generator().manual_seed(1))
     generator = torch.Generator().manual_seed(2)
     sampler = SamplerOptions(steps=2, guidance=guidance or Guidance())
-    return model_of(dtype).generate(scene, registry.get(task)(), context, 16, options=sampler, generator=generator)
+    return generate(model_of(dtype), scene, registry.get(task)(), context, 16, options=sampler, generator=generator)
 
 
 @pytest.mark.parametrize("dtype", FAR, ids=str)

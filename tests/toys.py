@@ -9,6 +9,8 @@ from lightning.pytorch import LightningDataModule, LightningModule
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from magnet.evaluation.evaluator import Evaluator
+
 
 class ToyModel(LightningModule):
     """One matrix.
@@ -28,9 +30,6 @@ class ToyModel(LightningModule):
         self.weight = nn.Parameter(torch.ones(max_agents, window))
         ToyModel.seen = {"model": self}
 
-    def configure_test(self, evaluation: Any) -> None:
-        ToyModel.seen["evaluation"] = evaluation
-
     def _loss(self, batch: Tensor) -> Tensor:
         return (self.weight.mean() - batch.mean()).square()
 
@@ -48,6 +47,28 @@ class ToyModel(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.SGD(self.parameters(), lr=self.lr)
+
+
+class ToyEvaluator(Evaluator):
+    """Around a toy in place of a denoiser: it keeps what it was given, for tests to look at, and samples nothing."""
+
+    def setup(self, stage: str) -> None:
+        ToyModel.seen["evaluator"] = self
+
+    def on_test_start(self) -> None:
+        pass
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        pass
+
+    def on_test_epoch_end(self) -> None:
+        pass
+
+    def on_predict_start(self) -> None:
+        pass
+
+    def predict_step(self, batch: Any, batch_idx: int) -> Any:
+        return batch
 
 
 class ToyData(LightningDataModule):

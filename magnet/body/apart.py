@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -47,8 +46,6 @@ class Apart:
     speed: float = 0.3
     rounds: int = 2
 
-
-Separation = Literal["off", "light", "firm"]
 
 APART: dict[str, Apart] = {
     "light": Apart(body=0.06, arms=0.08, speed=0.2),

@@ -101,7 +101,7 @@ def sampler_preset(name: str) -> dict[str, Any]:
     Raises:
         CommandError: no such preset; names the closest.
     """
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
 
     try:
         return dataclasses.asdict(SamplerOptions.preset(name))

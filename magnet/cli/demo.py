@@ -19,11 +19,13 @@ from magnet.cli import outputs, run_folder
 from magnet.cli.train import quiet
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import Evaluation, aligned
+from magnet.evaluation.evaluator import Evaluator, aligned
+from magnet.evaluation.results import Results
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS, preset_name
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.base import Task
@@ -94,9 +96,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         test_clips=options.scenes, test_limit=options.scenes, train_clips=60, test_batch_size=options.scenes
     )
     sampler = SamplerOptions.preset(options.sampler, **({} if options.steps is None else {"steps": options.steps}))
-    evaluation = measure(model, data, sampler, options.samples)
+    results = measure(model, data, sampler, options.samples)
     facts = {"checkpoint": options.ckpt_path or "shipped"}
-    outputs.show_results(evaluation, out, facts)
+    outputs.show_results(results, out, facts)
     for show in SHOWS:
         if options.sampler == "paper":  # what the shows themselves ask for suits our own way of sampling
             show = replace(show, stabilization_level=sampler.guidance.stabilization_level)
@@ -119,10 +121,9 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
-def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: int) -> Evaluation:
+def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: int) -> Results:
     """Joint future prediction on held-out scenes, beside the baselines."""
-    evaluation = Evaluation(JointFuture(), samples, sampler, baseline_stride=30)
-    model.configure_test(evaluation)
+    evaluator = Evaluator(model, JointFuture(), sampler, samples, baseline_stride=30)
     trainer = L.Trainer(
         accelerator="cpu",
         logger=False,
@@ -130,8 +131,9 @@ def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: 
         enable_model_summary=False,
         callbacks=[run_folder.progress_bar(sampling=True)],
     )
-    trainer.test(model, datamodule=data, verbose=False)
-    return evaluation
+    trainer.test(evaluator, datamodule=data, verbose=False)
+    assert evaluator.results is not None
+    return evaluator.results
 
 
 def perform(
@@ -143,7 +145,7 @@ def perform(
     generator = torch.Generator().manual_seed(data.seed)
     began = time.perf_counter()
     sampler = replace(sampler, guidance=replace(sampler.guidance, stabilization_level=show.stabilization_level))
-    sampled = model.generate(truth, show.task, show.context, frames, 1, sampler, generator)
+    sampled = generate(model, truth, show.task, show.context, frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
     sampled.save(out / f"{show.name}.npz")
     rows = {show.words: sampled}

@@ -7,8 +7,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from magnet import __version__
 from magnet.cli.errors import CommandError, explain, no_such
+from magnet.version import __version__
 
 TRAINER_COMMANDS = {
     "fit": "train a tokenizer or a denoiser",

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from magnet.cli import run_folder
-from magnet.evaluation.evaluator import UNALIGNED, Evaluation
-from magnet.evaluation.results import machine, print_table
+from magnet.evaluation.evaluator import UNALIGNED, Evaluator
+from magnet.evaluation.results import Results, machine, print_table
 from magnet.motion.scene import Scene
 
 PANELS = 4
@@ -27,18 +27,15 @@ WIDE = 100
 """Columns that a table may have where it is written to no screen."""
 
 
-def show_results(evaluation: Evaluation, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
+def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
     """Print the table; write all of it as JSON and CSV, with how it came about.
 
     Args:
-        evaluation: a run that is finished.
+        results: of a run that is finished.
         folder: to write to.
         facts: more of how it came about.
         full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
     """
-    results = evaluation.results
-    if results is None:
-        return
     results.meta.update(run_folder.provenance() | {"machine": machine()} | facts)
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
@@ -76,8 +73,7 @@ def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
 
 def write_scenes(
     predicted: list[Scene],
-    evaluation: Evaluation,
-    model: Any,
+    evaluator: Evaluator,
     data: Any,
     folder: Path,
     picture: str,
@@ -90,23 +86,23 @@ def write_scenes(
     from magnet.export.picture import contact_sheet
     from magnet.export.video import render_video
 
-    rank = f"{model.global_rank}-" if model.trainer.world_size > 1 else ""
+    rank = f"{evaluator.global_rank}-" if evaluator.trainer.world_size > 1 else ""
     number = 0
     for batch in predicted:
-        for first in range(0, batch.scenes, evaluation.samples):
-            scene = batch.select(slice(first, first + evaluation.samples)).to("cpu")
+        for first in range(0, batch.scenes, evaluator.samples):
+            scene = batch.select(slice(first, first + evaluator.samples)).to("cpu")
             name = f"{rank}{number:04d}{_safe(scene)}"
             scene.save(folder / "scenes" / f"{name}.npz")
-            if picture != "none" and number < pictures and model.global_rank == 0:
+            if picture != "none" and number < pictures and evaluator.global_rank == 0:
                 shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
                 look = {"context_frames": data.context_frames, "body": data.body.to("cpu")}
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
-    facts = evaluation.facts(model) | run_folder.provenance() | {"machine": machine()}
+    facts = evaluator.facts() | run_folder.provenance() | {"machine": machine()}
     (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
     print(cost(facts["sampling"]))
-    print(f"written: {number} scenes of {evaluation.samples} samples to {folder / 'scenes'}")
+    print(f"written: {number} scenes of {evaluator.samples} samples to {folder / 'scenes'}")
 
 
 def _safe(scene: Scene) -> str:

@@ -19,9 +19,9 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, Pr
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-import magnet
 from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.errors import CommandError
+from magnet.version import __version__
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma")
 FOLDER_VARIABLE = "MAGNET_RUN_FOLDER"
@@ -167,9 +167,9 @@ class SamplingProgress(ProgressBar):
 
     def _begin(self, what: str, batches: float, trainer: Trainer, model: Any) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        plan = model.evaluation.schedule(model, data.context_frames, data.horizon_frames)
+        plan = model.schedule(data.context_frames, data.horizon_frames)
         self.what, self.done, self.total = what, 0, int(batches) * plan.evaluations
-        model.evaluation.progress = self._advance
+        model.progress = self._advance
         self.lines._start()
         if self.enabled and trainer.is_global_zero and sys.stdout.isatty():
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -248,7 +248,7 @@ class Record(Callback):
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[CONFIG_KEY] = self.options
-        checkpoint["magnet_version"] = magnet.__version__
+        checkpoint["magnet_version"] = __version__
         if trainer.is_global_zero and self.latest:
             point(self.folder.with_name(LATEST), self.folder)
 
@@ -271,10 +271,10 @@ def provenance() -> dict[str, Any]:
     return {
         "command": shlex.join(["magnet", *sys.argv[1:]]),
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "magnet": magnet.__version__,
+        "magnet": __version__,
         "python": sys.version.split()[0],
         "packages": {name: _version(name) for name in PACKAGES},
-        "git": git_state(Path(magnet.__file__).parent),
+        "git": git_state(Path(__file__).parents[1]),
     }
 
 

@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
-from magnet import __version__
 from magnet.tasks import registry
+from magnet.version import __version__
 
 ALIASES = "magnet.cli.tasks.aliases"
 SHOW_USAGE = "magnet tasks show NAME [--out FILE.png] [--people 2] [--task.FIELD VALUE]"

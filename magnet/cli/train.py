@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import logging
 import os
@@ -26,10 +25,10 @@ from magnet.cli.parser import Parser
 from magnet.cli.tasks import NamedTask, alias_path, aliases, task_of
 from magnet.datamodules import registry
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import Evaluation
+from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
-from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
@@ -176,7 +175,7 @@ class MagnetCLI(LightningCLI):
     ) -> None:
         self.command, self.arguments, self.checkpoint, self.folder = command, arguments, checkpoint, folder
         self.classes = classes
-        self.evaluation: Evaluation | None = None
+        self.evaluator: Evaluator | None = None
         self.predicted: list[Any] = []
         self.models, self.data = named_classes()
         self.tasks = aliases() if command in SAMPLING else {}
@@ -223,7 +222,7 @@ class MagnetCLI(LightningCLI):
             self._default_class(parser, "task", alias_path(DEFAULT_TASK))
             parser.add_class_arguments(SamplerOptions, "sampler")
             parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
-            parser.add_class_arguments(Evaluation, skip={"task", "options"}, instantiate=False)
+            parser.add_class_arguments(Evaluator, skip={"denoiser", "task", "sampler"}, instantiate=False)
         if self.command == "test":
             parser.add_argument(
                 "--full", action="store_true", help="print all that was measured, with intervals, not the main numbers"
@@ -271,7 +270,7 @@ class MagnetCLI(LightningCLI):
             if not any(isinstance(callback, ModelCheckpoint) for callback in callbacks):
                 callbacks += run_folder.checkpoints(self.folder, self.model)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
-            sampling = self.command in SAMPLING and hasattr(self.model, "configure_test")
+            sampling = self.command in SAMPLING and isinstance(self.model, Denoiser)
             callbacks.append(run_folder.progress_bar(sampling))
         logger = config.get("logger")
         if logger is None or logger is True:
@@ -316,20 +315,25 @@ class MagnetCLI(LightningCLI):
         checkpoint = None if self.checkpoint is None else str(self.checkpoint)
         more = {"verbose": False} if subcommand in ("validate", "test") else {}
         words = super()._prepare_subcommand_kwargs(subcommand)
+        if self.evaluator is not None:
+            return {**words, **more, "model": self.evaluator}
         return {**words, **more, "ckpt_path": checkpoint, "weights_only": True}
 
     # -- running -------------------------------------------------------------------------------
 
     def _evaluate(self) -> None:
-        if not hasattr(self.model, "configure_test"):
+        """Put an evaluator around a denoiser, whose checkpoint is read here: the Trainer's model is the evaluator."""
+        if not isinstance(self.model, Denoiser):
             return
+        if self.checkpoint is not None:
+            stored = weights.read(self.checkpoint)
+            self.model.on_load_checkpoint(stored)
+            self.model.load_state_dict(stored["state_dict"])
         config = self.config_init[self.command]
-        names = {field.name for field in dataclasses.fields(Evaluation) if field.init} - {"task", "options"}
-        options = {name: config[name] for name in names}
+        options = {name: config[name] for name in ("samples", "baselines", "seed", "baseline_stride", "interval")}
         if options["samples"] < 1:
             raise CommandError(f"--samples is {options['samples']}, expected at least 1")
-        self.evaluation = Evaluation(task=task_of(config["task"]), options=config["sampler"], **options)
-        self.model.configure_test(self.evaluation)
+        self.evaluator = Evaluator(self.model, task_of(config["task"]), config["sampler"], **options)
 
     def before_fit(self) -> None:
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
@@ -361,18 +365,18 @@ class MagnetCLI(LightningCLI):
         """Show the table of methods, or what was logged."""
         if not self.trainer.is_global_zero:
             return
-        if self.evaluation is None or self.evaluation.results is None:
+        if self.evaluator is None or self.evaluator.results is None:
             return outputs.show_metrics(self.trainer, self.folder, self.command)
         task = self._option("task").class_path.rsplit(".", 1)[-1]
         facts = {"task": task, "checkpoint": str(self.checkpoint), "data": self.config_dump.get("data")}
-        outputs.show_results(self.evaluation, self.folder, facts, self._option("full"))
+        outputs.show_results(self.evaluator.results, self.folder, facts, self._option("full"))
 
     def after_predict(self) -> None:
         """Write scenes and pictures."""
         scenes = [batch for batch in self.predicted if isinstance(batch, Scene)]
-        if self.evaluation is not None and scenes:
+        if self.evaluator is not None and scenes:
             picture, count = self._option("picture"), self._option("pictures")
-            outputs.write_scenes(scenes, self.evaluation, self.model, self.datamodule, self.folder, picture, count)
+            outputs.write_scenes(scenes, self.evaluator, self.datamodule, self.folder, picture, count)
             self._point_to_viewer()
 
     def _point_to_viewer(self) -> None:

@@ -201,7 +201,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
 
 def sampler_options(options: argparse.Namespace) -> Any:
     """How to sample, as --sampler and --steps say."""
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
 
     steps = STEPS if options.sampler is None and options.steps is None else options.steps
     return SamplerOptions.preset(options.sampler or "default", **({} if steps is None else {"steps": steps}))

@@ -1,4 +1,4 @@
-"""`Denoiser`: training the diffusion forcing transformer, and sampling every task with it."""
+"""`Denoiser`: the diffusion forcing transformer and its training."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ from magnet.denoiser.objective import training_losses
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.transformer import Rope, Transformer
-from magnet.evaluation.evaluator import Evaluation
-from magnet.generation import rollout
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
 from magnet.old_names import renamed_checkpoint
@@ -148,7 +146,6 @@ class Denoiser(L.LightningModule):
         self.save_hyperparameters()
         self.window = window
         self.tokenizer: Tokenizer | RawPose
-        self.evaluation: Evaluation | None = None
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
@@ -288,9 +285,6 @@ class Denoiser(L.LightningModule):
             there = there & whole[:, :, None, None]
         return tokens, there
 
-    generate = rollout.generate
-    stream = rollout.stream
-
     # -- training ------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
@@ -353,27 +347,3 @@ class Denoiser(L.LightningModule):
         parts = [self.transformer] if self.posterior is None else [self.transformer, self.posterior]
         trained = [parameter for part in parts for parameter in part.parameters()]
         return adamw_cosine(self, trained, h.learning_rate, h.weight_decay, h.warmup_steps)
-
-    # -- testing and predicting ----------------------------------------------------------------
-
-    def configure_test(self, evaluation: Evaluation) -> None:
-        """What `test` and `predict` do; the command line calls this."""
-        self.evaluation = evaluation
-
-    def _evaluation(self) -> Evaluation:
-        self.require_tokenizer()
-        if self.evaluation is None:
-            self.evaluation = Evaluation()
-        return self.evaluation
-
-    def on_test_start(self) -> None:
-        self._evaluation().start(self, self.trainer.datamodule)  # type: ignore[attr-defined]
-
-    def test_step(self, batch: Scene, batch_idx: int) -> None:
-        self._evaluation().step(self, batch, batch_idx)
-
-    def on_test_epoch_end(self) -> None:
-        self.log_dict(self._evaluation().finish(self))
-
-    def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
-        return self._evaluation().predict(self, batch, batch_idx, self.trainer.datamodule)  # type: ignore[attr-defined]

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, place, project_se2
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
+from magnet.sampling.options import SamplerOptions
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser

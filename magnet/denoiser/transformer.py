@@ -60,7 +60,7 @@ def without_dropout(network: nn.Module) -> Iterator[None]:
             network.train()
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Post-norm transformer encoder block: self-attention over all tokens of a scene, then a GELU MLP."""
 
     def __init__(self, width: int, heads: int, mlp_ratio: int, dropout: float, rope_heads: bool) -> None:
@@ -99,7 +99,7 @@ class Transformer(nn.Module):
         layers: transformer blocks, paper Table A.2.
         heads: attention heads, paper Table A.2.
         mlp_ratio: hidden size of a block's MLP over d, paper Table A.2.
-        dropout: method.md C.4; the paper does not say.
+        dropout: the paper does not say; 0.05 is that of the authors' configuration.
         level_width: size of the noise-level embedding, paper Table A.2.
         agent_width: size of the agent embedding, paper Table A.2.
         slot_width: size of the noise-level embedding of each partner slot (ours: the paper has one level a token).
@@ -140,7 +140,7 @@ class Transformer(nn.Module):
             *(nn.Linear(width, width), nn.LayerNorm(width)),
         )
         self.blocks = nn.ModuleList(
-            Block(width, heads, mlp_ratio, dropout, rope_heads=rope == "heads") for _ in range(layers)
+            TransformerBlock(width, heads, mlp_ratio, dropout, rope_heads=rope == "heads") for _ in range(layers)
         )
         self.out_proj = nn.Linear(width, layout.width)
         self.register_buffer("groups", layout.groups(), persistent=False)

@@ -1,12 +1,12 @@
-"""What `magnet test` and `magnet predict` do with a task: sample, compare with baselines, measure, write down."""
+"""`Evaluator`: what `magnet test` and `magnet predict` do with a trained denoiser and a task."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,22 +17,23 @@ from magnet.baselines.predictor import Generators, JointBaseline, Predictor, Sce
 from magnet.baselines.windows import moved_points
 from magnet.body import Body
 from magnet.checks import require_whole
+from magnet.datamodules.base import MotionDataModule
+from magnet.denoiser.module import Denoiser
 from magnet.evaluation.results import Results
-from magnet.generation.conditioning import SamplerOptions, occupied, planning_grid
+from magnet.generation.conditioning import occupied
+from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
 from magnet.metrics.interval import Unit, independent_units
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import STRIDE
+from magnet.precision import require_float32_scenes
+from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
 from magnet.tasks.base import Task
 from magnet.tasks.joint import JointFuture
-
-if TYPE_CHECKING:
-    from magnet.datamodules.base import MotionDataModule
-    from magnet.denoiser.module import Denoiser
 
 MODEL, TRUTH, TRAINING = "magnet", "ground truth", "training set"
 """The rows of the model, of the recorded futures, and of training windows in place of samples."""
@@ -57,14 +58,14 @@ AGAINST_RECORDING = ("mpj", "hand_contact_")
 """Numbers that compare a sample with the recording of its own scene, by how their names begin."""
 
 
-@dataclass
-class Evaluation:
-    """A test run.
+class Evaluator(L.LightningModule):
+    """Samples a task with a trained denoiser and measures it; what `trainer.test` and `trainer.predict` are given.
 
     Args:
+        denoiser: the trained model.
         task: what is sampled.
+        sampler: how it is sampled.
         samples: scenes drawn for each test scene (paper 4: 10).
-        options: how they are sampled.
         baselines: also measure nearest neighbour, random sample and zero velocity, aligned with the context and as
             found, a ridge regression, training windows in place of samples, and how near samples come to these.
         seed: all noise follows from it. A sample's is its own, whatever else is in the batch, so that scores do not
@@ -72,47 +73,89 @@ class Evaluation:
         baseline_stride: frames between the starts of training stretches that baselines choose from.
         interval: what confidence intervals take as independent: `take`, recordings; `scene`, runs of test scenes of
             which none overlaps the first of another; `auto`, recordings where there are five or more, else runs.
+
+    Attributes:
+        results: the table, once a test has ended.
+        progress: told 1 after each denoising step.
+        stats: how well what was sampled hangs together, and what it cost.
+
+    Raises:
+        ValueError: no samples or no stride.
     """
 
-    task: Task = field(default_factory=JointFuture)
-    samples: int = 10
-    options: SamplerOptions = field(default_factory=SamplerOptions)
-    baselines: bool = True
-    seed: int = 1111
-    baseline_stride: int = 15
-    interval: Unit = "auto"
-    results: Results | None = field(default=None, init=False)
-    progress: Callable[[int], None] | None = field(default=None, init=False)
-    stats: SamplingStats = field(default_factory=SamplingStats, init=False)
-    scenes: int = field(default=0, init=False)
-    unit_of: dict[str, int] = field(default_factory=dict, init=False)
+    def __init__(
+        self,
+        denoiser: Denoiser,
+        task: Task | None = None,
+        sampler: SamplerOptions | None = None,
+        samples: int = 10,
+        baselines: bool = True,
+        seed: int = 1111,
+        baseline_stride: int = 15,
+        interval: Unit = "auto",
+    ) -> None:
+        super().__init__()
+        require_whole("samples", samples, 1)
+        require_whole("baseline_stride", baseline_stride, 1)
+        self.denoiser, self.task, self.sampler = denoiser, task or JointFuture(), sampler or SamplerOptions()
+        self.samples, self.baselines, self.seed = samples, baselines, seed
+        self.baseline_stride, self.interval = baseline_stride, interval
+        self.results: Results | None = None
+        self.progress: Callable[[int], None] | None = None
+        self.stats, self.scenes = SamplingStats(), 0
+        self.unit_of: dict[str, int] = {}
 
-    def start(self, model: Denoiser, datamodule: MotionDataModule) -> None:
+    # -- what the Trainer calls ----------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        self.denoiser.require_tokenizer()
+        require_float32_scenes(self.trainer.precision)
+
+    def on_test_start(self) -> None:
+        self.start(self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def test_step(self, batch: Scene, batch_idx: int) -> None:
+        self.step(batch)
+
+    def on_test_epoch_end(self) -> None:
+        self.log_dict(self.finish())
+
+    def on_predict_start(self) -> None:
+        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
+        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        self.stats, self.scenes = SamplingStats(), 0
+
+    def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
+        """Context and samples of one batch of scenes, for writing."""
+        generators = self.generators_of(batch.scenes)
+        self.scenes += batch.scenes
+        return self._sampled(batch, self.samples, generators)
+
+    # -- setting up ----------------------------------------------------------------------------
+
+    def start(self, datamodule: MotionDataModule) -> None:
         """Set up methods and metrics.
 
         Baselines continue what everybody did before: they are left out where the task does not give that.
 
         Raises:
-            ValueError: no samples, no stride, the context is not a whole number of tokens, or `interval` is none of
-                its choices.
+            ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
         """
-        require_whole("samples", self.samples, 1)
-        require_whole("baseline_stride", self.baseline_stride, 1)
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
         if self.context % STRIDE:
             raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")
-        self.body: Body = datamodule.body.to(model.device)
+        self.body: Body = datamodule.body.to(self.denoiser.device)
         self._read_test_scenes(datamodule)
-        known = self.schedule(model, self.context, self.horizon, self.slots).known
+        known = self.schedule(self.context, self.horizon, self.slots).known
         self.past_is_given = self.context > 0 and bool(known[: self.context // STRIDE].all())
         self.nothing_is_given = not bool(known.any())
-        self.methods: dict[str, Predictor] = {MODEL: self._model(model)}
+        self.methods: dict[str, Predictor] = {MODEL: self.predict_joints}
         self.windows: Windows | None = None
         fps = datamodule.store("test").fps
         if self.baselines:
-            self.windows = self._training_windows(model, datamodule)
+            self.windows = self._training_windows(datamodule)
             if self.past_is_given:
-                self.methods |= self._baselines(model, datamodule, self.windows)
+                self.methods |= self._baselines(datamodule, self.windows)
         measured = [*self.methods, TRAINING] if self.windows is not None else list(self.methods)
         self.metrics = {name: all_metrics(fps, confidence=CONFIDENCE) for name in measured}
         self.metrics[TRUTH] = ground_truth_metrics(fps, confidence=CONFIDENCE)
@@ -120,7 +163,7 @@ class Evaluation:
             for name in (MODEL, TRUTH):
                 nearest = NearestTraining(self.windows, "truth" if name == TRUTH else "generated", None, CONFIDENCE)
                 self.metrics[name].add_metrics({"memorisation": nearest})
-        self.metrics = {name: metrics.to(model.device) for name, metrics in self.metrics.items()}
+        self.metrics = {name: metrics.to(self.denoiser.device) for name, metrics in self.metrics.items()}
         self.stats, self.scenes = SamplingStats(), 0
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
 
@@ -139,60 +182,68 @@ class Evaluation:
         """The last recorded frame; the first one where there is no past."""
         return max(self.context - 1, 0)
 
-    def schedule(self, model: Denoiser, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
+    def schedule(self, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
         """The task's plan for scenes of so many frames, of people in the first `slots` slots; by default in all."""
         tokens = -(-(context + horizon) // STRIDE)
         past = context // STRIDE
-        agents = model.layout.agents if slots is None else slots
-        return self.task.schedule(planning_grid(tokens, agents, past, model.window, self.options))
+        agents = self.denoiser.layout.agents if slots is None else slots
+        return self.task.schedule(planning_grid(tokens, agents, past, self.denoiser.window, self.sampler))
 
-    def generated(self, model: Denoiser, scene: Scene) -> Tensor:
+    def generated(self, scene: Scene) -> Tensor:
         """Which future frames of whom the task generates, and so what is scored. -> (horizon, P) bool
 
         Scenes are sampled by a plan for the slots that somebody is in, so this is the same plan's.
         """
-        schedule = self.schedule(model, self.context, self.horizon, occupied(scene))
+        schedule = self.schedule(self.context, self.horizon, occupied(scene))
         generated = (schedule.finished & ~schedule.known).repeat_interleave(STRIDE, dim=0)
         future = generated[self.context : self.context + self.horizon]
         return torch.nn.functional.pad(future, (0, scene.agents - future.shape[1])).to(scene.device)
 
     # -- methods -------------------------------------------------------------------------------
 
-    def _model(self, model: Denoiser) -> Predictor:
-        def predict(scene: Scene, samples: int, generators: Generators) -> Tensor:
-            whole = self.sample(model, scene, samples, generators)
-            with torch.autocast(scene.device.type, enabled=False):
-                return joints_of(in_slots(whole.slice(self.context), scene.agents), self.body, samples)
+    def predict_joints(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
+        """The model as one of the methods: joints of the frames after the context. -> (S, B, horizon, P, 22, 3)"""
+        whole = self.sample(scene, samples, generators)
+        with torch.autocast(scene.device.type, enabled=False):
+            return joints_of(in_slots(whole.slice(self.context), scene.agents), self.body, samples)
 
-        return predict
-
-    def sample(self, model: Denoiser, scene: Scene, samples: int, generators: Generators) -> Scene:
+    def sample(self, scene: Scene, samples: int, generators: Generators) -> Scene:
         """Context and samples, in the model's slots.
 
         Where nothing is given samples stand anywhere: they are put where recorded ones are.
         """
-        context, horizon, options = self.context, self.horizon, self.options
-        scene = in_slots(scene, min(scene.agents, max(occupied(scene), model.layout.agents)))
-        whole = model.generate(
-            scene, self.task, context, horizon, samples, options, generators, self.progress, self.stats
-        )
+        whole = self._sampled(scene, samples, generators)
         if not self.nothing_is_given:
             return whole
         with torch.autocast(scene.device.type, enabled=False):
             return aligned(whole, self.now)
 
-    def _training_windows(self, model: Denoiser, datamodule: MotionDataModule) -> Windows:
+    def _sampled(self, scene: Scene, samples: int, generators: Generators) -> Scene:
+        return generate(
+            self.denoiser,
+            in_slots(scene, min(scene.agents, max(occupied(scene), self.denoiser.layout.agents))),
+            self.task,
+            self.context,
+            self.horizon,
+            samples,
+            self.sampler,
+            generators,
+            self.progress,
+            self.stats,
+        )
+
+    def _training_windows(self, datamodule: MotionDataModule) -> Windows:
         frames = self.context + self.horizon
         stride = max(WINDOW_STRIDE, int(datamodule.store("train").length.sum()) // MAX_WINDOWS)
         composed = BASELINE_COMPOSED if datamodule.composed_test else 0
         scenes = datamodule.train_windows(frames, min(stride, self.baseline_stride), composed)
         mirror = datamodule.augmentation.mirror > 0
-        return Windows.of((scene.to(model.device) for scene in scenes), self.body, self.context, mirror)
+        return Windows.of((scene.to(self.denoiser.device) for scene in scenes), self.body, self.context, mirror)
 
-    def _baselines(self, model: Denoiser, datamodule: MotionDataModule, windows: Windows) -> dict[str, Predictor]:
+    def _baselines(self, datamodule: MotionDataModule, windows: Windows) -> dict[str, Predictor]:
         frames = self.context + self.horizon
         composed = BASELINE_COMPOSED if datamodule.composed_test else 0
-        train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(model.device)
+        train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(self.denoiser.device)
 
         def of_scenes(method: Callable[..., Scene], draws: bool = False) -> Predictor:
             return SceneBaseline(method, self.body, self.context, self.horizon, draws)
@@ -208,7 +259,7 @@ class Evaluation:
 
     # -- the run -------------------------------------------------------------------------------
 
-    def step(self, model: Denoiser, batch: Scene, batch_idx: int) -> None:
+    def step(self, batch: Scene) -> None:
         """Measure every method on one batch of test scenes.
 
         Methods see scenes as they were recorded; only what they answer is moved into the world that all test
@@ -216,12 +267,12 @@ class Evaluation:
         """
         answers = {}
         for name, method in self.methods.items():
-            generators = self.generators_of(model, batch.scenes)
+            generators = self.generators_of(batch.scenes)
             began = time.perf_counter()
             answers[name] = method(batch, self.samples, generators)
             self.seconds[name] += time.perf_counter() - began
         with torch.autocast(batch.device.type, enabled=False):  # half precision is for the network alone
-            self._measure(batch, answers, self.generated(model, batch), self._numbers(model, batch.scenes))
+            self._measure(batch, answers, self.generated(batch), self._numbers(batch.scenes))
         self.scenes += batch.scenes
 
     def _measure(self, batch: Scene, answers: dict[str, Tensor], scored: Tensor, numbers: list[int]) -> None:
@@ -259,7 +310,7 @@ class Evaluation:
                 joints[:, b, :, batch.present[b]] = windows.shared(dealt, n, frames).transpose(1, 2)
         return joints, torch.tensor([len(among) > 0 for among in chosen], device=batch.device)
 
-    def finish(self, model: Denoiser) -> dict[str, Tensor]:
+    def finish(self) -> dict[str, Tensor]:
         """Close the run; the table is in `results`. Returns what to log, the model's metrics first."""
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
         strangers: dict[str, tuple[str, ...]] = {
@@ -272,54 +323,35 @@ class Evaluation:
         rows = {name: row for name, row in rows.items() if row}
         seconds = {name: round(value, 2) for name, value in self.seconds.items()}
         columns = columns_of(*self.metrics.values())
-        self.results = Results(rows, self.facts(model) | {"seconds": seconds}, columns)
+        self.results = Results(rows, self.facts() | {"seconds": seconds}, columns)
         return {f"test/{name}": torch.tensor(value) for name, value in rows[MODEL].items()}
 
-    def facts(self, model: Denoiser) -> dict[str, Any]:
+    def facts(self) -> dict[str, Any]:
         """What has been sampled, how, and what it cost; JSON-ready."""
         return {
             "task": type(self.task).__name__,
             "task options": repr(self.task),
             "samples": self.samples,
-            "sampler": repr(self.options),
+            "sampler": repr(self.sampler),
             "test scenes": self.scenes,
             "context frames": self.context,
             "horizon frames": self.horizon,
-            "device": str(model.device),
+            "device": str(self.denoiser.device),
             "intervals": {"level": CONFIDENCE, "by": self.interval, "units": len(set(self.unit_of.values()))},
             "sampling": {name: round(value, 4) for name, value in self.stats.means().items()},
         }
 
-    def predict(self, model: Denoiser, batch: Scene, batch_idx: int, datamodule: MotionDataModule) -> Scene:
-        """Context and samples of one batch of scenes, for writing."""
-        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
-        if batch_idx == 0:
-            self.stats, self.scenes = SamplingStats(), 0
-        generators = self.generators_of(model, batch.scenes)
-        self.scenes += batch.scenes
-        return model.generate(
-            in_slots(batch, min(batch.agents, max(occupied(batch), model.layout.agents))),
-            self.task,
-            self.context,
-            self.horizon,
-            self.samples,
-            self.options,
-            generators,
-            self.progress,
-            self.stats,
-        )
-
-    def _numbers(self, model: Denoiser, scenes: int) -> list[int]:
+    def _numbers(self, scenes: int) -> list[int]:
         """The next scenes' numbers in the whole test set, whatever batches and processes it is dealt to."""
-        trainer = model._trainer  # None where a batch is sampled by hand
+        trainer = self._trainer  # None where a batch is sampled by hand
         world = 1 if trainer is None else trainer.world_size
-        return [(self.scenes + b) * world + model.global_rank for b in range(scenes)]
+        return [(self.scenes + b) * world + self.global_rank for b in range(scenes)]
 
-    def generators_of(self, model: Denoiser, scenes: int) -> list[torch.Generator]:
+    def generators_of(self, scenes: int) -> list[torch.Generator]:
         """One for each sample of the next scenes of this run, known by a scene's number, not by its batch."""
-        numbers = self._numbers(model, scenes)
+        numbers = self._numbers(scenes)
         seeds = [derive(self.seed, "test", number, sample) for number in numbers for sample in range(self.samples)]
-        return [torch.Generator(device=model.device).manual_seed(seed) for seed in seeds]
+        return [torch.Generator(device=self.denoiser.device).manual_seed(seed) for seed in seeds]
 
 
 def in_slots(scene: Scene, slots: int) -> Scene:

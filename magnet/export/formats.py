@@ -26,18 +26,6 @@ if TYPE_CHECKING:
 
 READ = (".npz", ".bvh")
 PICTURES = (".mp4", ".gif", ".webp")
-WRITTEN = {
-    ".npz": "the scene itself; with smplx, SMPL-X's conventional keys",
-    ".bvh": "a skeleton a person, one file each",
-    ".glb": "everybody skinned and animated in one world",
-    ".csv": "a table of joint positions",
-    ".html": "a page that plays the scene, by itself",
-    ".mp4": "a film",
-    ".gif": "a film",
-    ".webp": "a film",
-    ".png": "a strip of moments",
-}
-"""Suffixes that can be written, and what they hold."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +155,78 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
     return scene, note, "body" not in keys
 
 
+@dataclass(frozen=True)
+class WriteOptions:
+    """What `write` was asked for, and the scene's body."""
+
+    body: Body
+    fps: float
+    unit: Unit
+    smplx: bool
+    context_frames: int
+    style: Style | Literal["light"]
+    title: str | None
+    progress: bool | Report
+
+    @property
+    def look(self) -> dict[str, Any]:
+        """What pictures and pages take."""
+        return {"body": self.body, "context_frames": self.context_frames, "style": self.style, "title": self.title}
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file that can be written.
+
+    Attributes:
+        write: writes the file; gives back the paths written.
+        batch: it holds several scenes; else each of them gets a file.
+        own_rate: it chooses its frames itself; else the scene is brought to the rate asked for before.
+        nan: it may hold numbers that are not finite.
+    """
+
+    write: Callable[[Scene, Path, WriteOptions], Sequence[Path]]
+    batch: bool = False
+    own_rate: bool = False
+    nan: bool = False
+
+
+def _write_npz(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
+    return save_smplx(scene, path, o.body) if o.smplx else [scene.save(path)]
+
+
+def _write_page(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
+    from magnet.export.page.html import save_html
+
+    # A body's skin is only written where the page itself thinks it may be.
+    styles: Any = None if o.style == "body" else (o.style,)
+    return [save_html(scene, path, o.body, context=o.context_frames, title=o.title or "", styles=styles)]
+
+
+def _write_film(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
+    from magnet.export.video import render_video
+
+    return [render_video(scene, path, fps=o.fps, progress=o.progress, **o.look)]
+
+
+def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
+    from magnet.export.picture import contact_sheet
+
+    return [contact_sheet(scene, path, **o.look)]
+
+
+WRITTEN: dict[str, Format] = {
+    ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
+    ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit)),  # a skeleton a person, one file each
+    ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body)]),  # everybody skinned and animated in one world
+    ".csv": Format(lambda all, to, o: [save_csv(all, to, o.body)], batch=True),  # a table of joint positions
+    ".html": Format(_write_page, batch=True),  # a page that plays the scene, by itself
+    **{suffix: Format(_write_film, batch=True, own_rate=True) for suffix in PICTURES},
+    ".png": Format(_write_strip, batch=True, own_rate=True),  # a strip of moments
+}
+"""Suffixes that can be written, and how."""
+
+
 def write(
     scene: Scene,
     path: str | Path,
@@ -206,34 +266,23 @@ def write(
     suffix = path.suffix.lower()
     if suffix not in WRITTEN:
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(WRITTEN)}")
+    kind, apart = WRITTEN[suffix], suffix == ".npz" and smplx
     body = body or load_body("open")
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
     if fps is not None:
         require_number("fps", fps, over=0)
-    if suffix != ".npz" or smplx:
+    if apart or not kind.nan:
         _require_finite(scene)
-    look: dict[str, Any] = {"body": body, "style": style, "title": title}
-    if suffix == ".png" or suffix in PICTURES:
-        return [_save_picture(scene, path, context_frames, look, fps, progress)]
-    if fps is not None and abs(fps - scene.fps) > 1e-6:
-        context_frames = round(context_frames * fps / scene.fps)
-        scene = resampled(scene, fps)
-    if suffix == ".html":
-        return [_save_page(scene, path, context_frames, **look)]
-    if suffix == ".csv":
-        return [save_csv(scene, path, body)]
-    if suffix == ".npz" and not smplx:
-        return [scene.save(path)]
-    each: dict[str, Callable[[Scene, Path], list[Path]]] = {
-        ".npz": lambda one, to: save_smplx(one, to, body),
-        ".bvh": lambda one, to: save_bvh(one, to, body, unit=unit),
-        ".glb": lambda one, to: [save_glb(one, to, body)],
-    }
-    if scene.scenes == 1:
-        return each[suffix](scene, path)
+    rate = scene.fps if fps is None else fps
+    if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
+        context_frames = round(context_frames * rate / scene.fps)
+        scene = resampled(scene, rate)
+    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress)
+    if scene.scenes == 1 or (kind.batch and not apart):
+        return list(kind.write(scene, path, options))
     places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]
-    return [written for b, place in enumerate(places) for written in each[suffix](scene.select([b]), place)]
+    return [made for b, place in enumerate(places) for made in kind.write(scene.select([b]), place, options)]
 
 
 def _require_finite(scene: Scene) -> None:
@@ -243,27 +292,3 @@ def _require_finite(scene: Scene) -> None:
     if bad:
         b, frame, agent = bad[0]
         raise ValueError(f"scene {b}, agent {agent}: frame {frame} is not finite; cut such frames out, or write .npz")
-
-
-def _save_picture(
-    scene: Scene, path: Path, context: int, look: dict[str, Any], fps: float | None, progress: bool | Report
-) -> Path:
-    if path.suffix.lower() == ".png":
-        from magnet.export.picture import contact_sheet
-
-        return contact_sheet(scene, path, context_frames=context, **look)
-    from magnet.export.video import render_video
-
-    return render_video(
-        scene, path, context_frames=context, fps=scene.fps if fps is None else fps, progress=progress, **look
-    )
-
-
-def _save_page(
-    scene: Scene, path: Path, context: int, body: Body, style: Style | Literal["light"], title: str | None
-) -> Path:
-    from magnet.export.page.html import save_html  # late: the viewer stands on this room
-
-    # A body's skin is only written where the page itself thinks it may be.
-    styles: Any = None if style == "body" else (style,)
-    return save_html(scene, path, body, context=context, title=title or "", styles=styles)

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet import __version__
 from magnet.body.base import JOINT_NAMES, PARENTS
 from magnet.export.stage import AGENTS
 from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.version import __version__
 
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
 VERTEX_DATA, INDICES = 34962, 34963

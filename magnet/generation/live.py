@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
+from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.base import Task
@@ -272,7 +273,7 @@ class Live:
             "any_floor": True,
         }
         options = dataclasses.replace(settings.sampler, **own)
-        longer = self.model.generate(scene, task, context, frames, options=options, generator=self.generator)
+        longer = generate(self.model, scene, task, context, frames, options=options, generator=self.generator)
         return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
 
     def _length(self, kind: type) -> int:

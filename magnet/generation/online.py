@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions, mask_unknown, receptive_field
+from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
 from magnet.generation.rollout import CHUNK, Generators, Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
+from magnet.sampling.options import SamplerOptions
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser

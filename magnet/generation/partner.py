@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.inputs import check_request
 from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import STRIDE
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl, chosen
 

@@ -12,11 +12,9 @@ from torch import Tensor
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
 from magnet.generation.conditioning import (
-    SamplerOptions,
     known_tokens,
     mask_unknown,
     occupied,
-    planning_grid,
     receptive_field,
     require_people,
     task_lookahead_limit,
@@ -28,6 +26,7 @@ from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import LEVELS, NoiseStream
+from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History

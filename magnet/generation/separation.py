@@ -33,6 +33,9 @@ def separated(
     new: Tensor,
     how: str,
     begun: bool,
+    known: Tensor,
+    unseen: Tensor,
+    decentralized: bool = False,
 ) -> Tensor:
     """Canonical frames of some rows of tokens with the new people moved so far that bodies do not collide.
 
@@ -43,18 +46,38 @@ def separated(
         latent: (B, n, P, C) of the rows.
         deltas: (B, n, P, 4, 9) of the rows.
         T_world_can: (B, 4 n, P, 4, 4) where people stand.
-        given: (B, 4 n) the rows of the scene, for shapes and who is there.
+        given: (B, 4 n) the rows of the scene: its shapes, who is there, and the poses of those who are known.
         new: (n, P) bool, who may be moved, by row.
         how: a name in `APART`.
-        begun: somebody stood in front of these rows, whence the new ones go on.
+        begun: the first row is one of before, whence the new ones go on.
+        known: (n, P) bool, whose poses are in `given`.
+        unseen: (P,) bool, whose motion the new ones may know no further than the first row: they are taken to stand
+            still from there on.
+        decentralized: the new ones do not see each other either; each makes way alone.
 
     Returns:
         (B, 4 n, P, 4, 4); others stay where they are, bit for bit.
     """
-    features = decode(latent, given.betas, deltas)
-    joints = _body(latent.device).joints(posed(features, T_world_can, given).replace(body="open-1"))
-    fixed = ~new.repeat_interleave(STRIDE, dim=0)
-    moved = kept_apart(joints, given.present, fixed, APART[how], begun)
+
+    def bodies(rows: slice) -> Tensor:
+        """Joints in some of the rows, decoded from these alone. -> (B, 4 n, P, 22, 3)"""
+        frames = slice((rows.start or 0) * STRIDE, None if rows.stop is None else rows.stop * STRIDE)
+        recorded = given.frames_at(frames)
+        made = posed(decode(latent[:, rows], given.betas, deltas[:, rows]), T_world_can[:, frames], recorded)
+        body, there = _body(latent.device), known[rows].repeat_interleave(STRIDE, dim=0)
+        return torch.where(there[..., None, None], *(body.joints(s.replace(body=body.id)) for s in (recorded, made)))
+
+    joints, rows = bodies(slice(None)), new.repeat_interleave(STRIDE, dim=0)
+    still = joints
+    if begun:
+        last = bodies(slice(0, 1))[:, -1:]
+        still = torch.cat([joints[:, :STRIDE], last.expand(-1, joints.shape[1] - STRIDE, -1, -1, -1)], dim=1)
+    moved = torch.zeros_like(T_world_can[..., :2, 3])
+    agents = torch.arange(new.shape[1], device=new.device)
+    for who in [agents == agent for agent in agents[new.any(dim=0)]] if decentralized else [new.any(dim=0)]:
+        hidden = unseen | (new.any(dim=0) & ~who)
+        present = given.present if begun else given.present & ~hidden
+        seen = torch.where(hidden[:, None, None], still, joints)
+        moved = moved + kept_apart(seen, present, ~(rows & who), APART[how], begun)
     T_new_world = from_planar(torch.zeros_like(moved[..., 0]), moved)
-    still = (moved == 0).all(dim=-1)[..., None, None]
-    return torch.where(still, T_world_can, T_new_world @ T_world_can)
+    return torch.where((moved == 0).all(dim=-1)[..., None, None], T_world_can, T_new_world @ T_world_can)

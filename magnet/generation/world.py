@@ -33,7 +33,7 @@ from magnet.sampling.schedule import MaskSchedule
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
 
 
 class WorldState:
@@ -112,8 +112,8 @@ class WorldState:
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
-        if self.options.apart != "off" and not decentralized:
-            self._separate(tokens, latent, finished, first, stop)
+        if self.options.apart != "off":
+            self._separate(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
@@ -132,7 +132,9 @@ class WorldState:
         tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
         return self._enter(tokens, begin, stop)
 
-    def _separate(self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int) -> None:
+    def _separate(
+        self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
+    ) -> None:
         """Move the newly placed out of others' bodies, but for those on their way to a keyframe."""
         lead = min(1, first)  # a row more in front, so that the decoder knows where poses come from
         if lead:
@@ -146,9 +148,12 @@ class WorldState:
             self._deltas(low, stop),
             self.T_world_can[:, frames],
             self.given.slice(frames.start, frames.stop),
-            new,
+            new.to(latent.device),
             self.options.apart,
             bool(lead),
+            self.known[low:stop].to(latent.device),
+            (self.known[first] & self.causal).to(latent.device),
+            decentralized,
         )
 
     def _deltas(self, first: int, stop: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
@@ -12,10 +12,13 @@ from magnet.checks import require_number, require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
-if TYPE_CHECKING:
-    from magnet.sampling.sampler import DenoiseFn
-
 Kind = Literal["none", "history", "self", "partner"]
+
+
+class DenoiseFn(Protocol):
+    """Predicts clean tokens. noisy (B, N, P, D), levels (B, N, P) int, present (B, P) bool -> (B, N, P, D)"""
+
+    def __call__(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even"},
     "paper": {
         "steps": 30,  # A.3
-        "stride": 4,  # method.md C.5: 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
+        "stride": 4,  # 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
         "pyramid_offset": 0,  # 3.3: segment by segment
         "placement": "integrate",  # the paper predicts steps and integrates them
         "pairwise_weight": 0.02,  # not read by `integrate`

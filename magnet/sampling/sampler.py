@@ -4,24 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import Guidance
+from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver, solver_step
-
-
-class DenoiseFn(Protocol):
-    """Predicts clean tokens. noisy (B, N, P, D), levels (B, N, P) int, present (B, P) bool -> (B, N, P, D)"""
-
-    def __call__(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor: ...
-
 
 StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was

@@ -13,7 +13,7 @@ STAGES = 2
 """Each stage halves the frame rate: 2 stages are the stride of 4 frames a token."""
 
 DILATION = 3
-"""Block i of a residual stack looks 3^i steps away."""
+"""The convolution of block i of a residual stack has a dilation of 3^i."""
 
 
 class Conv(nn.Module):
@@ -40,7 +40,7 @@ class Conv(nn.Module):
         return self.conv(F.pad(x.transpose(1, 2), self.pad)).transpose(1, 2)
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """Residual block, pre-norm: a dilated convolution of 3 steps, then one of 1. (B, T, C) -> same"""
 
     def __init__(self, width: int, dilation: int, causal: bool) -> None:
@@ -56,7 +56,7 @@ class Block(nn.Module):
 
 def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
     """`depth` blocks, widest reach first. (B, T, C) -> same"""
-    return nn.Sequential(*[Block(width, DILATION**i, causal) for i in reversed(range(depth))])
+    return nn.Sequential(*[ResidualBlock(width, DILATION**i, causal) for i in reversed(range(depth))])
 
 
 class Upsample(nn.Module):

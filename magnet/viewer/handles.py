@@ -5,18 +5,34 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from magnet.body.base import Body
 from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
+from magnet.generation.live import Live
 from magnet.motion.frames import canonical_frame
+from magnet.viewer.clock import Clock
 from magnet.viewer.people import PeopleView, add_people
+from magnet.viewer.worker import Worker
 
-if TYPE_CHECKING:
-    from magnet.viewer.live_app import LiveApp
+
+class App(Protocol):
+    """What handles need of the app that they belong to."""
+
+    live: Live
+    server: Any
+    body: Body
+    clock: Clock
+    worker: Worker
+
+    def steered(self, agent: int) -> None: ...
+
+    def say(self, news: str) -> None: ...
+
 
 NOBODY = "nobody"
 NO_KEYS = "no keyframe"
@@ -52,7 +68,7 @@ def people_names(slots: int) -> tuple[str, ...]:
 class Steering:
     """Whom to steer, and the handle of that person's goal."""
 
-    def __init__(self, app: LiveApp) -> None:
+    def __init__(self, app: App) -> None:
         self.app, self.live = app, app.live
         self.handle: Any = None
         gui = app.server.gui
@@ -105,7 +121,7 @@ class KeyframeRow:
 class KeyframePanel:
     """Keyframes: added where the clock stands, dragged, moved in time, removed, and gone through by in-betweening."""
 
-    def __init__(self, app: LiveApp) -> None:
+    def __init__(self, app: App) -> None:
         self.app, self.live = app, app.live
         self.rows: list[KeyframeRow] = []
         self.made = 0

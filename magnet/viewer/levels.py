@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.export.page.palette import agent_colours
-from magnet.generation.trace import DenoisingTrace
+from magnet.export.trace import DenoisingTrace
 from magnet.sampling.noise import LEVELS
 
 CELL = 14

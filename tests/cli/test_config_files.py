@@ -11,9 +11,9 @@ import yaml
 from magnet import cli
 from magnet.cli import config_files, demo, train, view
 from magnet.datamodules import registry
-from magnet.generation.conditioning import SamplerOptions
 from magnet.sampling.guidance import Guidance
-from tests.toys import OtherData, ToyData, ToyModel
+from magnet.sampling.options import SamplerOptions
+from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 PAPER = SamplerOptions.preset("paper")
@@ -82,11 +82,13 @@ def test_what_is_printed_runs_again(toy: Path, capsys: pytest.CaptureFixture[str
     assert printed(capsys, "test", "--config", "mine.yaml") == first
 
 
-def test_a_preset_reaches_the_model(toy: Path) -> None:
+def test_a_preset_reaches_the_evaluator(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli.main(["fit", "--model", "ToyModel", "--trainer.max_epochs", "1", "--out", "trained", *CPU]) == 0
     words = ("--ckpt_path", "trained/checkpoints/last.ckpt", "--sampler", "paper", "--sampler.steps", "3")
+    monkeypatch.setattr(train, "Denoiser", ToyModel)
+    monkeypatch.setattr(train, "Evaluator", ToyEvaluator)
     assert cli.main(["test", *words, *CPU]) == 0
-    assert ToyModel.seen["evaluation"].options == dataclasses.replace(PAPER, steps=3)
+    assert ToyModel.seen["evaluator"].sampler == dataclasses.replace(PAPER, steps=3)
 
 
 @pytest.mark.parametrize("command", ["test", "predict", "demo", "view"])

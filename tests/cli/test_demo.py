@@ -6,8 +6,8 @@ import pytest
 
 from magnet.cli import demo
 from magnet.datamodules.synthetic import Synthetic
-from magnet.generation.conditioning import SamplerOptions
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.testing import tiny_denoiser
 
 

@@ -8,21 +8,21 @@ from pathlib import Path
 import pytest
 
 from magnet.cli import outputs
-from magnet.evaluation.evaluator import UNALIGNED, Evaluation
+from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results
 from tests.evaluation.test_evaluator import data, run
 
 
 @pytest.fixture(scope="module")
-def tested() -> Evaluation:
+def tested() -> Evaluator:
     return run(data())
 
 
 @pytest.mark.parametrize("full", [False, True])
 def test_files_hold_everything_whatever_is_printed(
-    tested: Evaluation, tmp_path: Path, capsys: pytest.CaptureFixture[str], full: bool
+    tested: Evaluator, tmp_path: Path, capsys: pytest.CaptureFixture[str], full: bool
 ) -> None:
-    outputs.show_results(tested, tmp_path, {"task": "JointFuture"}, full)
+    outputs.show_results(tested.results, tmp_path, {"task": "JointFuture"}, full)
     printed = capsys.readouterr().out
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert rows.keys() == tested.results.rows.keys() == Results.load_csv(tmp_path / "results.csv").rows.keys()

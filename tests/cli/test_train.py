@@ -13,7 +13,7 @@ import yaml
 from magnet import cli
 from magnet.cli import train
 from magnet.datamodules import registry
-from tests.toys import OtherData, ToyData, ToyModel
+from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 
@@ -34,6 +34,14 @@ def trained(toy: Path) -> Path:
     linked = ("--data.max_agents", "3", "--data.window_frames", "32", "--trainer.max_epochs", "2")
     assert cli.main(["fit", "--model", "ToyModel", *options, *linked, "--out", "trained", *CPU]) == 0
     return toy / "trained"
+
+
+@pytest.fixture
+def sampling(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A trained toy that counts as a denoiser."""
+    monkeypatch.setattr(train, "Denoiser", ToyModel)
+    monkeypatch.setattr(train, "Evaluator", ToyEvaluator)
+    return trained
 
 
 def go(*arguments: str) -> tuple[ToyModel, Any]:
@@ -174,33 +182,30 @@ def test_latest_leads_to_the_newest_run(toy: Path) -> None:
     go("test", "--ckpt_path", "last")
 
 
-def test_sampling_options_reach_the_model(trained: Path) -> None:
+def test_sampling_options_reach_the_evaluator(sampling: Path) -> None:
     words = ("--task", "generation", "--samples", "3", "--sampler.steps", "7", "--baselines", "false")
     go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", *words)
-    evaluation = ToyModel.seen["evaluation"]
-    assert type(evaluation.task).__name__ == "Generation"
-    assert (evaluation.samples, evaluation.options.steps, evaluation.baselines) == (3, 7, False)
+    evaluator = ToyModel.seen["evaluator"]
+    assert type(evaluator.task).__name__ == "Generation"
+    assert (evaluator.samples, evaluator.sampler.steps, evaluator.baselines) == (3, 7, False)
 
 
 @pytest.mark.parametrize("given", [(), ("--full",)])
 def test_one_flag_asks_for_the_full_table(
-    trained: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...]
+    sampling: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...]
 ) -> None:
     """Whatever stands around it: it takes no value."""
     asked: list[bool] = []
     monkeypatch.setattr(train.outputs, "show_results", lambda *words: asked.append(words[-1]))
-    monkeypatch.setattr(ToyModel, "on_test_end", lambda self: setattr(self.evaluation, "results", 1), raising=False)
-    monkeypatch.setattr(
-        ToyModel, "configure_test", lambda self, evaluation: setattr(self, "evaluation", evaluation), raising=False
-    )
+    monkeypatch.setattr(ToyEvaluator, "on_test_end", lambda self: setattr(self, "results", 1))
     go("test", *given, "--ckpt_path", "trained/checkpoints/last.ckpt", "--samples", "2")
     assert asked == [bool(given)]
 
 
-def test_joint_future_is_the_task_when_none_is_named(trained: Path) -> None:
+def test_joint_future_is_the_task_when_none_is_named(sampling: Path) -> None:
     go("predict", "--ckpt_path", "trained/checkpoints/last.ckpt")
-    assert type(ToyModel.seen["evaluation"].task).__name__ == "JointFuture"
-    assert ToyModel.seen["evaluation"].samples == 10
+    assert type(ToyModel.seen["evaluator"].task).__name__ == "JointFuture"
+    assert ToyModel.seen["evaluator"].samples == 10
 
 
 def test_results_are_written_as_json_and_csv(trained: Path, toy: Path) -> None:

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from magnet.denoiser.module import Denoiser
+from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene, tiny_denoiser
 from tests.datamodules.fakes import FakeData, couples_and_singles
@@ -155,18 +156,18 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
     ids=str,
 )
 def test_every_ablation_trains_and_samples(tmp_path, ablation):
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
     from magnet.tasks.joint import JointFuture
 
     model = build(tmp_path, **ablation)
     fitted(model, 1)
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(0))
-    whole = model.eval().generate(scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
+    whole = generate(model.eval(), scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
     assert whole.T_world_root.isfinite().all()
 
 
 def test_without_a_vq_vae_the_poses_themselves_are_tokens(tmp_path):
-    from magnet.generation.conditioning import SamplerOptions
+    from magnet.sampling.options import SamplerOptions
     from magnet.tasks.joint import JointFuture
 
     torch.manual_seed(0)
@@ -174,7 +175,7 @@ def test_without_a_vq_vae_the_poses_themselves_are_tokens(tmp_path):
     assert model.layout.latent == 540
     run = fitted(model, 1)
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(0))
-    whole = model.eval().generate(scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
+    whole = generate(model.eval(), scene, JointFuture(), 16, 8, options=SamplerOptions(steps=2))
     assert whole.T_world_root.isfinite().all()
     run.save_checkpoint(tmp_path / "raw.ckpt")
     assert same_weights(model, Denoiser.load_from_checkpoint(tmp_path / "raw.ckpt", weights_only=True))

@@ -6,9 +6,10 @@ import torch
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.self_forcing import with_self_forcing
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_denoiser
@@ -27,16 +28,16 @@ def continuous() -> Denoiser:
     return tiny_denoiser(max_agents=3, window=8, target="continuous")
 
 
-def generate(
+def sampled(
     model: Denoiser, scene: Scene, task=None, options: SamplerOptions = FAST, context: int = 16, **more
 ) -> Scene:
     generator = torch.Generator().manual_seed(0)
-    return model.generate(scene, task or JointFuture(), context, 40 - context, 1, options, generator, **more)
+    return generate(model, scene, task or JointFuture(), context, 40 - context, 1, options, generator, **more)
 
 
 @pytest.mark.parametrize("name", registry.names())
 def test_every_task_runs_with_every_option(model: Denoiser, scene: Scene, name: str):
-    made = generate(model, scene, registry.get(name)(), context=0 if name == "generation" else 16)
+    made = sampled(model, scene, registry.get(name)(), context=0 if name == "generation" else 16)
     assert made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
     assert torch.equal(made.T_world_root[made.given], scene.slice(0, 40).T_world_root[made.given])
 
@@ -88,7 +89,7 @@ def test_a_continuous_target_is_what_the_encoder_says_before_the_codebook(contin
 
 def quantization_errors(model: Denoiser, scene: Scene, **options) -> int:
     stats = SamplingStats()
-    generate(model, scene, options=SamplerOptions(steps=2, stride=2, **options), stats=stats)
+    sampled(model, scene, options=SamplerOptions(steps=2, stride=2, **options), stats=stats)
     return stats.quantization_errors
 
 

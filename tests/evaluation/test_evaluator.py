@@ -4,11 +4,10 @@ import lightning as L
 import pytest
 import torch
 
-from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluation, aligned
-from magnet.generation.conditioning import SamplerOptions
+from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluator, aligned
 from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.scene import Scene, concatenate
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
@@ -23,24 +22,23 @@ def data(clips: list | None = None, **options) -> FakeData:
     return FakeData(clips, **{**sizes, **options})
 
 
-def prepared(**options) -> tuple[Denoiser, Evaluation, L.Trainer]:
+def prepared(**options) -> tuple[Evaluator, L.Trainer]:
     model = tiny_denoiser(max_agents=3)
-    evaluation = Evaluation(**{"samples": 3, "options": FAST, "baseline_stride": 10, **options})
-    model.configure_test(evaluation)
+    evaluation = Evaluator(model, **{"samples": 3, "sampler": FAST, "baseline_stride": 10, **options})
     trainer = L.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
-    return model, evaluation, trainer
+    return evaluation, trainer
 
 
-def run(datamodule: FakeData, **options) -> Evaluation:
-    model, evaluation, trainer = prepared(**options)
-    trainer.test(model, datamodule=datamodule, verbose=False)
+def run(datamodule: FakeData, **options) -> Evaluator:
+    evaluation, trainer = prepared(**options)
+    trainer.test(evaluation, datamodule=datamodule, verbose=False)
     return evaluation
 
 
-def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluation]:
+def predicted(datamodule: FakeData, **options) -> tuple[Scene, Evaluator]:
     """All scenes that `magnet predict` writes, whatever batches they came in."""
-    model, evaluation, trainer = prepared(**options)
-    return concatenate(trainer.predict(model, datamodule=datamodule)), evaluation
+    evaluation, trainer = prepared(**options)
+    return concatenate(trainer.predict(evaluation, datamodule=datamodule)), evaluation
 
 
 def test_every_method_is_measured_on_the_same_scenes():
@@ -92,10 +90,10 @@ def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
     noisy.known = task.schedule(Grid(9, 3, 4, 2, 8, 2)).known
     for datamodule in (FakeData(clips, **options), noisy):
         model = tiny_denoiser(max_agents=3)
-        evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
-        evaluation.start(model, datamodule)
+        evaluation = Evaluator(model, task, samples=2, sampler=FAST, baselines=False)
+        evaluation.start(datamodule)
         batch = next(iter(datamodule.test_dataloader()))
-        seen.append(evaluation.sample(model, batch, 2, evaluation.generators_of(model, batch.scenes)))
+        seen.append(evaluation.sample(batch, 2, evaluation.generators_of(batch.scenes)))
     plain, replaced = seen
     assert torch.equal(plain.body_rot, replaced.body_rot)
     assert torch.equal(plain.T_world_root, replaced.T_world_root)
@@ -134,10 +132,10 @@ def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in():
 
 
 def test_no_two_samples_share_their_noise():
-    model, evaluation, _ = prepared()
-    seeds = [g.initial_seed() for g in evaluation.generators_of(model, 2)]
+    evaluation, _ = prepared()
+    seeds = [g.initial_seed() for g in evaluation.generators_of(2)]
     evaluation.scenes = 2
-    seeds += [g.initial_seed() for g in evaluation.generators_of(model, 1)]
+    seeds += [g.initial_seed() for g in evaluation.generators_of(1)]
     assert len(set(seeds)) == len(seeds) == 9
 
 
@@ -149,7 +147,7 @@ def test_prediction_counts_what_it_costs():
     past = evaluation.context // 4
     assert (evaluation.scenes, scenes.scenes, stats.runs) == (9, 27, 3)
     assert stats.means()["calls"] == stats.evaluations == FAST.steps + tokens - past - 1
-    assert evaluation.facts(prepared()[0])["sampling"]["evaluations"] == stats.evaluations
+    assert evaluation.facts()["sampling"]["evaluations"] == stats.evaluations
 
 
 @pytest.mark.parametrize("name", ["generation", "partner_inpainting", "inbetweening"])
@@ -167,8 +165,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     seen = run(datamodule, task=registry.get("generation")())
     assert (seen.now, seen.past_is_given) == (0, False)
     batch = next(iter(datamodule.test_dataloader()))
-    model = tiny_denoiser(max_agents=3)
-    made = seen.sample(model, batch, 3, seen.generators_of(model, batch.scenes))
+    made = seen.sample(batch, 3, seen.generators_of(batch.scenes))
     yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
     there = made.present[..., None]
     middle = torch.where(there, ground, 0).sum(dim=1) / there.sum(dim=1)

@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluation, shared_world
+from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluator, shared_world
 from magnet.motion.scene import Scene
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.inbetweening import Inbetweening
@@ -54,17 +53,17 @@ CASES = {
 EACH = pytest.mark.parametrize(("task", "scored"), CASES.values(), ids=CASES.keys())
 
 
-def sampled(task: object) -> tuple[Evaluation, Denoiser, Scene, Scene]:
-    """A run's evaluation and model, its only batch of two people in three slots, and the samples that it draws."""
+def sampled(task: object) -> tuple[Evaluator, Scene, Scene]:
+    """A run's evaluator, its only batch of two people in three slots, and the samples that it draws."""
     datamodule = data(test_batch_size=9)
     model = tiny_denoiser(max_agents=3)
-    evaluation = Evaluation(task, samples=2, options=FAST, baselines=False)
-    evaluation.start(model, datamodule)
+    evaluation = Evaluator(model, task, samples=2, sampler=FAST, baselines=False)
+    evaluation.start(datamodule)
     batch = next(iter(datamodule.test_dataloader()))
-    return evaluation, model, batch, evaluation.sample(model, batch, 2, evaluation.generators_of(model, batch.scenes))
+    return evaluation, batch, evaluation.sample(batch, 2, evaluation.generators_of(batch.scenes))
 
 
-def mean_error(evaluation: Evaluation, made: Scene, batch: Scene, scored: Tensor) -> float:
+def mean_error(evaluation: Evaluator, made: Scene, batch: Scene, scored: Tensor) -> float:
     """Distance of 21 joints over what is scored, as MPJPE has it. made (9 * S scenes, horizon)"""
     truth = evaluation.body.joints(batch.slice(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
     error = (evaluation.body.joints(made) - truth)[..., 1:, :].norm(dim=-1).mean(dim=-1)  # (9 S, T, P)
@@ -73,14 +72,14 @@ def mean_error(evaluation: Evaluation, made: Scene, batch: Scene, scored: Tensor
 
 @EACH
 def test_what_is_scored_is_what_was_generated(task: object, scored: Tensor) -> None:
-    evaluation, model, batch, _ = sampled(task)
-    assert torch.equal(evaluation.generated(model, batch), scored)
+    evaluation, batch, _ = sampled(task)
+    assert torch.equal(evaluation.generated(batch), scored)
 
 
 @EACH
 def test_none_of_the_copied_truth_counts(task: object, scored: Tensor) -> None:
-    evaluation, model, batch, whole = sampled(task)
-    evaluation.step(model, batch, 0)
+    evaluation, batch, whole = sampled(task)
+    evaluation.step(batch)
     row = evaluation.metrics[MODEL].compute()
     made = whole.slice(CONTEXT)
     assert float(row["mpjpe"]) == pytest.approx(mean_error(evaluation, made, batch, scored), rel=1e-4)
@@ -91,7 +90,7 @@ def test_none_of_the_copied_truth_counts(task: object, scored: Tensor) -> None:
 @EACH
 def test_what_was_given_comes_back_as_it_was_given(task: object, scored: Tensor) -> None:
     """Whatever blending does to the frames around it."""
-    _, _, batch, whole = sampled(task)
+    _, batch, whole = sampled(task)
     given = torch.cat([torch.ones(CONTEXT, 3, dtype=torch.bool), ~scored])
     truth = batch.repeat(2)
     assert torch.equal(whole.body_rot[:, given], truth.body_rot[:, given])
@@ -113,8 +112,8 @@ def test_the_plan_is_that_of_the_slots_somebody_is_in() -> None:
     """A task that picks the last agent generates the last person, not a free slot; so that is who is scored."""
     scores = [run(data(max_agents=slots), task=HalfGiven(), baselines=False).results.rows[MODEL] for slots in (2, 3)]
     assert scores[0]["mpjpe"] > 0
-    evaluation, model, batch, whole = sampled(HalfGiven())
-    scored = evaluation.generated(model, batch)
+    evaluation, batch, whole = sampled(HalfGiven())
+    scored = evaluation.generated(batch)
     assert scored.any(dim=0).tolist() == [False, True, False]
     changed = (whole.T_world_root != batch.repeat(2).T_world_root).flatten(3).any(dim=-1).any(dim=0)
     assert torch.equal(changed[CONTEXT:], scored)
@@ -123,11 +122,11 @@ def test_the_plan_is_that_of_the_slots_somebody_is_in() -> None:
 def rows(model_slots: int, data_slots: int, baselines: bool) -> dict[str, dict[str, float]]:
     datamodule = data(max_agents=data_slots)
     model = tiny_denoiser(max_agents=model_slots)
-    evaluation = Evaluation(JointFuture(), samples=2, options=FAST, baselines=baselines, baseline_stride=20)
-    evaluation.start(model, datamodule)
+    evaluation = Evaluator(model, JointFuture(), samples=2, sampler=FAST, baselines=baselines, baseline_stride=20)
+    evaluation.start(datamodule)
     for batch in datamodule.test_dataloader():
-        evaluation.step(model, batch, 0)
-    evaluation.finish(model)
+        evaluation.step(batch)
+    evaluation.finish()
     return evaluation.results.rows
 
 
@@ -176,19 +175,19 @@ def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
     """Three recordings of 120 frames hold three scenes of 36 frames each side by side, however densely they begin."""
     for stride in (None, 12, 5):
         datamodule = data(test_stride=stride)
-        evaluation = Evaluation(options=FAST, baselines=False, interval=interval)
-        evaluation.start(tiny_denoiser(max_agents=3), datamodule)
+        evaluation = Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, baselines=False, interval=interval)
+        evaluation.start(datamodule)
         assert len(set(evaluation.unit_of.values())) == units
         assert len(evaluation.unit_of) == len(datamodule.test_windows())
 
 
 def test_intervals_go_by_recordings_where_there_are_enough() -> None:
     clips = [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(5)]
-    evaluation = Evaluation(options=FAST, baselines=False)
-    evaluation.start(tiny_denoiser(max_agents=3), data(clips))
+    evaluation = Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, baselines=False)
+    evaluation.start(data(clips))
     assert len(set(evaluation.unit_of.values())) == 5
     with pytest.raises(ValueError, match="interval: got 'clip', expected auto, take, scene"):
-        Evaluation(options=FAST, interval="clip").start(tiny_denoiser(max_agents=3), data(clips))
+        Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, interval="clip").start(data(clips))
 
 
 def test_a_worlds_middle_is_that_of_the_people_present() -> None:
@@ -199,9 +198,9 @@ def test_a_worlds_middle_is_that_of_the_people_present() -> None:
 
 
 def test_scenes_without_names_are_each_their_own() -> None:
-    evaluation, model, batch, _ = sampled(JointFuture())
+    evaluation, batch, _ = sampled(JointFuture())
     for unnamed in (batch.replace(names=()), batch):
-        evaluation.step(model, unnamed, 0)
-        evaluation.finish(model)
+        evaluation.step(unnamed)
+        evaluation.finish()
     row = evaluation.results.rows[MODEL]
     assert row["mpjpe_low"] < row["mpjpe"] < row["mpjpe_high"]

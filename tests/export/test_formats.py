@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 
+from magnet import cli
 from magnet.body import Body, load_body
 from magnet.body.base import JOINT_NAMES
 from magnet.export import formats, resampled
@@ -184,3 +185,20 @@ def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, t
     for name, smplx in (("a.npz", False), ("b.npz", True), ("c.bvh", False)):
         notes = formats.read(formats.write(duet, tmp_path / name, body, smplx=smplx)).notes
         assert not any("y = 0" in note or "floor" in note for note in notes)
+
+
+def test_a_new_format_is_a_function_and_a_line(duet, tmp_path, body, monkeypatch, capsys):
+    """Where a thing goes (CONTRIBUTING): one that writes how far everybody goes, reached as every other is."""
+
+    def save_way(scene: Scene, path: Path, options: formats.WriteOptions) -> list[Path]:
+        ground = scene.T_world_root[..., [0, 2], 3].diff(dim=1).norm(dim=-1).sum(dim=1)
+        path.write_text("".join(f"{metres:.3f}\n" for metres in ground[0].tolist()))
+        return [path]
+
+    monkeypatch.setitem(formats.WRITTEN, ".way", formats.Format(save_way))
+    assert len(formats.write(duet.repeat(2), tmp_path / "a.way", body)) == 2
+    scene = duet.save(tmp_path / "duet.npz")
+    assert cli.main(["export", str(scene), str(tmp_path / "b.way")]) == 0
+    assert len((tmp_path / "b.way").read_text().split()) == duet.agents
+    with pytest.raises(ValueError, match=r"use .*\.way"):
+        formats.write(duet, tmp_path / "a.fbx", body)

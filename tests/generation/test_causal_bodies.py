@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from magnet.generation.causal_bodies import Expected, decode_bodies, finalize_bodies, own_view
-from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, receptive_field
+from magnet.generation.conditioning import known_tokens, mask_unknown, receptive_field
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, posed
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, Stage
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser

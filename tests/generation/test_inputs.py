@@ -12,11 +12,12 @@ import torch
 
 from magnet.api import Model
 from magnet.denoiser.module import Denoiser
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.live import Live
 from magnet.generation.partner import Partner
+from magnet.generation.rollout import generate, stream
 from magnet.generation.trace import record
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting
@@ -43,8 +44,8 @@ def answered(model: Denoiser, scene: Scene) -> Scene:
 
 
 WAYS: dict[str, Callable[[Denoiser, Scene], Any]] = {
-    "generate": lambda model, scene: model.generate(scene, JointFuture(), CONTEXT, FRAMES, options=FAST),
-    "stream": lambda model, scene: next(model.stream(scene, JointFuture(), CONTEXT, None, options=FAST, chunk=1)),
+    "generate": lambda model, scene: generate(model, scene, JointFuture(), CONTEXT, FRAMES, options=FAST),
+    "stream": lambda model, scene: next(stream(model, scene, JointFuture(), CONTEXT, None, options=FAST, chunk=1)),
     "predict": lambda model, scene: Model(model, FAST).predict(scene, frames=FRAMES),
     "continue_": lambda model, scene: Model(model, FAST).continue_(scene, frames=FRAMES),
     "inpaint": lambda model, scene: Model(model, FAST).inpaint(scene, agent=1),
@@ -112,7 +113,7 @@ def test_no_frames_are_refused_wherever_some_are_needed(model, duet):
     for way in set(WAYS) - {"inpaint"}:
         with pytest.raises(ValueError, match=r"needs 32 frames|needs 4 frames|none to sample|at least|expected 1"):
             WAYS[way](model, nothing)
-    assert model.generate(nothing, Generation(), 0, 8, options=FAST).frames == 8
+    assert generate(model, nothing, Generation(), 0, 8, options=FAST).frames == 8
     with pytest.raises(ValueError, match="none to sample"):
         WAYS["inpaint"](model, nothing)
 
@@ -125,7 +126,7 @@ def test_what_a_task_is_not_given_may_hold_anything(task, value, model, duet):
 
     def sampled(scene: Scene) -> Scene:
         generator = torch.Generator().manual_seed(0)
-        return model.generate(scene, registry.get(task)(), context, CONTEXT + FRAMES - context, 1, FAST, generator)
+        return generate(model, scene, registry.get(task)(), context, CONTEXT + FRAMES - context, 1, FAST, generator)
 
     plain = sampled(duet)
     assert plain.given is not None
@@ -150,7 +151,7 @@ def test_absent_agents_may_hold_anything(model, duet):
         present=present,
     )
     sampled = [
-        model.generate(each, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0))
+        generate(model, each, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0))
         for each in (scene, junk)
     ]
     assert torch.equal(sampled[0].T_world_root[:, :, :2], sampled[1].T_world_root[:, :, :2])
@@ -205,7 +206,7 @@ def test_scenes_of_other_float_types_are_sampled_in_float32(model, duet):
 def test_people_who_really_are_up_there_are_taken_if_one_says_so(model, duet):
     high = lifted(duet, 1.0)
     options = dataclasses.replace(FAST, any_floor=True)
-    got = model.generate(high, JointFuture(), CONTEXT, FRAMES, options=options)
+    got = generate(model, high, JointFuture(), CONTEXT, FRAMES, options=options)
     assert torch.equal(got.T_world_root[:, :CONTEXT, :2], high.T_world_root[:, :CONTEXT])
     assert Partner(model, high.slice(0, CONTEXT), (1,), options).past.frames == CONTEXT
 
@@ -220,10 +221,10 @@ def test_only_those_who_are_given_are_asked_where_their_floor_is(model, duet):
     T = duet.T_world_root.clone()
     T[:, :, 0, 1, 3] += 5.0
     scene = duet.replace(T_world_root=T)
-    model.generate(scene, PartnerInpainting(target=(0,)), 0, CONTEXT, options=FAST)
-    model.generate(scene, JointFuture(), CONTEXT, FRAMES, options=FAST)  # the other one stands on the floor
+    generate(model, scene, PartnerInpainting(target=(0,)), 0, CONTEXT, options=FAST)
+    generate(model, scene, JointFuture(), CONTEXT, FRAMES, options=FAST)  # the other one stands on the floor
     with pytest.raises(ValueError, match="everybody stands 4"):
-        model.generate(scene, PartnerInpainting(target=(1,)), 0, CONTEXT, options=FAST)
+        generate(model, scene, PartnerInpainting(target=(1,)), 0, CONTEXT, options=FAST)
 
 
 @pytest.mark.parametrize(
@@ -244,11 +245,11 @@ def test_counts_that_are_none_are_named(numbers, message, model, duet):
     task = MotionControl() if context == 48 else JointFuture()
     if message is None:
         assert torch.equal(
-            model.generate(duet, task, context, frames, samples, FAST).T_world_root[:, :, :2], duet.T_world_root
+            generate(model, duet, task, context, frames, samples, FAST).T_world_root[:, :, :2], duet.T_world_root
         )
         return
     with pytest.raises(ValueError, match=message):
-        model.generate(duet, task, context, frames, samples, FAST)
+        generate(model, duet, task, context, frames, samples, FAST)
 
 
 def test_a_model_that_was_never_trained_is_refused(duet):
@@ -261,7 +262,7 @@ def test_sampling_a_model_in_training_mode_drops_nothing_out(duet):
     model = tiny_denoiser(max_agents=2, dropout=0.5)
 
     def sampled() -> torch.Tensor:
-        return model.generate(duet, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0)).body_rot
+        return generate(model, duet, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0)).body_rot
 
     expected = sampled()
     model.train()

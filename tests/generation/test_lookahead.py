@@ -4,16 +4,11 @@ import pytest
 import torch
 
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import (
-    SamplerOptions,
-    encodings,
-    known_tokens,
-    lookahead_limit,
-    mask_unknown,
-    task_lookahead_limit,
-)
+from magnet.generation.conditioning import encodings, known_tokens, lookahead_limit, mask_unknown, task_lookahead_limit
+from magnet.generation.rollout import stream
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -151,7 +146,8 @@ def test_streams_do_not_leak_either(model, recording, block, chunk):
     a, b = (
         cat_time(
             list(
-                model.stream(
+                stream(
+                    model,
                     scene,
                     MotionControl((0,), block),
                     4 * PAST,

@@ -9,11 +9,12 @@ import torch
 import magnet
 from magnet.api import Model
 from magnet.datamodules.synthetic import Synthetic
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.partner import Partner
+from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 
@@ -103,7 +104,7 @@ def test_answers_are_what_motion_control_gives_bit_for_bit(denoiser, block, opti
     """Live and offline score the same: fed as it comes, or all known at once."""
     scene, past = random_scene(2, 136, 3, torch.Generator().manual_seed(7)), 16
     task, frames = MotionControl((0, 2), block), 136 - 16
-    whole = denoiser.generate(scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
+    whole = generate(denoiser, scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
     partner = Partner(denoiser, scene.slice(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)
     chunks = [4 * block * n for n in (1, 2)] * 40
     fed, first = [], past

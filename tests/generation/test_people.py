@@ -4,11 +4,13 @@ import pytest
 import torch
 
 from magnet.generation.blending import cat_time
-from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown, occupied, planning_grid
+from magnet.generation.conditioning import known_tokens, mask_unknown, occupied
+from magnet.generation.rollout import generate, stream
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
 from magnet.sampling.noise import NoiseStream
+from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.sampler import sample
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
@@ -33,7 +35,7 @@ def people(slots: list[list[bool]], frames: int = 40) -> Scene:
 
 def run(model, scene: Scene, task, context: int = 8, stats: SamplingStats | None = None, seed: int = 0) -> Scene:
     each = [torch.Generator().manual_seed(seed + number) for number in range(scene.scenes)]
-    return model.generate(scene, task, context, 40 - context, 1, FAST, each, stats=stats)
+    return generate(model, scene, task, context, 40 - context, 1, FAST, each, stats=stats)
 
 
 def close(a: Scene, b: Scene) -> bool:
@@ -120,12 +122,12 @@ def test_scenes_without_the_people_that_a_task_needs_are_named(model):
         with pytest.raises(ValueError, match=message):
             run(model, scene, task)
     with pytest.raises(ValueError, match="scene 1 has nobody in it"):
-        model.stream(nobody, JointFuture(), 8, None)
+        stream(model, nobody, JointFuture(), 8, None)
 
 
 def test_a_stream_without_end_waits_for_nobody(model):
     scene = people([[True, True]], 8)
-    begun = model.stream(scene, AgenticAsync(), 8, None, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
-    ended = model.stream(scene, AgenticAsync(), 8, 400, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
+    begun = stream(model, scene, AgenticAsync(), 8, None, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
+    ended = stream(model, scene, AgenticAsync(), 8, 400, 1, FAST, torch.Generator().manual_seed(0), chunk=4)
     a, b = (cat_time([next(chunks) for _ in range(3)]) for chunks in (begun, ended))
     assert close(a, b)

@@ -5,8 +5,9 @@ import itertools
 import pytest
 import torch
 
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import stream
 from magnet.motion.scene import Scene, cat_time
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_denoiser
@@ -23,7 +24,7 @@ def model():
 
 def run(model, scene: Scene, task, options: SamplerOptions, context: int = 16, frames: int | None = 32, **more):
     generator = torch.Generator().manual_seed(0)
-    return model.stream(scene, task, context, frames, 1, options, generator, **more)
+    return stream(model, scene, task, context, frames, 1, options, generator, **more)
 
 
 @pytest.mark.parametrize("options", [PYRAMID, INDEPENDENT], ids=["pyramid", "independent"])

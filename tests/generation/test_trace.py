@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.generation.trace import DenoisingTrace, record
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import PartnerPrediction
@@ -35,7 +36,7 @@ def generator() -> torch.Generator:
 def test_recording_changes_nothing_of_the_sample(model, start, task, kind) -> None:
     options = SamplerOptions(steps=3, guidance=Guidance(kind))
     recording = record(model, start, task, 16, 16, options, generator())
-    plain = model.generate(start, task, 16, 16, options=options, generator=generator())
+    plain = generate(model, start, task, 16, 16, options=options, generator=generator())
     torch.testing.assert_close(recording.scene.T_world_root, plain.permute_agents(torch.arange(2)).T_world_root)
     assert bool(recording.estimates.T_world_root.isfinite().all())
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions, planning_grid
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import NoiseStream, alpha_bar
+from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.sampler import sample
 from magnet.tasks.joint import JointFuture
 

@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from magnet.generation.blending import freeze_after
-from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown
+from magnet.generation.conditioning import known_tokens, mask_unknown
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry

@@ -5,9 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from magnet.generation.conditioning import SamplerOptions, planning_grid
+from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.presets import PRESETS, preset_name
 from magnet.tasks import registry
 from magnet.testing import tiny_denoiser
@@ -52,7 +53,7 @@ def test_the_papers_sampler_takes_thirty_even_steps_a_stride_and_adds_no_noise(n
 def test_every_task_is_sampled_the_papers_way_and_given_frames_come_back(name: str, scene: Scene):
     model, context = tiny_denoiser(max_agents=3, window=8), 0 if name == "generation" else 16
     options = SamplerOptions.preset("paper", steps=2)
-    made = model.generate(scene, registry.get(name)(), context, 40 - context, 1, options)
+    made = generate(model, scene, registry.get(name)(), context, 40 - context, 1, options)
     assert made.T_world_root.isfinite().all() and made.given is not None
     assert torch.equal(made.T_world_root[made.given], scene.slice(0, 40).T_world_root[made.given])
 

@@ -1,6 +1,7 @@
 """The package of `examples/magnet-duel`, installed as a stranger's would be."""
 
 import importlib
+import json
 import os
 import shutil
 import subprocess
@@ -44,24 +45,45 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where / "installed"
 
 
-def test_an_installed_task_is_listed_with_where_it_comes_from(installed: Path, tmp_path: Path):
-    listed = run("magnet", "tasks", installed=installed, cwd=tmp_path)
-    assert "magnet-duel 0.1.0" in listed
-    assert "--task.ending" in listed and "P(A_t:L-1 | A_0:t-1, A_L, B_0:L, ...)" in listed
+COMMANDS = {
+    "tasks": ("tasks",),
+    "test": ("test", "--task", "duel", "--task.target", "1", "--task.ending", "2", "--print_config"),
+    "data list": ("data", "list"),
+    "fit": ("fit", "--model", "Tokenizer", "--data", "Strolls", "--data.takes", "3", "--print_config"),
+}
+ONE_AFTER_ANOTHER = """
+import contextlib, io, json, sys
+from magnet import cli
+
+said = {}
+for name, words in json.loads(sys.argv[1]).items():
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+        cli.main(words)
+    said[name] = out.getvalue()
+print(json.dumps(said))
+"""
 
 
-def test_its_fields_are_options_as_ours_are(installed: Path, tmp_path: Path):
-    command = ("magnet", "test", "--task", "duel", "--task.target", "1", "--task.ending", "2", "--print_config")
-    config = run(*command, installed=installed, cwd=tmp_path)
-    assert "target: 1" in config and "ending: 2" in config
+@pytest.fixture(scope="module")
+def said(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What commands print where the package is installed, by their names; in one process, which takes seconds."""
+    where = tmp_path_factory.mktemp("said")
+    (where / "commands.py").write_text(ONE_AFTER_ANOTHER)
+    return json.loads(run("commands", json.dumps(COMMANDS), installed=installed, cwd=where))
 
 
-def test_its_data_set_is_listed_and_its_fields_are_options(installed: Path, tmp_path: Path):
-    listed = run("magnet", "data", "list", installed=installed, cwd=tmp_path)
-    assert "Strolls  of magnet-duel 0.1.0" in listed and "--data Strolls" in listed
-    command = ("magnet", "fit", "--model", "Tokenizer", "--data", "Strolls", "--data.takes", "3", "--print_config")
-    config = run(*command, installed=installed, cwd=tmp_path)
-    assert "magnet_duel.strolls.Strolls" in config and "takes: 3" in config
+def test_an_installed_task_is_listed_with_where_it_comes_from(said: dict[str, str]):
+    assert "magnet-duel 0.1.0" in said["tasks"]
+    assert "--task.ending" in said["tasks"] and "P(A_t:L-1 | A_0:t-1, A_L, B_0:L, ...)" in said["tasks"]
+
+
+def test_its_fields_are_options_as_ours_are(said: dict[str, str]):
+    assert "target: 1" in said["test"] and "ending: 2" in said["test"]
+
+
+def test_its_data_set_is_listed_and_its_fields_are_options(said: dict[str, str]):
+    assert "Strolls  of magnet-duel 0.1.0" in said["data list"] and "--data Strolls" in said["data list"]
+    assert "magnet_duel.strolls.Strolls" in said["fit"] and "takes: 3" in said["fit"]
 
 
 def test_its_own_tests_pass(installed: Path, tmp_path: Path):

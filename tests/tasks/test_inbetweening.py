@@ -6,11 +6,13 @@ from magnet import weights
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import next_known, seam_weights, warp_to_keyframe
-from magnet.generation.conditioning import SamplerOptions, known_tokens, mask_unknown
+from magnet.generation.conditioning import known_tokens, mask_unknown
+from magnet.generation.rollout import generate
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, inverse, pairwise, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, pairwise_by_frame
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks.inbetweening import Inbetweening
@@ -107,7 +109,7 @@ TASKS = {
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, options, generator, people, task):
     scene = random_scene(2, 48, people, generator)
-    whole = model.generate(scene, task, 8, 40, 1, options, torch.Generator().manual_seed(0))
+    whole = generate(model, scene, task, 8, 40, 1, options, torch.Generator().manual_seed(0))
     known = task.schedule(Grid(12, 4, 2, 3, 8, 2)).known[:, :people].repeat_interleave(4, dim=0)
     there = whole.permute_agents(torch.arange(people))
     assert torch.equal(there.T_world_root[known.expand(2, -1, -1)], scene.T_world_root[known.expand(2, -1, -1)])
@@ -125,7 +127,7 @@ def test_nothing_jumps_at_the_keyframes_of_the_model_that_ships(task):
     made = Scene.load(weights.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 64)
     handshake = Synthetic(test_clips=1).scene("test", 2).scene.slice(0, 64)
     for scene in (made, handshake):
-        whole = model.generate(scene, task, 8, 56, 2, options, torch.Generator().manual_seed(0))
+        whole = generate(model, scene, task, 8, 56, 2, options, torch.Generator().manual_seed(0))
         there = whole.permute_agents(torch.arange(scene.agents))
         seam, inside = changes(there, there.given[0])
         for what, most in seam.items():
@@ -175,7 +177,7 @@ def test_keyframes_without_a_past_place_the_scene(model, options, generator):
     """Nothing is known before: whoever arrives first takes the others along, and distances stay as generated."""
     scene = random_scene(2, 48, 2, generator)
     task = Inbetweening(keys=(6,), agents=(0,))
-    whole = model.generate(scene, task, 0, 48, 1, options, torch.Generator().manual_seed(0))
+    whole = generate(model, scene, task, 0, 48, 1, options, torch.Generator().manual_seed(0))
     whole = whole.permute_agents(torch.arange(2))
     assert torch.equal(whole.T_world_root[:, 24:28, 0], scene.T_world_root[:, 24:28, 0])
     step = (whole.T_world_root[:, 1:, :, :3, 3] - whole.T_world_root[:, :-1, :, :3, 3]).norm(dim=-1)
@@ -185,7 +187,7 @@ def test_keyframes_without_a_past_place_the_scene(model, options, generator):
 def test_moving_the_world_moves_what_is_between(model, options, scene):
     T = from_planar(torch.tensor(0.9), torch.tensor([4.0, -2.0]))
     a, b = (
-        model.generate(s, Inbetweening(every=5), 8, 40, 1, options, torch.Generator().manual_seed(0))
+        generate(model, s, Inbetweening(every=5), 8, 40, 1, options, torch.Generator().manual_seed(0))
         for s in (scene, scene.transformed(T))
     )
     assert torch.allclose(a.transformed(T).T_world_root[:, :, :3], b.T_world_root[:, :, :3], atol=2e-3)
@@ -215,7 +217,7 @@ def test_with_the_true_tokens_everybody_is_where_they_were(model, options, scene
 
 
 def test_given_partners_beside_keyframes_are_not_moved(model, options, scene):
-    whole = model.generate(scene, PartnerInpainting((1,)), 8, 40, 1, options, torch.Generator().manual_seed(0))
+    whole = generate(model, scene, PartnerInpainting((1,)), 8, 40, 1, options, torch.Generator().manual_seed(0))
     assert torch.equal(whole.T_world_root[:, :, [0, 2]], scene.T_world_root[:, :48, [0, 2]])
 
 

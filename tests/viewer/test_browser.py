@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from magnet.export.page.takes import take
-from magnet.generation.conditioning import SamplerOptions
 from magnet.generation.trace import record
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import JointFuture
 from magnet.viewer import base
 from magnet.viewer.saving import FORMATS

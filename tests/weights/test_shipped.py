@@ -9,8 +9,9 @@ import torch
 from magnet import weights
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
-from magnet.generation.conditioning import SamplerOptions
+from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.synthesis import coupling_error
 from magnet.tasks.joint import Generation, JointFuture
 
@@ -40,7 +41,7 @@ def test_it_generates_groups_of_one_to_four(model, people):
     scene = Synthetic(people=[max(people, 2)], test_clips=1).clips("test")[0].scene.slice(0, 32)
     scene = scene.permute_agents(torch.arange(people))
     options = SamplerOptions(steps=4)
-    whole = model.generate(scene, JointFuture(), 32, 32, 1, options, torch.Generator().manual_seed(0))
+    whole = generate(model, scene, JointFuture(), 32, 32, 1, options, torch.Generator().manual_seed(0))
     assert whole.present.sum() == people
     assert_upright(whole, people)
 
@@ -48,7 +49,7 @@ def test_it_generates_groups_of_one_to_four(model, people):
 def test_it_makes_scenes_from_nothing(model):
     scene = Synthetic(people=[2], test_clips=1).clips("test")[0].scene
     options = SamplerOptions(steps=10)
-    whole = model.generate(scene, Generation(), 0, 60, 1, options, torch.Generator().manual_seed(0))
+    whole = generate(model, scene, Generation(), 0, 60, 1, options, torch.Generator().manual_seed(0))
     assert_upright(whole, 2)
 
 
@@ -68,7 +69,7 @@ def test_it_has_learnt_the_coupling_of_a_circle_dance(model):
         made = data.scene("test", i)
         context = made.scene.slice(0, 32)
         options = SamplerOptions(steps=20)
-        whole = model.generate(context, JointFuture(), 32, 90, 1, options, torch.Generator().manual_seed(i))
+        whole = generate(model, context, JointFuture(), 32, 90, 1, options, torch.Generator().manual_seed(i))
         joints = data.body.joints(whole.slice(32))[0][:, :3]
         still = data.body.joints(context.slice(31).slice(0, 1))[0].expand(90, -1, -1, -1)
         mine, held = (coupling_error("circle", j, made.truth, start=32 / 30) for j in (joints, still))

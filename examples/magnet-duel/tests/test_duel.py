@@ -3,6 +3,7 @@ import torch
 from magnet_duel import Duel
 from magnet_duel.strolls import Strolls
 
+from magnet.generation.rollout import generate
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.testing import random_scene, task_laws, tiny_denoiser
@@ -19,7 +20,7 @@ def test_the_package_is_found():
 
 def test_others_and_the_ending_come_back_as_they_were():
     scene = random_scene(1, 48, 2, torch.Generator().manual_seed(0))
-    sampled = tiny_denoiser(max_agents=2).generate(scene, Duel(target=1), 8, 40)
+    sampled = generate(tiny_denoiser(max_agents=2), scene, Duel(target=1), 8, 40)
     assert torch.equal(sampled.T_world_root[:, :, 0], scene.T_world_root[:, :, 0])
     assert torch.equal(sampled.T_world_root[:, 44:], scene.T_world_root[:, 44:])
     assert not torch.equal(sampled.T_world_root[:, 8:44, 1], scene.T_world_root[:, 8:44, 1])

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from magnet.body.base import Body, load_body
 from magnet.export.page.rig import Array
+from magnet.export.trace import DenoisingTrace
 from magnet.files import load_npz
-from magnet.generation.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 
 SAMPLES = 4

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from magnet.generation import causal_bodies
-from magnet.generation.conditioning import SamplerOptions
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.partner import MotionControl
-from magnet.testing_poses import never_shown, pose_law
+from magnet.testing.poses import never_shown, pose_law
 
 GRID = Grid(12, 2, 3, steps=2, window=6, stride=2)
 THREE = Grid(10, 3, 3, steps=2, window=6, stride=3)

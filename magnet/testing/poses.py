@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.generation.conditioning import SamplerOptions, task_lookahead_limit
+from magnet.generation.conditioning import task_lookahead_limit
 from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
 from magnet.sampling.noise import NoiseStream
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing.models import random_scene, tiny_denoiser
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser

@@ -1,0 +1,104 @@
+"""How scenes are sampled: the options of the sampler, and the grid that tasks plan on with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from magnet.checks import require_choice, require_number, require_whole
+from magnet.motion.frames import Placement
+from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.presets import preset_fields
+from magnet.sampling.schedule import Grid
+from magnet.sampling.solvers import Solver
+
+Separation = Literal["off", "light", "firm"]
+
+
+@dataclass(frozen=True)
+class SamplerOptions:
+    """How scenes are sampled.
+
+    `preset` gives sets of these options by name; `paper` is the paper's sampler.
+
+    Args:
+        steps: denoising steps S; the paper takes 30 (A.3). No more than pass levels that differ, which is a matter of
+            `spacing` and `shift`.
+        stride: token steps finished before the window moves on; the reference keeps 12 of 16.
+        pyramid_offset: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
+            8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
+            that can roll do, with half of the window half denoised; those whose agents take turns or that look
+            ahead to keyframes go in strides.
+        placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
+            reference), `anchor`, or `fuse` (ours).
+        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
+            (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
+        apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
+            is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
+        requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
+            does. None: if codes are what the model was trained to generate (`target` of the denoiser).
+        keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
+        blend: frames over which a seam fades out behind given frames, and in before them.
+        eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
+            `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
+        shift: over 1, more of even denoising steps at high noise levels; 1 leaves them even, as in the paper.
+        any_floor: take people who all stand far from y = 0, where models have their floor, as they are.
+        guidance: motion history guidance (paper A.7), off by default.
+        noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
+            passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
+        solver: `ddim`, as in the paper, or `dpmpp_2m`, DPM-Solver++(2M), of second order: few steps keep the variance.
+        spacing: of the levels that are passed: `even`, as in the paper, which `shift` moves; or evenly in `log_snr`,
+            with a last level near 0.
+    """
+
+    steps: int = 16
+    stride: int = 4
+    pyramid_offset: int | None = None
+    placement: Placement = "fuse"
+    pairwise_weight: float = 0.02
+    apart: Separation = "off"
+    requantize: bool | None = None
+    keep_given: bool = True
+    blend: int = 10
+    eta: float = 1.0
+    shift: float = 1.0
+    any_floor: bool = False
+    guidance: Guidance = field(default_factory=Guidance)
+    noise_sampling: NoiseSampling = "joint"
+    solver: Solver = "dpmpp_2m"
+    spacing: Spacing = "log_snr"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.guidance, Guidance):
+            raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
+        require_choice("placement", self.placement, Placement)
+        require_choice("apart", self.apart, Separation)
+        require_choice("solver", self.solver, Solver)
+        require_whole("steps", self.steps, 1, LEVELS)
+        require_whole("stride", self.stride, 1)
+        if self.pyramid_offset is not None:
+            require_whole("pyramid_offset", self.pyramid_offset, 0)
+        require_number("pairwise_weight", self.pairwise_weight, least=0)
+        require_whole("blend", self.blend, 0)
+        require_number("eta", self.eta, 0, 1)
+        require_spacing(self.spacing, self.shift)
+
+    @classmethod
+    def preset(cls, name: str, **fields: Any) -> SamplerOptions:
+        """The options of a preset (`magnet.sampling.presets`), some fields replaced: `preset("paper", steps=50)`.
+
+        Raises:
+            ValueError: no such preset; suggests the closest.
+        """
+        said = preset_fields(name)
+        if "guidance" in said:
+            said = {**said, "guidance": Guidance(**said["guidance"])}
+        return cls(**{**said, **fields})
+
+
+def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
+    """The grid that a task plans on: sizes in token steps, and how these options sample."""
+    o = options
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)

@@ -1,0 +1,74 @@
+"""Small models and motions for tests."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import roma
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import rigid
+from magnet.motion.scene import Scene
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+
+def random_scene(
+    scenes: int, frames: int, agents: int, generator: torch.Generator, present: Tensor | None = None
+) -> Scene:
+    """Smooth random motion that is nobody's: upright bodies that wander and turn, all joints moving a little."""
+
+    def smooth(*shape: int, scale: float) -> Tensor:
+        """A few slow sine waves along the second axis."""
+        time = torch.linspace(0, frames / 30, frames).view(1, -1, *[1] * (len(shape) - 2))
+        wave = torch.zeros(shape)
+        for frequency in (0.3, 0.7, 1.3):
+            size = torch.randn(shape[0], 1, *shape[2:], generator=generator)
+            phase = 6.28 * torch.rand(shape[0], 1, *shape[2:], generator=generator)
+            wave = wave + size * (6.28 * frequency * time + phase).sin()
+        return scale * wave
+
+    body_rot = roma.rotvec_to_rotmat(smooth(scenes, frames, agents, 21, 3, scale=0.2))
+    tilt = roma.rotvec_to_rotmat(smooth(scenes, frames, agents, 3, scale=0.1))
+    yaw = 6.28 * torch.rand(scenes, 1, agents, generator=generator) + smooth(scenes, frames, agents, scale=0.4)
+    heading = roma.rotvec_to_rotmat(torch.stack([0 * yaw, yaw, 0 * yaw], dim=-1))
+    start = torch.randn(scenes, 1, agents, 3, generator=generator)
+    position = start + smooth(scenes, frames, agents, 3, scale=0.3)
+    position[..., 1] = 0.9 + 0.05 * smooth(scenes, frames, agents, scale=1.0)
+    scene = Scene(
+        body_rot=body_rot,
+        T_world_root=rigid(heading @ tilt, position),
+        betas=0.5 * torch.randn(scenes, agents, 10, generator=generator),
+        present=torch.ones(scenes, agents, dtype=torch.bool),
+    )
+    return scene if present is None else without_absent(scene.replace(present=present))
+
+
+def without_absent(scene: Scene) -> Scene:
+    """Empty the slots of agents that are not present, as every reader does."""
+    there = scene.present[:, None, :, None, None]
+    eye = torch.eye(4, device=scene.device)
+    return scene.replace(
+        body_rot=torch.where(there[..., None], scene.body_rot, eye[:3, :3]),
+        T_world_root=torch.where(there, scene.T_world_root, eye),
+        betas=torch.where(scene.present[..., None], scene.betas, 0.0),
+    )
+
+
+def tiny_denoiser(max_agents: int = 3, window: int = 8, seed: int = 0, **options: Any) -> Denoiser:
+    """An untrained denoiser of a few thousand weights, with a tokenizer whose codebook is set."""
+    from magnet.denoiser.module import Denoiser
+    from magnet.tokenizer.module import Tokenizer
+
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
+        generator = torch.Generator().manual_seed(seed)
+        tokenizer.init_codebook([random_scene(4, 32, 2, generator)])
+        sizes = {"width": 32, "layers": 2, "heads": 2, "mlp_ratio": 2, "dropout": 0.0}
+        model = Denoiser(max_agents=max_agents, window=window, **{**sizes, **options})
+        model.build(tokenizer)
+        model.fit_normalizer(*model.tokenize(random_scene(4, 32, max_agents, generator)))
+    return model.eval()

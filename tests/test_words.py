@@ -1,0 +1,81 @@
+"""The project's words: one name for one class, pages that exist, and a glossary of words that the code uses."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import io
+import re
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "magnet").rglob("*.py"))
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text()
+
+
+def test_no_class_name_exists_twice():
+    where: dict[str, list[str]] = defaultdict(list)
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                where[node.name].append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    twice = {name: places for name, places in where.items() if len(places) > 1}
+    assert not twice, f"one word for one thing: {twice}"
+
+
+def texts(path: Path) -> Iterator[str]:
+    """Comments and strings of a source file, docstrings among them."""
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+        if token.type in (tokenize.COMMENT, tokenize.STRING):
+            yield token.string
+
+
+def test_every_page_that_the_code_names_is_in_the_repository():
+    missing = []
+    for path in SOURCES:
+        for page in re.findall(r"[\w./-]*\w\.md\b", "\n".join(texts(path))):
+            near = (ROOT / page, path.parent / page)
+            if not any(place.exists() for place in near):
+                missing.append(f"{path.relative_to(ROOT)}: {page}")
+    assert not missing, missing
+
+
+def glossary() -> list[tuple[str, str]]:
+    """(word, what it is called in the code) of every row of the glossary's tables of three columns."""
+    rows = re.findall(r"(?m)^\| ([^|]+) \| ([^|]+) \| [^|]+ \|$", GLOSSARY.partition("## Words of earlier")[0])
+    return [(word, name) for word, names in rows for name in re.findall(r"`(\w+)`", names)]
+
+
+@functools.cache
+def names() -> set[str]:
+    """Every name that the package's code uses, and its modules."""
+    found = {path.stem for path in SOURCES}
+    for path in SOURCES:
+        tokens = tokenize.generate_tokens(io.StringIO(path.read_text()).readline)
+        found |= {token.string for token in tokens if token.type == tokenize.NAME}
+    return found
+
+
+def test_every_word_of_the_glossary_is_used_in_the_code():
+    entries = glossary()
+    assert len(entries) > 40
+    unused = [f"{word}: {name}" for word, name in entries if name not in names()]
+    assert not unused, unused
+
+
+@pytest.mark.parametrize("column", [0, 1], ids=["before", "now"])
+def test_new_words_are_used_and_old_classes_are_gone(column: int):
+    rows = re.findall(r"(?m)^\| ([^|]*`[^|]*) \| ([^|]*`[^|]*) \|$", GLOSSARY.partition("## Words of earlier")[2])
+    words = [word for row in rows for word in re.findall(r"`(?:\w+\.)?(\w+)(?:\(\))?`", row[column])]
+    assert len(words) > 20
+    used = names()
+    if column:
+        assert not [word for word in words if word not in used]
+    else:
+        classes = {"Canvas", "Stream", "FedStream", "RecordedStream", "Health", "Troupe", "Playground", "Look"}
+        assert classes <= set(words) and not (classes - {"Canvas"}) & used  # pictures are drawn on a `Canvas`
