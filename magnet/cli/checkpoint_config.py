@@ -21,6 +21,7 @@ from magnet.cli.class_options import class_in_flags, one_class, same_class, spec
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
 from magnet.motion.tokens import STRIDE
+from magnet.old_names import renamed_flags, told
 
 Spec = dict[str, Any]
 """A class and its options: {"class_path": ..., "init_args": {...}}."""
@@ -53,7 +54,9 @@ class Arguments:
                 found.files.append(value if equals else next(rest, ""))
             else:
                 found.flags.append(argument)
-        found.flags = one_class(found.flags)
+        found.flags, changed = renamed_flags(one_class(found.flags))
+        if changed:
+            print(f"magnet: {told(changed)}", file=sys.stderr)
         found.layers = [layer for file in found.files for layer in read_layers(file)]
         return found
 
@@ -225,9 +228,7 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
     return layer
 
 
-OWN_WAY = {
-    "tokenizer", "start_from", "decoder_only", "learning_rate", "weight_decay", "warmup_steps", "compile", "seed"
-}  # fmt: skip
+OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
 """Options of a model that one which starts from it does not take over."""
 
 

@@ -13,7 +13,6 @@ from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import STRIDE, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
-from magnet.tokenizer.module import Tokenizer
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -53,7 +52,7 @@ def label(scene: Scene, number: int) -> str:
 
 def receptive_field(model: Denoiser) -> tuple[int, int]:
     """Tokens before and after that a code or a decoded frame can depend on: encoder and decoder look equally far."""
-    return model.tokenizer.vqvae.decoder.receptive_field if isinstance(model.tokenizer, Tokenizer) else (0, 0)
+    return model.tokenizer.receptive_field
 
 
 def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:

@@ -17,7 +17,8 @@ from magnet.tokenizer.normalizer import Normalizer
 class RawPose(nn.Module):
     """Stands in for a tokenizer: the latent is the z-scored pose of four frames, 540 numbers. Nothing to train."""
 
-    latent: int = STRIDE * POSE_FEATURES
+    codebook_dim: int = STRIDE * POSE_FEATURES
+    receptive_field = (0, 0)
 
     def __init__(self) -> None:
         super().__init__()

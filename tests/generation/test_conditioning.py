@@ -80,7 +80,7 @@ def test_no_task_leaks(model, scene, generator, name):
 
 def test_the_literal_reading_leaks_where_the_unknown_partner_is(scene, generator):
     """pairwise_noise="token": the same replacement changes the sample, which is why it is not the default."""
-    leaking = tiny_denoiser(max_agents=3, window=8, pairwise_noise="token")
+    leaking = tiny_denoiser(max_agents=3, window=8, noise={"pairwise": "token"})
     task = registry.get("partner_inpainting")()
     known = task.schedule(Grid(12, 3, 4, 3, 8, 2)).known
     other = unknown_replaced(scene, known, generator)

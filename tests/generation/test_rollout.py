@@ -21,9 +21,8 @@ from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from magnet.testing.poses import blocks_of
-from magnet.tokenizer.module import Tokenizer
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS = 45
@@ -166,7 +165,7 @@ def test_long_given_stretches_are_encoded_in_pieces_as_they_are_whole(causal, de
     model = tiny_denoiser(max_agents=2)
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        model.tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=depth, causal=causal).eval()
+        model.tokenizer = tiny_tokenizer(network={"depth": depth, "causal": causal}).eval()
     scene = random_scene(1, 400, 2, torch.Generator().manual_seed(5))
     before, after = receptive_field(model)
 
