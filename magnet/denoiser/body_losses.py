@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.body.joints import WRISTS
 from magnet.motion.frames import partners, pose_features
 from magnet.motion.scene import FPS, Scene
 from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame
@@ -18,7 +19,6 @@ from magnet.tokenizer.normalizer import Normalizer
 
 BODY_LOSSES = ("joint", "velocity", "partner", "hands")
 
-WRISTS = [20, 21]
 
 WITHIN_REACH = 0.4
 """Metres: only wrists that were recorded nearer to each other than this count in `hands`."""

@@ -8,14 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.body.joints import FEET, TOES
 from magnet.motion.frames import from_9d
 from magnet.motion.rotations import from_6d, geodesic
 from magnet.motion.scene import FPS
-
-FEET = (7, 8, 10, 11)
-"""Ankles and toes."""
-
-TOES = (10, 11)
 
 STANDS = (0.05, 0.2)
 """Height in metres and speed in m/s under which a recorded toe stands."""
