@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from magnet import cli
+from magnet.cli.main import COMMANDS
 from magnet.motion.scene import Scene
 
 ROOT = Path(__file__).parents[1]
@@ -96,7 +97,7 @@ def test_commands_and_files_that_a_page_names_exist(page):
     """Every `magnet ...` line parses as far as its command, every config and linked file is there."""
     text = (ROOT / page).read_text()
     for command in re.findall(r"^\s{4}(?:\w+=\S+ )*magnet (\w+)", text, re.MULTILINE):
-        assert command in cli.COMMANDS, command
+        assert command in COMMANDS, command
     for path in re.findall(r"configs/[\w./]+\.yaml", text):
         assert (ROOT / path).exists(), path
     for link in re.findall(r"\]\(((?!https?:)[^)#]+)", text):

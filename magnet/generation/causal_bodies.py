@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import STRIDE
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
-
-if TYPE_CHECKING:
-    from magnet.generation.world import WorldState
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
+
+
+class World(Protocol):
+    """What bodies are made from: where everybody has been placed so far, see `WorldState`."""
+
+    model: Denoiser
+    options: SamplerOptions
+    given: Scene
+    known: Tensor
+    placed: Tensor
+    T_world_can: Tensor
+    finalized: int
+
+    def by_frame(self, rows: Tensor) -> Tensor: ...
 
 
 class Expected:
@@ -74,9 +87,7 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
     return each[:, view_of, :, agent].permute(1, 2, 0, 3)
 
 
-def finalize_bodies(
-    world: WorldState, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None
-) -> None:
+def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
     """Settle the bodies of rows up to `stop` for good: they are given from then on.
 
     Args:
@@ -93,7 +104,7 @@ def finalize_bodies(
     world.finalized = stop
 
 
-def finalized_bodies(world: WorldState, tokens: Tensor, first: int, stop: int) -> Scene:
+def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
     """Rows [first, stop) as they have been shown, and from there on as they would be."""
     known = world.given.slice(first * STRIDE, max(min(world.finalized, stop), first) * STRIDE)
     if world.finalized >= stop:
@@ -103,7 +114,7 @@ def finalized_bodies(world: WorldState, tokens: Tensor, first: int, stop: int) -
 
 
 def decode_bodies(
-    world: WorldState,
+    world: World,
     tokens: Tensor,
     first: int,
     stop: int,
@@ -131,7 +142,7 @@ def decode_bodies(
 
 
 def continuation(
-    world: WorldState, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
+    world: World, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
     tokens, told = expected

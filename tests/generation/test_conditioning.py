@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.generation.blending import seam_weights
-from magnet.generation.conditioning import known_tokens, mask_unknown, stretches
+from magnet.generation.conditioning import known_tokens, mask_unknown, segments
 from magnet.generation.rollout import generate
 from magnet.generation.world import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
@@ -265,7 +265,7 @@ def test_the_step_into_a_keyframe_is_shown_as_the_keyframes_own_next_step(model,
 
 def test_each_agents_unbroken_stretches_are_found():
     known = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 1], [1, 1, 1]], dtype=torch.bool)
-    assert stretches(known) == [(0, 2, [0]), (0, 4, [1]), (2, 4, [2]), (3, 4, [0])]
+    assert segments(known) == [(0, 2, [0]), (0, 4, [1]), (2, 4, [2]), (3, 4, [0])]
 
 
 def test_scrubbed_scenes_hold_nothing_unknown(scene):
