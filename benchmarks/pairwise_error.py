@@ -21,7 +21,7 @@ from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.evaluation.results import machine
 from magnet.motion.planar import yaw_ground
 from magnet.motion.scene import concatenate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS, add_noise
 
 SHOWN = (5, 20, 50, 100, 300, 500)
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON to write")
     options = parser.parse_args()
     model = Denoiser.load(options.ckpt_path)
-    frames = model.window * STRIDE
+    frames = model.window * TOKEN_FRAMES
     data = CMU(singles=False, test_takes=options.takes, test_stride=frames, horizon_frames=frames - 32, batch_size=16)
     data.prepare_data()
     data.setup("test")

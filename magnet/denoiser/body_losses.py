@@ -11,7 +11,7 @@ from magnet.body import Body
 from magnet.body.joints import WRISTS
 from magnet.motion.frames import partners, pose_features
 from magnet.motion.scene import FPS, Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.losses import length, masked_mean, matrices, moved, world_velocity
@@ -126,8 +126,8 @@ def body_losses(
     shape = betas[:, None]
     mine = joints(*matrices(decode(latent, betas, steps)), shape)  # (B, T, P, 22, 3)
     real = joints(*matrices(true_pose), shape)
-    weight = signal.repeat_interleave(STRIDE, dim=1)  # (B, T, P)
-    counts = there.repeat_interleave(STRIDE, dim=1)
+    weight = signal.repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
+    counts = there.repeat_interleave(TOKEN_FRAMES, dim=1)
     own = counts[..., 0]
     losses = {"joint": masked_mean(weight * _mean_length(mine - real), own)}
 

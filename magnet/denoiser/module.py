@@ -24,7 +24,7 @@ from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
 from magnet.old_names import renamed_checkpoint
 from magnet.precision import dtype_of, require_float32_scenes
 from magnet.sampling.noise import add_noise
@@ -178,7 +178,9 @@ class Denoiser(L.LightningModule):
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         """
-        people = self.tokenizer.encode_scene(scene.people().pad_frames(STRIDE), self.quantized).float()[:, 1:-1, 0]
+        people = self.tokenizer.encode_scene(scene.people().pad_frames(TOKEN_FRAMES), self.quantized).float()[
+            :, 1:-1, 0
+        ]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -211,7 +213,7 @@ class Denoiser(L.LightningModule):
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
         if scene.valid is not None:
-            whole = scene.valid.unflatten(1, (-1, STRIDE)).all(dim=-1)
+            whole = scene.valid.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
             there = there & whole[:, :, None, None]
         return tokens, there
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from magnet.motion.frames import partners
 from magnet.motion.planar import nine_of, rotate_ground, yaw_ground
 from magnet.motion.pose_graph import Planar, solve_pose_graph
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.normalizer import Normalizer
 
@@ -81,8 +81,8 @@ class PairwisePosterior(nn.Module):
     ) -> Tensor:
         """Posterior means in 9-D, as tokens hold them. -> (B, N, P, P - 1, 4, 9)"""
         step = yaw_ground(by_frame(steps))
-        own = group_levels[..., 0].repeat_interleave(STRIDE, dim=1)  # (B, T, P)
-        pair_levels = group_levels[..., 1:].repeat_interleave(STRIDE, dim=1)  # (B, T, P, P - 1)
+        own = group_levels[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
+        pair_levels = group_levels[..., 1:].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P, P - 1)
         there = self.layout.group_present(present)[:, None, :, 1:]
         steps_known = own == 0
         step_ground = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_ground, own)))
@@ -134,7 +134,7 @@ def shown_deviation(pair_levels: Tensor, layout: TokenLayout, normalizer: Normal
     """
     alpha = alpha_bar(pair_levels)
     noise = ((1 - alpha) / alpha.clamp_min(1e-6)).sqrt()
-    first = layout.latent + 9 * STRIDE
+    first = layout.latent + 9 * TOKEN_FRAMES
     std = normalizer.std[first : first + 9]
     cosine, sine = std[[0]].square().mean(), std[[2]].square().mean()
     turning = noise * ((cosine + sine) / 2).sqrt()

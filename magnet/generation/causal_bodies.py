@@ -12,7 +12,7 @@ from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
 
@@ -97,7 +97,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
         near: one past the last finished row, at least `stop`.
         expected: see `Expected.behind`, from row `near` on.
     """
-    frames = slice(world.finalized * STRIDE, stop * STRIDE)
+    frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
@@ -106,7 +106,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
     """Rows [first, stop) as they have been shown, and from there on as they would be."""
-    known = world.given.slice(first * STRIDE, max(min(world.finalized, stop), first) * STRIDE)
+    known = world.given.slice(first * TOKEN_FRAMES, max(min(world.finalized, stop), first) * TOKEN_FRAMES)
     if world.finalized >= stop:
         return known
     rest = decode_bodies(world, tokens, max(world.finalized, first), stop, stop)
@@ -129,15 +129,15 @@ def decode_bodies(
     if expected is not None:
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
-    frames = slice(first * STRIDE - lead, stop * STRIDE)
+    frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
     features = model.tokenizer.decode(latent, world.given.betas, deltas)
-    features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
+    features = features[:, frames.start - low * TOKEN_FRAMES : frames.stop - low * TOKEN_FRAMES]
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
-    before = world.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
+    before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
 
 

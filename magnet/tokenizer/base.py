@@ -16,7 +16,7 @@ from magnet.motion.scene import Scene
 class PoseTokenizer(Protocol):
     """Poses of one person to latents and back: all that a denoiser asks of a tokenizer.
 
-    It is a `torch.nn.Module`; the denoiser freezes it. `Tokenizer` and `RawPose` are two. A latent is of `STRIDE`
+    It is a `torch.nn.Module`; the denoiser freezes it. `Tokenizer` and `RawPose` are two. A latent is of `TOKEN_FRAMES`
     frames. Give yours to `Denoiser.build`.
     """
 

@@ -15,7 +15,7 @@ from torchmetrics import MeanMetric
 
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, by_token
+from magnet.motion.tokens import TOKEN_FRAMES, by_token
 from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
@@ -97,7 +97,7 @@ class Tokenizer(L.LightningModule):
         self.quantizer = made = make_quantizer(options)
         self.codebook_dim = made.dim
         self.vqvae = VQVAE(
-            POSE_FEATURES, made.dim, network.width, network.depth, network.causal, STRIDE, made.unit_input
+            POSE_FEATURES, made.dim, network.width, network.depth, network.causal, TOKEN_FRAMES, made.unit_input
         )
         self.body: Body | None = None
         self.mpjpe = MeanMetric()
@@ -138,7 +138,7 @@ class Tokenizer(L.LightningModule):
             first = max(start - before, 0)
             near = slice(first, start + window + after)
             frames = self._reconstruct(latent[:, near], betas, steps[:, near])
-            parts.append(frames[:, (start - first) * STRIDE : (start - first + window) * STRIDE])
+            parts.append(frames[:, (start - first) * TOKEN_FRAMES : (start - first + window) * TOKEN_FRAMES])
         return torch.cat(parts, dim=1)
 
     @property
@@ -157,7 +157,7 @@ class Tokenizer(L.LightningModule):
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
-        scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
+        scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
         seen = features(scene)
         latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
         return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
@@ -165,8 +165,10 @@ class Tokenizer(L.LightningModule):
     def embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
         """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
         B, T, P, _ = pose.shape
-        if T % STRIDE:
-            raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the clip first")
+        if T % TOKEN_FRAMES:
+            raise ValueError(
+                f"{T} frames are not a whole number of tokens of {TOKEN_FRAMES} frames; cut the clip first"
+            )
         known = pose.new_ones(B, T, 2, dtype=torch.bool)
         if valid is not None:
             known = torch.stack([valid, step_known(valid)], dim=-1)
@@ -176,7 +178,9 @@ class Tokenizer(L.LightningModule):
 
     def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
         P = latent.shape[2]
-        known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
+        known = (
+            None if valid is None else step_known(valid).unflatten(1, (-1, TOKEN_FRAMES)).repeat_interleave(P, dim=0)
+        )
         pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
         with torch.autocast(pose.device.type, enabled=False):
             return orthonormalize(unfold(pose, latent))
