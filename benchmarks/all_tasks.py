@@ -27,7 +27,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import TRUTH, Evaluator
 from magnet.evaluation.results import Results, machine
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
@@ -80,7 +80,7 @@ class Replaced(Evaluator):
     """The sampler sees other motion in place of all that the task does not give: scores must not notice."""
 
     def predict_joints(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
-        known = self.schedule(self.context, self.horizon).known.repeat_interleave(STRIDE, dim=0)
+        known = self.schedule(self.context, self.horizon).known.repeat_interleave(TOKEN_FRAMES, dim=0)
         keep = (
             known[: scene.frames, : scene.agents, None, None].to(scene.device) | ~scene.present[:, None, :, None, None]
         )

@@ -168,6 +168,7 @@ def fit(data: Any, steps: int) -> str:
     import lightning as L
 
     from magnet.tokenizer import Tokenizer
+    from magnet.tokenizer.options import AutoencoderOptions, QuantizerOptions
 
     seen: list[tuple[float, float]] = []
 
@@ -175,7 +176,7 @@ def fit(data: Any, steps: int) -> str:
         def on_train_batch_end(self, *_: Any) -> None:
             seen.append((time.perf_counter(), memory()["RssAnon"]))
 
-    model = Tokenizer(latent=16, hidden=32, codes=32, depth=1)
+    model = Tokenizer(AutoencoderOptions(width=32, depth=1), QuantizerOptions(codebook_dim=16, codebook_size=32))
     quiet = {
         "logger": False,
         "enable_checkpointing": False,

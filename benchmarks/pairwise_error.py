@@ -17,10 +17,11 @@ from torch import Tensor
 
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.pairwise_posterior import PairwisePosterior, planar_of
+from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.evaluation.results import machine
+from magnet.motion.planar import yaw_ground
 from magnet.motion.scene import concatenate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS, add_noise
 
 SHOWN = (5, 20, 50, 100, 300, 500)
@@ -36,7 +37,7 @@ def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
 
 def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float]:
     """Mean errors of pairwise transforms: centimetres, degrees. (B, N, P, D) x 2"""
-    pairs = [planar_of(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2]) for x in (tokens, truth)]
+    pairs = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2]) for x in (tokens, truth)]
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(pairs[0][0].shape)
     turned = pairs[0][0] - pairs[1][0]
     turned = torch.atan2(turned.sin(), turned.cos()).abs()[there]
@@ -52,7 +53,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON to write")
     options = parser.parse_args()
     model = Denoiser.load(options.ckpt_path)
-    frames = model.window * STRIDE
+    frames = model.window * TOKEN_FRAMES
     data = CMU(singles=False, test_takes=options.takes, test_stride=frames, horizon_frames=frames - 32, batch_size=16)
     data.prepare_data()
     data.setup("test")

@@ -24,7 +24,7 @@ from magnet.generation.blending import cat_time
 from magnet.generation.rollout import stream
 from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import Task, registry
@@ -108,13 +108,13 @@ def measure(options: argparse.Namespace) -> None:
 
 def given_later(task: Task, context: int) -> bool:
     """Whether the task is given motion after the context too, to the end of the scene."""
-    past = context // STRIDE
+    past = context // TOKEN_FRAMES
     return bool(task.schedule(Grid(past + 32, 2, past)).known[past:].any())
 
 
 def recorded(options: argparse.Namespace, frames: int) -> Scene:
     """What the task may be given, and no more; at least a few frames, for who is there."""
-    frames = max(-(-frames // STRIDE) * STRIDE, CONTEXT)
+    frames = max(-(-frames // TOKEN_FRAMES) * TOKEN_FRAMES, CONTEXT)
     if options.model == TOY:
         return random_scene(1, frames, 2, torch.Generator().manual_seed(1))
     clip = max(frames, CLIP)

@@ -21,7 +21,7 @@ from magnet.export import formats
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 
@@ -230,7 +230,7 @@ class Model:
             ValueError: more people than the model has room for.
         """
         require_whole("people", people, 1, self.most_people)
-        empty = empty_scene(1, STRIDE, people, torch.zeros(()))
+        empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
         return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples)
 
@@ -250,9 +250,9 @@ class Model:
         if context is not None:
             require_whole("context", context)
         given = scene.frames if context is None else min(scene.frames, context)
-        given = given // STRIDE * STRIDE
-        if given < STRIDE:
-            raise ValueError(f"to go on, the model needs {STRIDE} frames or more; got {max(given, 0)}")
+        given = given // TOKEN_FRAMES * TOKEN_FRAMES
+        if given < TOKEN_FRAMES:
+            raise ValueError(f"to go on, the model needs {TOKEN_FRAMES} frames or more; got {max(given, 0)}")
         scene = scene.slice(scene.frames - given)
         return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
 
@@ -342,7 +342,7 @@ class Model:
         if frames is not None:
             require_whole("frames", frames, 1)
         else:
-            frames = scene.frames // STRIDE * STRIDE - context
+            frames = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES - context
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
         known = [field.name for field in dataclasses.fields(kind)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,21 +21,80 @@ CLASSES: dict[str, str] = {
 }
 """Dotted paths of classes that have moved or changed their name."""
 
-DENOISER: dict[str, str | None] = {
-    "relations": "pairwise",
-    "relation_noise": "pairwise_noise",
-    "relation_weight": "pairwise_weight",
+OPTIMIZER: dict[str, str | None] = {
+    "learning_rate": "optimizer.learning_rate",
+    "weight_decay": "optimizer.weight_decay",
+    "warmup_steps": "optimizer.warmup_steps",
     "std_floor": None,
 }
 
+DENOISER: dict[str, str | None] = {
+    **OPTIMIZER,
+    "width": "network.width",
+    "layers": "network.layers",
+    "heads": "network.heads",
+    "mlp_ratio": "network.mlp_ratio",
+    "dropout": "network.dropout",
+    "level_width": "network.level_width",
+    "agent_width": "network.agent_width",
+    "slot_width": "network.slot_width",
+    "rope": "network.rope",
+    "agent_embedding": "network.agent_embedding",
+    "relations": "network.pairwise",
+    "causal_block": "network.causal_block",
+    "pairwise_posterior": "network.pairwise_posterior",
+    "noise_levels": "noise.distribution",
+    "level_shift": "noise.shift",
+    "relation_noise": "noise.pairwise",
+    "pairwise_metres": "noise.pairwise_metres",
+    "own_past": "self_forcing.share",
+    "latent_weight": "loss.latent",
+    "step_weight": "loss.delta",
+    "relation_weight": "loss.pairwise",
+    "near_weight": "loss.near",
+    "consistency_weight": "loss.consistency",
+    "consistency_warmup": "loss.consistency_warmup",
+    "pose_weight": "loss.joint",
+    "motion_weight": "loss.velocity",
+    "partner_weight": "loss.partner",
+    "hands_weight": "loss.hands",
+    "decoded_share": "loss.decoded_share",
+    "weighting": "loss.weighting",
+    "snr_most": "loss.snr_gamma",
+}
+
 TOKENIZER: dict[str, str | None] = {
-    "std_floor": None,
+    **OPTIMIZER,
+    "hidden": "network.width",
+    "depth": "network.depth",
+    "causal": "network.causal",
+    "codes": "quantizer.codebook_size",
+    "latent": "quantizer.codebook_dim",
+    "levels": "quantizer.num_quantizers",
+    "decay": "quantizer.ema_decay",
+    "revive_below": "quantizer.dead_code_threshold",
+    "body_weight": "loss.joint_rotation",
+    "root_rotation_weight": "loss.root_rotation",
+    "root_translation_weight": "loss.root_translation",
+    "commitment_weight": "loss.commitment",
+    "joint_weight": "loss.joint",
+    "velocity_weight": "loss.velocity",
+    "foot_weight": "loss.foot_velocity",
+    "stance_weight": "loss.foot_contact",
+    "exchange_limbs": "augment.limb_swap_prob",
+    "turn_joints": "augment.joint_noise",
+    "drift": "augment.root_noise",
 }
 
 DATA: dict[str, str | None] = {}
 
 SAMPLER: dict[str, str | None] = {
     "requantise": "requantize",
+    "rolling": "pyramid_offset",
+    "trust": "pairwise_weight",
+    "paste": "keep_given",
+    "guidance.literal": "guidance.paper_average",
+    "guidance.context_level": "guidance.stabilization_level",
 }
 
 OPTIONS: dict[str, dict[str, str | None]] = {
@@ -117,16 +177,24 @@ def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str
 
     Args:
         kind: a key of `OPTIONS`.
-        options: by name. What is said under a new name beats what is said under its old one.
+        options: by name, groups as dictionaries. What is said under a new name beats what is said under its old one.
     """
-    names = OPTIONS.get(kind, {})
-    new: Options = {name: copy.deepcopy(value) for name, value in options.items() if not _is_old(name, value, names)}
-    changed: dict[str, str | None] = {}
-    for name, value in options.items():
-        if _is_old(name, value, names):
-            changed[name] = names[name]
-            if names[name] is not None:
-                _put(new, str(names[name]).split("."), copy.deepcopy(value))
+    new, changed = copy.deepcopy(options), {}
+    for old, now in OPTIONS.get(kind, {}).items():
+        *groups, name = old.split(".")
+        within = _group(new, groups)
+        # A group may have the name that an option had.
+        if (
+            within is None
+            or name not in within
+            or ((now or "").startswith(f"{old}.") and isinstance(within[name], dict))
+        ):
+            continue
+        value = within.pop(name)
+        changed[old] = now
+        if now is not None:
+            *groups, name = now.split(".")
+            _group(new, groups, make=True).setdefault(name, value)  # type: ignore[union-attr]
     for (of, name), values in VALUES.items():
         if of == kind and isinstance(new.get(name), str) and new[name] in values:
             changed[f"{name}: {new[name]}"] = f"{name}: {values[new[name]]}"
@@ -134,17 +202,36 @@ def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str
     return new, changed
 
 
-def _is_old(name: str, value: Any, names: dict[str, str | None]) -> bool:
-    """A group may have the name that an option had; an option's value is no group."""
-    now = names.get(name, name)
-    return name in names and not (now is not None and now.startswith(f"{name}.") and isinstance(value, dict))
+def renamed_flags(flags: Sequence[str]) -> tuple[list[str], dict[str, str | None]]:
+    """A command line whose flags have their new names, and which ones changed; a flag that is gone is left out."""
+    new: list[str] = []
+    changed: dict[str, str | None] = {}
+    rest = iter(flags)
+    for flag in rest:
+        name, equals, value = flag.partition("=")
+        key, _, option = name.removeprefix("--").partition(".")
+        option = option.removeprefix("init_args.")
+        if not name.startswith("--") or option not in OPTIONS.get(key, {}):
+            new.append(flag)
+            continue
+        now = OPTIONS[key][option]
+        changed[name] = None if now is None else f"--{key}.{now}"
+        if now is not None:
+            new.append(f"--{key}.{now}{equals}{value}")
+        elif not equals:
+            next(rest, None)
+    return new, changed
 
 
-def _put(options: Options, path: list[str], value: Any) -> None:
-    *groups, name = path
-    for group in groups:
-        options = options.setdefault(group, {})
-    options.setdefault(name, value)
+def _group(options: Options, path: list[str], make: bool = False) -> Options | None:
+    """The group of options that some names lead to; None where there is none and none is to be made."""
+    for name in path:
+        if make:
+            options.setdefault(name, {})
+        if not isinstance(options.get(name), dict):
+            return None
+        options = options[name]
+    return options
 
 
 def _renamed_spec(key: str, spec: Options, where: str, changed: dict[str, str | None]) -> Options:

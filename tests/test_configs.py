@@ -24,18 +24,21 @@ SETS = {"duobox": "DuoBox", "dd100": "DD100", "remocap": "ReMoCap", "interx": "I
 ROWS: dict[str, dict[str, dict[str, Any] | None]] = {
     "Table 5": {
         "table5_without_vq_vae": {"model.init_args.tokenizer": "raw"},
-        "table5_without_pairwise": {"model.init_args.pairwise": False},
+        "table5_without_pairwise": {"model.init_args.network.pairwise": False},
     },
     "Table A.5": {
-        "tableA5_without_agent_pe": {"model.init_args.agent_embedding": False},
-        "tableA5_without_time_pe": {"model.init_args.rope": "none"},
-        "tableA5_without_both_pe": {"model.init_args.agent_embedding": False, "model.init_args.rope": "none"},
+        "tableA5_without_agent_pe": {"model.init_args.network.agent_embedding": False},
+        "tableA5_without_time_pe": {"model.init_args.network.rope": "none"},
+        "tableA5_without_both_pe": {
+            "model.init_args.network.agent_embedding": False,
+            "model.init_args.network.rope": "none",
+        },
     },
     "Table A.6": {
         "tableA6_independent": {"sampler.noise_sampling": "independent"},
         "tableA6_joint": {},
     },
-    "not a table": {"eq7_one_level_a_token": {"model.init_args.pairwise_noise": "token"}},
+    "not a table": {"eq7_one_level_a_token": {"model.init_args.noise.pairwise": "token"}},
 }
 """Rows beside the full model, which is duobox_denoiser.yaml in all tables, and all that they change."""
 
@@ -136,17 +139,20 @@ def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -
         assert (run["data.init_args.batch_size"], run["data.init_args.window_frames"]) == (256, 64)
         assert run["data.init_args.mirror"] and run["data.init_args.shuffle_agents"]
         assert run["data.init_args.compose"] == 0
-        assert (run["model.init_args.learning_rate"], run["model.init_args.weight_decay"]) == (2e-4, 1e-4)
+        optimizer = [run[f"model.init_args.optimizer.{name}"] for name in ("learning_rate", "weight_decay")]
+        assert optimizer == [2e-4, 1e-4]
         people = 4 if name == "embody3d" else 2
         assert run["data.init_args.max_agents"] == people
         masked = (run["data.init_args.drop_agent"] > 0, run["data.init_args.drop_at_most"])
         assert masked == ((True, 2) if people == 4 else (False, 1))
-    sizes = {"latent": 512, "hidden": 512, "codes": 1024, "levels": 1}
+    sizes = {"network.width": 512, "quantizer.codebook_dim": 512, "quantizer.codebook_size": 1024}
+    sizes |= {"quantizer.num_quantizers": 1}
     assert {key: tokenizer[f"model.init_args.{key}"] for key in sizes} == sizes
     sizes = {"width": 512, "layers": 6, "heads": 8, "mlp_ratio": 4, "level_width": 256, "agent_width": 256}
-    assert {key: denoiser[f"model.init_args.{key}"] for key in sizes} == sizes
-    paper = {"rope": "hidden", "agent_embedding": True, "pairwise": True, "noise_levels": "per_token"}
-    assert {key: denoiser[f"model.init_args.{key}"] for key in paper} == paper
+    assert {key: denoiser[f"model.init_args.network.{key}"] for key in sizes} == sizes
+    paper = {"rope": "hidden", "agent_embedding": True, "pairwise": True}
+    assert {key: denoiser[f"model.init_args.network.{key}"] for key in paper} == paper
+    assert denoiser["model.init_args.noise.distribution"] == "per_token"
     assert denoiser["model.init_args.tokenizer"] == f"runs/{name}_tokenizer/latest/checkpoints/best.ckpt"
 
 
@@ -169,8 +175,20 @@ def test_every_ablation_is_a_row_that_is_told() -> None:
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {
-    "Tokenizer": {"latent": 8, "hidden": 8, "codes": 8, "depth": 1},
-    "Denoiser": {"width": 16, "layers": 1, "heads": 2, "mlp_ratio": 1, "level_width": 8, "agent_width": 8},
+    "Tokenizer": {
+        "network.width": 8,
+        "network.depth": 1,
+        "quantizer.codebook_dim": 8,
+        "quantizer.codebook_size": 8,
+    },
+    "Denoiser": {
+        "network.width": 16,
+        "network.layers": 1,
+        "network.heads": 2,
+        "network.mlp_ratio": 1,
+        "network.level_width": 8,
+        "network.agent_width": 8,
+    },
 }
 SMALL = {"batch_size": 2, "epoch_size": 4, "window_frames": 16, "val_batch_size": 2}
 FAKES = {"remocap": ("--frames", "40", "--takes", "4"), "duobox": ("--frames", "150", "--takes", "1")}

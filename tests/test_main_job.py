@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from magnet import cli
+from magnet.cli.main import COMMANDS
 from magnet.motion.scene import Scene
 
 ROOT = Path(__file__).parents[1]
@@ -38,8 +39,10 @@ def data_words() -> list[str]:
 def trained(tmp_path_factory) -> Path:
     """A folder in which a tokenizer and a denoiser have been trained for two steps."""
     folder = tmp_path_factory.mktemp("job")
-    tokenizer = {"latent": "16", "hidden": "16", "codes": "32", "depth": "1"}
-    denoiser = {"width": "32", "layers": "1", "heads": "2", "tokenizer": str(folder / "tok/checkpoints/last.ckpt")}
+    tokenizer = {"network.width": "16", "network.depth": "1"}
+    tokenizer |= {"quantizer.codebook_dim": "16", "quantizer.codebook_size": "32"}
+    denoiser = {"network.width": "32", "network.layers": "1", "network.heads": "2"}
+    denoiser |= {"tokenizer": str(folder / "tok/checkpoints/last.ckpt")}
     for name, kind, fields in (("tok", "Tokenizer", tokenizer), ("den", "Denoiser", denoiser)):
         words = [word for field, value in fields.items() for word in (f"--model.{field}", value)]
         magnet("fit", "--model", kind, *words, *data_words(), "--trainer.max_steps", "2", "--out", str(folder / name))
@@ -94,7 +97,7 @@ def test_commands_and_files_that_a_page_names_exist(page):
     """Every `magnet ...` line parses as far as its command, every config and linked file is there."""
     text = (ROOT / page).read_text()
     for command in re.findall(r"^\s{4}(?:\w+=\S+ )*magnet (\w+)", text, re.MULTILINE):
-        assert command in cli.COMMANDS, command
+        assert command in COMMANDS, command
     for path in re.findall(r"configs/[\w./]+\.yaml", text):
         assert (ROOT / path).exists(), path
     for link in re.findall(r"\]\(((?!https?:)[^)#]+)", text):

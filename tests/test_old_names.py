@@ -9,7 +9,15 @@ import yaml
 from magnet import weights
 from magnet.cli.config_files import read_layers
 from magnet.denoiser.module import Denoiser
-from magnet.old_names import OPTIONS, STATE, renamed_checkpoint, renamed_config, renamed_options, renamed_state
+from magnet.old_names import (
+    OPTIONS,
+    STATE,
+    renamed_checkpoint,
+    renamed_config,
+    renamed_flags,
+    renamed_options,
+    renamed_state,
+)
 
 OLD = """
 model:
@@ -58,21 +66,44 @@ def test_an_old_file_is_read_and_told_about_in_one_line(tmp_path, capsys):
     assert layer.options == renamed_config(yaml.safe_load(OLD))[0] != yaml.safe_load(OLD)
     assert layer.options["trainer"]["callbacks"][0]["class_path"] == "magnet.training.ema.WeightEMA"
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and "old.yaml" in said[0] and "model.relation_noise is now" in said[0]
+    assert len(said) == 1 and "old.yaml" in said[0] and "model.relation_noise is now model.noise.pairwise" in said[0]
 
 
 @pytest.mark.parametrize("kind", sorted(OPTIONS))
 def test_no_new_name_is_an_old_one(kind):
     for old, new in OPTIONS[kind].items():
         assert new is None or new not in OPTIONS[kind], f"{old} would be renamed twice"
-        once, _ = renamed_options(kind, {old: 1})
+        *groups, name = old.split(".")
+        said = {name: 1}
+        for group in groups:
+            said = {group: said}
+        once, changed = renamed_options(kind, said)
+        assert changed == {old: new}
         assert renamed_options(kind, once) == (once, {})
 
 
 def test_what_is_said_under_the_new_name_beats_the_old_one():
-    assert renamed_options("Denoiser", {"relations": True, "pairwise": False})[0] == {"pairwise": False}
+    said = {"relations": True, "network": {"pairwise": False}}
+    assert renamed_options("Denoiser", said)[0] == {"network": {"pairwise": False}}
 
 
 def test_weights_of_no_old_name_stay():
     state = {"transformer.blocks.0.qkv.weight": torch.ones(1), "step": torch.ones(1)}
     assert renamed_state(state) == state and STATE
+
+
+def test_old_flags_become_new_ones():
+    flags = ["--model.width", "8", "--model.init_args.level_shift=3", "--model.std_floor", "0.1", "--data.width", "8"]
+    new, changed = renamed_flags(flags)
+    assert new == ["--model.network.width", "8", "--model.noise.shift=3", "--data.width", "8"]
+    assert changed["--model.width"] == "--model.network.width" and changed["--model.std_floor"] is None
+
+
+@pytest.mark.parametrize("kind", ["Denoiser", "Tokenizer"])
+def test_every_new_option_is_one_of_the_models(kind):
+    import magnet
+
+    made = getattr(magnet, kind)()
+    for new in filter(None, OPTIONS[kind].values()):
+        group, _, name = new.partition(".")
+        assert not name or name in made.hparams[group], new

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from magnet import cli
 from magnet.body import load_body
-from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.export.retime import resampled
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize

@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.baselines.retrieval import Retrieval, assignments
 from magnet.motion.frames import canonical_frame, inverse, pairwise, partners, pose_features, to_9d
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 CHUNK = 512
 """Stretches looked at together, to bound memory."""
@@ -110,7 +110,7 @@ class NearestNeighbour(Retrieval):
         present = self.train.present
         other = ~torch.eye(self.train.agents, dtype=torch.bool, device=present.device)
         both = present[:, :, None] & present[:, None, :] & other
-        steps = (frames + STRIDE - 1) // STRIDE
+        steps = (frames + TOKEN_FRAMES - 1) // TOKEN_FRAMES
         own_weights = torch.cat([torch.full((135,), 135**-0.5), torch.full((9,), 9**-0.5)]).repeat(steps)
         self._scales = ContextFeatures(own_weights.to(own) / _deviation(own, present), 9**-0.5 / _deviation(pair, both))
         self._features = ContextFeatures(own.mul_(self._scales.own), pair.mul_(self._scales.pair))
@@ -119,9 +119,9 @@ class NearestNeighbour(Retrieval):
 
 def context_features(begin: Scene) -> ContextFeatures:
     """(M, T, P) scene -> (M, P, N * 144), (M, P, P, N * 9), N compared frames"""
-    back = torch.arange(begin.frames - 1, -1, -STRIDE, device=begin.device).flip(0)
+    back = torch.arange(begin.frames - 1, -1, -TOKEN_FRAMES, device=begin.device).flip(0)
     T_world_can = canonical_frame(begin.T_world_root)
-    before = T_world_can[:, (back - STRIDE).clamp(min=0)]
+    before = T_world_can[:, (back - TOKEN_FRAMES).clamp(min=0)]
     steps = to_9d(inverse(before) @ T_world_can[:, back])
     own = torch.cat([pose_features(begin)[:, back], steps], dim=-1)  # (M, N, P, 144)
     agents = begin.agents

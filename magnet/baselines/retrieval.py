@@ -7,7 +7,8 @@ import itertools
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, from_planar, inverse, rotate_ground, to_planar
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
+from magnet.motion.planar import rotate_ground
 from magnet.motion.scene import Scene
 
 MAX_ORDERED = 4

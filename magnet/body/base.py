@@ -18,19 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from magnet.body.family import TREE, body_files, family_of, title
+from magnet.body.family import body_files, family_of, title
+from magnet.body.joints import PARENTS
 from magnet.body.pickles import pickled_arrays
 from magnet.files import load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
-
-JOINT_NAMES: tuple[str, ...] = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
-)  # fmt: skip
-PARENTS: tuple[int, ...] = TREE
-MIRROR: tuple[int, ...] = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20)
-"""Index of each joint's counterpart on the other side; joints on the midline are their own."""
 
 SHAPES = 10
 """Shape numbers a body has; further ones in a file are left out."""

@@ -5,6 +5,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magnet.body.joints import (  # isort: skip
+    HEAD, L_ANKLE, L_ELBOW, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_HIP, R_KNEE,
+    R_SHOULDER, R_WRIST, SPINE1, SPINE2, SPINE3,
+)  # fmt: skip
+
 
 class Capsule(NamedTuple):
     """All points within `radius` metres of the line between two joints."""
@@ -16,19 +21,19 @@ class Capsule(NamedTuple):
 
 
 CAPSULES: tuple[Capsule, ...] = (
-    Capsule(0, 3, 0.12, "lower torso"),
-    Capsule(3, 6, 0.11, "middle torso"),
-    Capsule(6, 9, 0.10, "upper torso"),
-    Capsule(9, 12, 0.06, "neck"),
-    Capsule(12, 15, 0.09, "head"),
-    Capsule(16, 18, 0.05, "left upper arm"),
-    Capsule(17, 19, 0.05, "right upper arm"),
-    Capsule(18, 20, 0.04, "left forearm"),
-    Capsule(19, 21, 0.04, "right forearm"),
-    Capsule(1, 4, 0.07, "left thigh"),
-    Capsule(2, 5, 0.07, "right thigh"),
-    Capsule(4, 7, 0.06, "left shin"),
-    Capsule(5, 8, 0.06, "right shin"),
+    Capsule(PELVIS, SPINE1, 0.12, "lower torso"),
+    Capsule(SPINE1, SPINE2, 0.11, "middle torso"),
+    Capsule(SPINE2, SPINE3, 0.10, "upper torso"),
+    Capsule(SPINE3, NECK, 0.06, "neck"),
+    Capsule(NECK, HEAD, 0.09, "head"),
+    Capsule(L_SHOULDER, L_ELBOW, 0.05, "left upper arm"),
+    Capsule(R_SHOULDER, R_ELBOW, 0.05, "right upper arm"),
+    Capsule(L_ELBOW, L_WRIST, 0.04, "left forearm"),
+    Capsule(R_ELBOW, R_WRIST, 0.04, "right forearm"),
+    Capsule(L_HIP, L_KNEE, 0.07, "left thigh"),
+    Capsule(R_HIP, R_KNEE, 0.07, "right thigh"),
+    Capsule(L_KNEE, L_ANKLE, 0.06, "left shin"),
+    Capsule(R_KNEE, R_ANKLE, 0.06, "right shin"),
 )
 """Hands and feet have none, so that holding hands is not a collision."""
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-TREE = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
-"""Parents of the 22 joints that all have in common."""
+from magnet.body.joints import HEAD, L_WRIST, PARENTS, R_WRIST, WRISTS
 
 
 def _hand(wrist: int, first: int) -> list[int]:
@@ -15,9 +14,9 @@ def _hand(wrist: int, first: int) -> list[int]:
 
 
 TREES: dict[str, tuple[int, ...]] = {
-    "smpl": (*TREE, 20, 21),
-    "smplh": (*TREE, *_hand(20, 22), *_hand(21, 37)),
-    "smplx": (*TREE, 15, 15, 15, *_hand(20, 25), *_hand(21, 40)),
+    "smpl": (*PARENTS, *WRISTS),
+    "smplh": (*PARENTS, *_hand(L_WRIST, 22), *_hand(R_WRIST, 37)),
+    "smplx": (*PARENTS, HEAD, HEAD, HEAD, *_hand(L_WRIST, 25), *_hand(R_WRIST, 40)),
 }
 """Parents of all joints: SMPL ends in two hands, SMPL-H in thirty finger joints, SMPL-X has a jaw and eyes as well."""
 TITLES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}

@@ -13,16 +13,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from magnet.body.base import JOINT_NAMES, PARENTS, Body
+from magnet.body.base import Body
+
+from magnet.body.joints import (  # isort: skip
+    COLLARS, FEET, HIPS, JOINT_NAMES, L_HIP, L_SHOULDER, NECK, PARENTS, PELVIS, R_HIP, R_SHOULDER, SHOULDERS, SPINE1,
+    SPINE2, SPINE3,
+)  # fmt: skip
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_6d, to_6d
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 CENTIMETRE = 0.01
-NEARLY_RIGID = ((1, 2), (16, 17), (1, 16), (2, 17))
+NEARLY_RIGID = (HIPS, SHOULDERS, (L_HIP, L_SHOULDER), (R_HIP, R_SHOULDER))
 """Distances that say something of a shape although joints between them bend a little: hips, shoulders, flanks."""
-FEET = (7, 8, 10, 11)
-TORSO, CHEST, PELVIS = (0, 1, 2, 3, 6, 9, 12, 16, 17), (9, 12, 13, 14, 16, 17), (0, 1, 2, 3, 6)
+TORSO = (PELVIS, *HIPS, SPINE1, SPINE2, SPINE3, NECK, *SHOULDERS)
+UPPER, LOWER = (SPINE3, NECK, *COLLARS, *SHOULDERS), (PELVIS, *HIPS, SPINE1, SPINE2)
+"""Joints that turn with the chest, and with the pelvis."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,7 @@ def _checked(targets: Tensor, joints: Sequence[int], rotations: Tensor | None, v
     if targets.dim() != 4 or targets.shape[2:] != (len(joints), 3):
         raise ValueError(f"targets: got {tuple(targets.shape)}, expected (T, P, {len(joints)}, 3) for these joints")
     T, P = targets.shape[:2]
-    lacking = [JOINT_NAMES[j] for j in (1, 2, 16, 17) if j not in joints]
+    lacking = [JOINT_NAMES[j] for j in (*HIPS, *SHOULDERS) if j not in joints]
     if lacking:
         raise ValueError(f"targets lack {', '.join(lacking)}; both hips and both shoulders are needed")
     if rotations is not None and tuple(rotations.shape) != (T, P, BODY_JOINTS, 3, 3):
@@ -310,7 +316,7 @@ def start(
         return kabsch(rest[:, there].expand(T, P, len(there), 3), targets[:, :, [place[j] for j in there]])
 
     torso = rigid_part(TORSO)
-    pelvis, chest = rigid_part(PELVIS), rigid_part(CHEST)
+    pelvis, chest = rigid_part(LOWER), rigid_part(UPPER)
     if torso is None:
         raise ValueError("the torso's targets do not say how it is turned")
     pelvis = torso if pelvis is None else pelvis
@@ -320,7 +326,12 @@ def start(
     if hints is not None:
         known = hints.isfinite().all(dim=-1).all(dim=-1)
     for j in range(BODY_JOINTS):
-        guess = {0: pelvis, 3: _between(pelvis, chest, 1 / 3), 6: _between(pelvis, chest, 2 / 3), 9: chest}.get(j)
+        guess = {
+            PELVIS: pelvis,
+            SPINE1: _between(pelvis, chest, 1 / 3),
+            SPINE2: _between(pelvis, chest, 2 / 3),
+            SPINE3: chest,
+        }.get(j)
         guess = world[:, :, PARENTS[j]] if guess is None else guess
         world[:, :, j] = guess if hints is None else torch.where(known[:, :, j, None, None], hints[:, :, j], guess)
         child = [c for c in range(BODY_JOINTS) if PARENTS[c] == j]
@@ -331,8 +342,8 @@ def start(
             world[:, :, j] = torch.where(both, swing(bone, want) @ world[:, :, j], world[:, :, j])
     local = world.clone()
     local[:, :, 1:] = world[:, :, list(PARENTS[1:])].transpose(-1, -2) @ world[:, :, 1:]
-    hips = [place[1], place[2]]
-    t = (targets[:, :, hips] - (world[:, :, :1] @ (rest[:, [1, 2]] - rest[:, :1])[..., None])[..., 0]).mean(dim=2)
+    hips = [place[j] for j in HIPS]
+    t = (targets[:, :, hips] - (world[:, :, :1] @ (rest[:, list(HIPS)] - rest[:, :1])[..., None])[..., 0]).mean(dim=2)
     return local, t, known
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from magnet.body.base import Body, load_body
-from magnet.body.fit import FEET, clearance
+from magnet.body.fit import clearance
+from magnet.body.joints import FEET
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SKIN = 0.03

@@ -2,7 +2,7 @@
 
 import torch
 
-from magnet.body.base import MIRROR
+from magnet.body.joints import MIRROR
 from magnet.motion.scene import Scene
 
 

@@ -20,7 +20,8 @@ from magnet import weights
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.old_names import renamed_flags, told
 
 Spec = dict[str, Any]
 """A class and its options: {"class_path": ..., "init_args": {...}}."""
@@ -53,7 +54,9 @@ class Arguments:
                 found.files.append(value if equals else next(rest, ""))
             else:
                 found.flags.append(argument)
-        found.flags = one_class(found.flags)
+        found.flags, changed = renamed_flags(one_class(found.flags))
+        if changed:
+            print(f"magnet: {told(changed)}", file=sys.stderr)
         found.layers = [layer for file in found.files for layer in read_layers(file)]
         return found
 
@@ -219,15 +222,13 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
     elif model_args:
         linked_values = {"max_agents": model_args.get("max_agents")}
         if model_args.get("window") is not None:
-            linked_values["window_frames"] = STRIDE * model_args["window"]
+            linked_values["window_frames"] = TOKEN_FRAMES * model_args["window"]
         accepted = options_of(class_named(layer["data"]["class_path"]))
         layer["data"]["init_args"] |= {k: v for k, v in linked_values.items() if v is not None and k in accepted}
     return layer
 
 
-OWN_WAY = {
-    "tokenizer", "start_from", "decoder_only", "learning_rate", "weight_decay", "warmup_steps", "compile", "seed"
-}  # fmt: skip
+OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
 """Options of a model that one which starts from it does not take over."""
 
 
@@ -264,7 +265,7 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
     layer = {"model": {"class_path": path, "init_args": {k: v for k, v in kept.items() if k not in LINKS.values()}}}
     if short == "Denoiser":
         data = given.class_of("data") or data_default
-        linked = {"max_agents": kept.get("max_agents"), "window_frames": STRIDE * kept.get("window", 0) or None}
+        linked = {"max_agents": kept.get("max_agents"), "window_frames": TOKEN_FRAMES * kept.get("window", 0) or None}
         accepted = options_of(class_named(data))
         wanted = {key: value for key, value in linked.items() if value is not None and key in accepted}
         layer["data"] = {"class_path": data, "init_args": wanted}
@@ -277,9 +278,9 @@ LINKS = {"max_agents": "max_agents", "window_frames": "window"}
 
 def tokens(window_frames: int) -> int:
     """Frames of a window as token steps."""
-    if window_frames % STRIDE:
-        raise ValueError(f"data.window_frames is {window_frames}, which is not a multiple of {STRIDE}")
-    return window_frames // STRIDE
+    if window_frames % TOKEN_FRAMES:
+        raise ValueError(f"data.window_frames is {window_frames}, which is not a multiple of {TOKEN_FRAMES}")
+    return window_frames // TOKEN_FRAMES
 
 
 def refuse_linked(given: Arguments) -> None:

@@ -138,7 +138,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.body.base import load_body
-    from magnet.export.page.takes import read_takes
+    from magnet.viewer.takes import read_takes
 
     body = load_body(options.body or "open")
     return read_takes(options.files, body, options.context, options.samples)
@@ -146,7 +146,7 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
 
 def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
     """The first scene of --truth, or None."""
-    from magnet.export.page.takes import read_takes
+    from magnet.viewer.takes import read_takes
 
     if not options.truth:
         return None
@@ -168,8 +168,8 @@ def _write_page(options: argparse.Namespace) -> int:
 
 
 def _watch(options: argparse.Namespace) -> Any:
-    from magnet.export.page.takes import read_takes
     from magnet.viewer.server import free_port, require_viser
+    from magnet.viewer.takes import read_takes
     from magnet.viewer.watch import Viewer, default_render_options
 
     require_viser()

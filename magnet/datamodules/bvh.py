@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
@@ -26,7 +26,6 @@ from magnet.motion.resample import resample_points, resample_rotations
 from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm", "mm", "inch", "foot"]
-PELVIS, NECK, HEAD = 0, 12, 15
 LIMBS = sorted({joint + side for joint in TARGETS if joint != NECK for side in (0, 1)})
 MOST_SHAPE = 5.0
 """Bound of shape numbers: odd proportions are better left as a residual than made a body that nobody has."""

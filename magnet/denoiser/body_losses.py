@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from magnet.denoiser.losses import masked_mean
+from magnet.body import Body
+from magnet.body.joints import WRISTS
 from magnet.motion.frames import partners, pose_features
-from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame
+from magnet.motion.scene import FPS, Scene
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
-from magnet.tokenizer.losses import length, matrices, moved, world_velocity
+from magnet.tokenizer.base import PoseTokenizer
+from magnet.tokenizer.losses import length, masked_mean, matrices, moved, world_velocity
+from magnet.tokenizer.normalizer import Normalizer
 
-if TYPE_CHECKING:
-    from magnet.body import Body
-    from magnet.denoiser.module import Denoiser
+BODY_LOSSES = ("joint", "velocity", "partner", "hands")
 
-FPS = 30.0
-
-BODY_LOSSES = ("pose", "motion", "partner", "hands")
-
-WRISTS = [20, 21]
 
 WITHIN_REACH = 0.4
 """Metres: only wrists that were recorded nearer to each other than this count in `hands`."""
@@ -35,15 +30,34 @@ Joints = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def decoded_losses(
-    model: Denoiser, clean: Tensor, tokens: Tensor, levels: Tensor, scene: Scene, there: Tensor, body: Body
+    tokenizer: PoseTokenizer,
+    normalizer: Normalizer,
+    layout: TokenLayout,
+    body: Body,
+    clean: Tensor,
+    tokens: Tensor,
+    levels: Tensor,
+    scene: Scene,
+    there: Tensor,
+    share: float,
 ) -> dict[str, Tensor]:
-    """`body_losses` on the least noisy scenes of a batch, `decoded_share` of them.
+    """`body_losses` on the least noisy scenes of a batch.
 
-    clean (B, N, P, D) predicted, normalized; tokens the true ones in real units; levels (B, N, P); there as below.
+    Args:
+        tokenizer: decodes; frozen.
+        normalizer: of the tokens.
+        layout: of the tokens.
+        body: whose joints are compared, on the tokens' device.
+        clean: (B, N, P, D) predicted tokens, normalized.
+        tokens: (B, N, P, D) the true ones in real units.
+        levels: (B, N, P) int.
+        scene: the batch, of P agents.
+        there: (B, N, P, 1 + slots) bool, as in `token_losses`.
+        share: of the scenes, how many are decoded; at least one is.
     """
     signal = alpha_bar(levels)
-    chosen = least_noisy(signal, there, max(1, round(model.hparams["decoded_share"] * len(clean))))
-    few, kind = scene.select(chosen), model.device.type
+    chosen = least_noisy(signal, there, max(1, round(share * len(clean))))
+    few, kind = scene.select(chosen), clean.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
     people, true_pose = few.present, pose_features(few)
 
@@ -51,18 +65,18 @@ def decoded_losses(
         """Poses of those who are there; empty slots, half of them or more, cost nothing and stay as they are."""
         by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, steps)]
         with torch.autocast(kind, dtype, half):  # only networks may run in half precision
-            decoded = model.tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
+            decoded = tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
         return true_pose.transpose(1, 2).index_put((people,), decoded).transpose(1, 2)
 
     with torch.autocast(kind, enabled=False):
         return body_losses(
-            model.normalizer.denormalize(clean[chosen]),
+            normalizer.denormalize(clean[chosen]),
             tokens[chosen],
             true_pose,
             few.betas,
             signal[chosen],
             there[chosen],
-            model.layout,
+            layout,
             decode,
             body.forward_kinematics,
         )
@@ -103,7 +117,7 @@ def body_losses(
         joints: of the body.
 
     Returns:
-        pose: distance of joints in one's own canonical frame, metres. motion: error of the joints' velocities over
+        joint: distance of joints in one's own canonical frame, metres. velocity: error of the joints' velocities over
         the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres. hands: error
         of the vectors from one's own wrists to a partner's that were recorded within reach, metres.
     """
@@ -112,14 +126,14 @@ def body_losses(
     shape = betas[:, None]
     mine = joints(*matrices(decode(latent, betas, steps)), shape)  # (B, T, P, 22, 3)
     real = joints(*matrices(true_pose), shape)
-    weight = signal.repeat_interleave(STRIDE, dim=1)  # (B, T, P)
-    counts = there.repeat_interleave(STRIDE, dim=1)
+    weight = signal.repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
+    counts = there.repeat_interleave(TOKEN_FRAMES, dim=1)
     own = counts[..., 0]
-    losses = {"pose": masked_mean(weight * _mean_length(mine - real), own)}
+    losses = {"joint": masked_mean(weight * _mean_length(mine - real), own)}
 
     velocity = world_velocity(mine, by_frame(steps)) - world_velocity(real, by_frame(true_steps))
     both = own[:, 1:] & own[:, :-1]
-    losses["motion"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
+    losses["velocity"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
     if layout.slots:
         other = partners(layout.agents, tokens.device)
         seen = moved(pairwise_by_frame(pairs), mine[:, :, other])  # (B, T, P, P - 1, 22, 3)

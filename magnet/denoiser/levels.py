@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
+from magnet.denoiser.options import Distribution
 from magnet.sampling.noise import LEVELS, shifted
-
-NoiseLevels = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
 MIXTURE = (0.2, 0.1, 0.05, 0.65)
@@ -26,7 +23,7 @@ ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
 
-def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
+def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
@@ -53,7 +50,7 @@ def draw_levels(kind: NoiseLevels, B: int, N: int, P: int, generator: torch.Gene
     if kind == "per_sequence":
         return uniform(B, 1, 1)
     if kind != "mixture":
-        raise ValueError(f"noise_levels: got {kind!r}, expected per_token, per_timestep, per_sequence or mixture")
+        raise ValueError(f"noise.distribution: got {kind!r}, expected per_token, per_timestep, per_sequence or mixture")
     share = torch.tensor(MIXTURE, device=device)
     which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))

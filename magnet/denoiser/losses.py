@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.motion.frames import partners
+from magnet.motion.planar import conjugate, multiply, rotate_by, unit_ground
 from magnet.motion.tokens import TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
-
-Weighting = Literal["uniform", "min_snr"]
-
-
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean over the elements that count, whatever the others hold; 0 where none does. mask broadcasts to values."""
-    mask = mask.expand_as(values)
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
+from magnet.tokenizer.losses import masked_mean
 
 
-def snr_weights(levels: Tensor, most: float) -> Tensor:
-    """Weight of a predicted clean number by its noise level: min(SNR, `most`), SNR = a / (1 - a) of a = `alpha_bar`.
+def snr_weights(levels: Tensor, gamma: float) -> Tensor:
+    """Weight of a predicted clean number by its noise level: min(SNR, gamma), SNR = a / (1 - a) of a = `alpha_bar`.
 
     The min-SNR weighting for a network that predicts x0 (Hang et al. 2023, Efficient diffusion training via min-SNR
-    weighting strategy, Sec. 3.4, with `most` 5): what noise has drowned cannot be told, and at SNR 0 counts nothing.
+    weighting strategy, Sec. 3.4, with gamma 5): what noise has drowned cannot be told, and at SNR 0 counts nothing.
     levels (...) int -> (...)
     """
     signal = alpha_bar(levels)
-    return (signal / (1 - signal).clamp_min(1e-12)).clamp_max(most)
+    return (signal / (1 - signal).clamp_min(1e-12)).clamp_max(gamma)
 
 
 def token_losses(
@@ -47,7 +39,7 @@ def token_losses(
     latent, steps, pairs = layout.unpack(error)
     losses = {
         "latent": masked_mean(latent, there[..., :1]),
-        "step": masked_mean(steps.flatten(-2), there[..., :1]),
+        "delta": masked_mean(steps.flatten(-2), there[..., :1]),
     }
     if layout.slots:
         losses["pairwise"] = masked_mean(pairs.flatten(-2), there[..., 1:, None])
@@ -64,16 +56,16 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     """
     P = layout.agents
     _, steps, pairs = layout.unpack(tokens)
-    turn, shift = _planar(by_frame(steps))  # (B, T, P, 2) each
-    pair_turn, pair_shift = _planar(pairwise_by_frame(pairs))  # (B, T, P, P - 1, 2)
+    turn, shift = unit_ground(by_frame(steps))  # (B, T, P, 2) each
+    pair_turn, pair_shift = unit_ground(pairwise_by_frame(pairs))  # (B, T, P, P - 1, 2)
     partner = partners(P, tokens.device)
     own_turn, own_shift = turn[:, 1:, :, None], shift[:, 1:, :, None]
     other_turn, other_shift = turn[:, 1:, partner], shift[:, 1:, partner]
     before_turn, before_shift = pair_turn[:, :-1], pair_shift[:, :-1]
     # T' = inverse(dT_self) @ T @ dT_partner
-    expected_turn = _multiply(_conjugate(own_turn), _multiply(before_turn, other_turn))
-    moved = before_shift + _apply(before_turn, other_shift) - own_shift
-    expected_shift = _apply(_conjugate(own_turn), moved)
+    expected_turn = multiply(conjugate(own_turn), multiply(before_turn, other_turn))
+    moved = before_shift + rotate_by(before_turn, other_shift) - own_shift
+    expected_shift = rotate_by(conjugate(own_turn), moved)
     rotation = 1 - (expected_turn * pair_turn[:, 1:]).sum(-1)
     translation = F.smooth_l1_loss(expected_shift, pair_shift[:, 1:], reduction="none").sum(-1)
     frames = there[..., 1:].repeat_interleave(steps.shape[-2], dim=1)
@@ -96,10 +88,10 @@ def near_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, 
 
     clean, truth (B, N, P, D) in real units, there as in `token_losses`, levels (B, N, P, 1 + slots) of the groups -> ()
     """
-    turn, shift = _planar(layout.unpack(clean)[2])  # (B, N, P, P - 1, 4, 2)
-    true_turn, true_shift = _planar(layout.unpack(truth)[2])
+    turn, shift = unit_ground(layout.unpack(clean)[2])  # (B, N, P, P - 1, 4, 2)
+    true_turn, true_shift = unit_ground(layout.unpack(truth)[2])
     away = (shift - true_shift).square().sum(-1)
-    apart = _multiply(_conjugate(true_turn), turn)
+    apart = multiply(conjugate(true_turn), turn)
     angle = torch.atan2(apart[..., 1], apart[..., 0]).square()
     error = _soft_length(away, FINE_GROUND) + _soft_length(angle, FINE_YAW)
     signal = alpha_bar(levels[..., 1:])[..., None]
@@ -109,25 +101,3 @@ def near_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, 
 def _soft_length(square: Tensor, fine: float) -> Tensor:
     """Length less a little, about quadratic below `fine`, from its square. (...) -> (...)"""
     return (square + fine**2).sqrt() - fine
-
-
-def _planar(nine: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit (cos, sin) of the yaw and ground shift (x, z) of nine numbers. (..., 9) -> (..., 2) x 2"""
-    turn = torch.stack([nine[..., 0], -nine[..., 2]], dim=-1)
-    return F.normalize(turn, dim=-1, eps=1e-6), nine[..., [6, 8]]
-
-
-def _multiply(a: Tensor, b: Tensor) -> Tensor:
-    real = a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1]
-    return torch.stack([real, a[..., 0] * b[..., 1] + a[..., 1] * b[..., 0]], dim=-1)
-
-
-def _conjugate(a: Tensor) -> Tensor:
-    return torch.stack([a[..., 0], -a[..., 1]], dim=-1)
-
-
-def _apply(turn: Tensor, shift: Tensor) -> Tensor:
-    """Turn a ground vector (x, z) about the vertical."""
-    cos, sin = turn.unbind(-1)
-    x, z = shift.unbind(-1)
-    return torch.stack([cos * x + sin * z, cos * z - sin * x], dim=-1)

@@ -5,30 +5,35 @@ from __future__ import annotations
 import copy
 import inspect
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from magnet import weights
 from magnet.body import Body, load_body
-from magnet.checks import require_number
+from magnet.checks import require_choice
 from magnet.denoiser import starting
-from magnet.denoiser.levels import NoiseLevels
-from magnet.denoiser.losses import Weighting
-from magnet.denoiser.objective import training_losses
+from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
+from magnet.denoiser.levels import draw_levels
+from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
+from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
+from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.denoiser.statistics import token_statistics
-from magnet.denoiser.transformer import Rope, Transformer
+from magnet.denoiser.transformer import Transformer
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, scene_transforms
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
 from magnet.old_names import renamed_checkpoint
 from magnet.precision import dtype_of, require_float32_scenes
+from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
+from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.module import RawPose, Tokenizer
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
+from magnet.training.options import OptimizerOptions, group_of, plain
 
 Target = Literal["quantized", "continuous"]
 
@@ -44,52 +49,15 @@ class Denoiser(L.LightningModule):
             own, and this is then not read.
         max_agents: agent slots P; smaller scenes leave slots empty. Linked to the data's.
         window: token steps that the model sees at once; 16 tokens are 64 frames. Linked to the data's.
-        width: hidden size d, paper Table A.2.
-        layers: transformer blocks, paper Table A.2.
-        heads: attention heads, paper Table A.2.
-        mlp_ratio: MLP size over d, paper Table A.2.
-        dropout: in attention and MLPs; the paper does not say.
-        level_width: size of the noise-level embedding, paper Table A.2.
-        agent_width: size of the agent embedding, paper Table A.2.
-        slot_width: size of the level embedding of each partner slot (ours; see pairwise_noise).
-        rope: where time enters: `hidden` as in paper Table A.2, `heads` as usual elsewhere, `none` (ablation,
-            Table A.5).
-        agent_embedding: False takes the agents' identities away (ablation, paper Table A.5).
-        pairwise: False takes pairwise transforms out of the tokens (ablation, paper Table 5).
-        causal_block: token steps of a block of attention: a token sees blocks up to its own, so that what is finished
-            is not changed by what is not (ours). 0: everything sees everything, as in the paper.
         target: what of the pose is generated: `quantized`, the tokenizer's codes, as in the paper, or `continuous`,
-            its encoder's latents before they are snapped to codes (ours); sampling follows.
-        pairwise_noise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents.
-            `token`: one level a token as the paper reads literally, which leaks where unknown agents are.
-        pairwise_posterior: replaces predicted pairwise transforms by their posterior, given what is shown of them and
-            the predicted steps (ours), see `PairwisePosterior`.
-        noise_levels: how training draws levels: `per_token` (paper 3.2), `per_timestep`, `per_sequence`, or
-            `mixture` (ours: these and the patterns that sampling asks about).
-        level_shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
-        weighting: how much a token's error counts by its noise: `uniform`, as in the paper, or `min_snr`; see
-            `magnet.denoiser.losses.snr_weights`.
-        snr_most: gamma of `min_snr`, the most that an error counts.
-        own_past: share of the scenes with a past whose past is shown as the model would have made it (ours).
-        latent_weight: lambda_0 of paper Eq. 10.
-        step_weight: lambda_1 of paper Eq. 10.
-        pairwise_weight: lambda_2 of paper Eq. 10.
-        near_weight: adds the error of pairwise transforms in which centimetres near a partner count (ours); see
-            `magnet.denoiser.losses.near_loss`.
-        consistency_weight: lambda_3 of paper Eq. 10, for rotation and translation alike.
-        consistency_warmup: steps over which lambda_3 grows from 0.
-        pose_weight: adds the distance of decoded joints in metres to the loss (ours); see `body_losses`.
-        motion_weight: adds the error of decoded joints' velocities in m/s (ours).
-        partner_weight: adds the distance of the partners' decoded joints, as each sees them, in metres (ours).
-        hands_weight: adds the error of vectors between people's wrists within reach, in metres (ours).
-        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these four.
+            its encoder's latents before they are rounded to codes (ours); sampling follows.
         start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
             starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalized.
-        pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
-            smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
-        learning_rate: paper A.3.
-        weight_decay: paper A.3.
-        warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
+        network: the transformer.
+        noise: noise levels in training.
+        loss: weights of the terms.
+        self_forcing: training on a past that the model has made itself.
+        optimizer: AdamW.
         compile: compile the transformer's blocks for training; worth it on a GPU, not on a CPU.
         seed: all training noise follows from it.
     """
@@ -99,53 +67,27 @@ class Denoiser(L.LightningModule):
         tokenizer: str | None = None,
         max_agents: int = 2,
         window: int = 16,
-        width: int = 512,
-        layers: int = 6,
-        heads: int = 8,
-        mlp_ratio: int = 4,
-        dropout: float = 0.05,
-        level_width: int = 256,
-        agent_width: int = 256,
-        slot_width: int = 32,
-        rope: Rope = "hidden",
-        agent_embedding: bool = True,
-        pairwise: bool = True,
-        causal_block: int = 0,
         target: Target = "quantized",
-        pairwise_noise: Literal["noisier_end", "token"] = "noisier_end",
-        pairwise_posterior: bool = False,
-        noise_levels: NoiseLevels = "per_token",
-        level_shift: float = 1.0,
-        weighting: Weighting = "uniform",
-        snr_most: float = 5.0,
-        own_past: float = 0.0,
-        latent_weight: float = 1.0,
-        step_weight: float = 1.0,
-        pairwise_weight: float = 1.0,
-        near_weight: float = 0.0,
-        consistency_weight: float = 0.1,
-        consistency_warmup: int = 1000,
-        pose_weight: float = 0.0,
-        motion_weight: float = 0.0,
-        partner_weight: float = 0.0,
-        hands_weight: float = 0.0,
-        decoded_share: float = 0.25,
         start_from: str | None = None,
-        pairwise_metres: float = 0.0,
-        learning_rate: float = 2e-4,
-        weight_decay: float = 1e-4,
-        warmup_steps: int = 1000,
+        network: TransformerOptions = TransformerOptions(),
+        noise: NoiseOptions = NoiseOptions(),
+        loss: DenoiserLoss = DenoiserLoss(),
+        self_forcing: SelfForcing = SelfForcing(),
+        optimizer: OptimizerOptions = OptimizerOptions(warmup_steps=1000),
         compile: bool = False,
         seed: int = 1111,
     ) -> None:
         super().__init__()
-        for name, value, kind in (("target", target, Target), ("weighting", weighting, Weighting)):
-            if value not in get_args(kind):
-                raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(kind))}")
-        require_number("snr_most", snr_most, over=0)
-        self.save_hyperparameters()
+        require_choice("target", target, Target)
+        self.network, self.noise = group_of(TransformerOptions, network), group_of(NoiseOptions, noise)
+        self.loss, self.self_forcing = group_of(DenoiserLoss, loss), group_of(SelfForcing, self_forcing)
+        self.optimizer = group_of(OptimizerOptions, optimizer)
+        groups = {"network": self.network, "noise": self.noise, "loss": self.loss, "self_forcing": self.self_forcing}
+        sizes = {"tokenizer": tokenizer, "max_agents": max_agents, "window": window, "target": target}
+        rest = {"start_from": start_from, "compile": compile, "seed": seed}
+        self.save_hyperparameters(plain({**sizes, **groups, "optimizer": self.optimizer, **rest}))
         self.window = window
-        self.tokenizer: Tokenizer | RawPose
+        self.tokenizer: PoseTokenizer
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
@@ -156,27 +98,15 @@ class Denoiser(L.LightningModule):
 
     # -- parts ---------------------------------------------------------------------------------
 
-    def build(self, tokenizer: Tokenizer | RawPose) -> None:
-        """Make the parts whose sizes depend on the tokenizer."""
-        h: Any = self.hparams
+    def build(self, tokenizer: PoseTokenizer) -> None:
+        """Make the parts whose sizes depend on the tokenizer, any `PoseTokenizer`."""
         self.tokenizer = tokenizer.requires_grad_(False).eval()
-        self.layout = TokenLayout(tokenizer.latent, h.max_agents, h.pairwise, h.pairwise_noise)
+        agents, pairwise = self.hparams["max_agents"], self.network.pairwise
+        self.layout = TokenLayout(tokenizer.codebook_dim, agents, pairwise, self.noise.pairwise)
         self.normalizer = Normalizer(self.layout.width, floor=0.0)
-        self.transformer = Transformer(
-            self.layout,
-            width=h.width,
-            layers=h.layers,
-            heads=h.heads,
-            mlp_ratio=h.mlp_ratio,
-            dropout=h.dropout,
-            level_width=h.level_width,
-            agent_width=h.agent_width,
-            slot_width=h.slot_width,
-            rope=h.rope,
-            agent_embedding=h.agent_embedding,
-            causal_block=h.causal_block,
-        )
-        self.posterior = PairwisePosterior(self.layout) if h.pairwise_posterior and self.layout.slots else None
+        self.transformer = Transformer(self.layout, self.network)
+        posterior = self.network.pairwise_posterior and self.layout.slots
+        self.posterior = PairwisePosterior(self.layout) if posterior else None
 
     @property
     def quantized(self) -> bool:
@@ -248,7 +178,9 @@ class Denoiser(L.LightningModule):
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         """
-        people = self.tokenizer.encode_scene(scene.people().pad_frames(STRIDE), self.quantized).float()[:, 1:-1, 0]
+        people = self.tokenizer.encode_scene(scene.people().pad_frames(TOKEN_FRAMES), self.quantized).float()[
+            :, 1:-1, 0
+        ]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -281,7 +213,7 @@ class Denoiser(L.LightningModule):
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
         if scene.valid is not None:
-            whole = scene.valid.unflatten(1, (-1, STRIDE)).all(dim=-1)
+            whole = scene.valid.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
             there = there & whole[:, :, None, None]
         return tokens, there
 
@@ -293,26 +225,31 @@ class Denoiser(L.LightningModule):
     def on_fit_start(self) -> None:
         if not self.normalizer.ready:
             if self.hparams["start_from"]:
-                starting.start_from(self, self.hparams["start_from"])
+                self.take_over(self.hparams["start_from"])
             if not self.normalizer.ready:
                 self._fit_statistics()
         if self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
 
+    def take_over(self, path: str | Path) -> None:
+        """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
+        metres = self.noise.pairwise_metres
+        starting.start_from(path, self.transformer, self.tokenizer, self.normalizer, metres)
+
     @torch.no_grad()
     def _fit_statistics(self) -> None:
         """z-scores from the first training batches; the same on every rank, because ranks draw alike here."""
         datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
         scenes = [scene.to(self.device) for scene in datamodule.statistics_batches()]
-        if isinstance(self.tokenizer, RawPose):
+        if not isinstance(self.tokenizer, Tokenizer):  # a `Tokenizer` has been trained
             self.tokenizer.fit_normalizers(scenes)
         parts = [self.tokenize(scene) for scene in scenes]
         self.fit_normalizer(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
 
     def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
         """Set how tokens are normalized from real ones, as `tokenize` returns them."""
-        self.normalizer.set(*token_statistics(self.layout, tokens, there, self.hparams["pairwise_metres"]))
+        self.normalizer.set(*token_statistics(self.layout, tokens, there, self.noise.pairwise_metres))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         generator = step_generator(
@@ -331,7 +268,45 @@ class Denoiser(L.LightningModule):
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    losses = training_losses
+    def losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
+        """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11)."""
+        layout, weight = self.layout, self.loss
+        with torch.no_grad():
+            tokens, there = self.tokenize(scene)
+            scene = scene.pad_agents(layout.agents)
+            truth = self.normalizer.normalize(tokens)
+            B, N, P, _ = truth.shape
+            levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
+            group_levels = layout.group_levels(levels)
+            noise = torch.randn(truth.shape, generator=generator, device=truth.device)
+            shown = self._self_forced(truth, levels, scene, generator)
+            noisy = add_noise(shown, noise, layout.spread(group_levels))
+        clean = self.denoise(noisy, levels, scene.present).float()
+        snr = snr_weights(group_levels, weight.snr_gamma) if weight.weighting == "min_snr" else None
+        losses = token_losses(clean, truth, layout, there, snr)
+        total = weight.latent * losses["latent"] + weight.delta * losses["delta"]
+        if layout.slots:
+            predicted = self.normalizer.denormalize(clean)
+            rotation, translation = consistency_losses(predicted, layout, there)
+            losses["consistency"] = rotation + translation
+            ramp = min(1.0, (self.global_step + 1) / max(weight.consistency_warmup, 1)) if self.training else 1.0
+            total = total + weight.pairwise * losses["pairwise"] + ramp * weight.consistency * losses["consistency"]
+            if weight.near:
+                losses["near"] = near_loss(predicted, tokens, layout, there, group_levels)
+                total = total + weight.near * losses["near"]
+        if any(getattr(weight, name) for name in BODY_LOSSES):
+            parts = (self.tokenizer, self.normalizer, layout, self.require_body())
+            bodies = decoded_losses(*parts, clean, tokens, levels, scene, there, weight.decoded_share)
+            total = total + sum(getattr(weight, name) * value for name, value in bodies.items())
+            losses |= bodies
+        return {"loss": total, **losses}
+
+    def _self_forced(self, truth: Tensor, levels: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+        if not (self.training and self.self_forcing.share):
+            return truth
+        requantize = self.tokenizer.requantize if self.quantized else None
+        parts = (self.denoise, requantize, self.normalizer, self.layout)
+        return with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift)
 
     def require_body(self) -> Body:
         """The body whose joints decoded losses compare, on this model's device."""
@@ -343,7 +318,8 @@ class Denoiser(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()
-        h: Any = self.hparams
-        parts = [self.transformer] if self.posterior is None else [self.transformer, self.posterior]
+        parts: list[nn.Module] = [self.transformer]
+        if self.posterior is not None:
+            parts.append(self.posterior)
         trained = [parameter for part in parts for parameter in part.parameters()]
-        return adamw_cosine(self, trained, h.learning_rate, h.weight_decay, h.warmup_steps)
+        return adamw_cosine(self, trained, self.optimizer)

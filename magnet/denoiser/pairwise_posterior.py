@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from magnet.motion.frames import partners, rotate_ground
+from magnet.motion.frames import partners
+from magnet.motion.planar import nine_of, rotate_ground, yaw_ground
 from magnet.motion.pose_graph import Planar, solve_pose_graph
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.normalizer import Normalizer
 
@@ -79,9 +80,9 @@ class PairwisePosterior(nn.Module):
         normalizer: Normalizer,
     ) -> Tensor:
         """Posterior means in 9-D, as tokens hold them. -> (B, N, P, P - 1, 4, 9)"""
-        step = planar_of(by_frame(steps))
-        own = group_levels[..., 0].repeat_interleave(STRIDE, dim=1)  # (B, T, P)
-        pair_levels = group_levels[..., 1:].repeat_interleave(STRIDE, dim=1)  # (B, T, P, P - 1)
+        step = yaw_ground(by_frame(steps))
+        own = group_levels[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
+        pair_levels = group_levels[..., 1:].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P, P - 1)
         there = self.layout.group_present(present)[:, None, :, 1:]
         steps_known = own == 0
         step_ground = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_ground, own)))
@@ -89,8 +90,8 @@ class PairwisePosterior(nn.Module):
         # Where the window stands in the world is arbitrary: the first frame's steps tie nobody to anything.
         first = torch.zeros_like(step_yaw[:, :1])
         step_yaw, step_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (step_yaw, step_ground))
-        guess = planar_of(pairwise_by_frame(predicted))
-        seen = planar_of(pairwise_by_frame(shown))
+        guess = yaw_ground(pairwise_by_frame(predicted))
+        seen = yaw_ground(pairwise_by_frame(shown))
         ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, normalizer)
         weights = {
             "yaw": (precision(self._at(self.log_pair_yaw, pair_levels)) * there, precision(yaw_noise) * there),
@@ -128,12 +129,12 @@ def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, normal
 def shown_deviation(pair_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> tuple[Tensor, Tensor]:
     """Standard deviation of what is shown of pairwise transforms. (...) int -> metres (...), radians (...)
 
-    A heading is read off four of the nine numbers (`planar_of`): about a turn, their noise of standard deviation s in
+    A heading is read off four of the nine numbers (`yaw_ground`): about a turn, their noise of standard deviation s in
     each leaves s / sqrt(2) radians.
     """
     alpha = alpha_bar(pair_levels)
     noise = ((1 - alpha) / alpha.clamp_min(1e-6)).sqrt()
-    first = layout.latent + 9 * STRIDE
+    first = layout.latent + 9 * TOKEN_FRAMES
     std = normalizer.std[first : first + 9]
     cosine, sine = std[[0]].square().mean(), std[[2]].square().mean()
     turning = noise * ((cosine + sine) / 2).sqrt()
@@ -143,17 +144,6 @@ def shown_deviation(pair_levels: Tensor, layout: TokenLayout, normalizer: Normal
 
 def precision(deviation: Tensor) -> Tensor:
     return deviation.double().square().reciprocal()
-
-
-def planar_of(nine: Tensor) -> tuple[Tensor, Tensor]:
-    """Heading and ground position of a transform in 9-D that is about planar. (..., 9) -> (...), (..., 2)"""
-    return torch.atan2(-nine[..., 2], nine[..., 0]), nine[..., [6, 8]]
-
-
-def nine_of(yaw: Tensor, ground: Tensor) -> Tensor:
-    """Inverse of `planar_of`: a transform over the ground in 9-D. (...), (..., 2) -> (..., 9)"""
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    return torch.stack([yaw.cos(), zero, -yaw.sin(), zero, one, zero, ground[..., 0], zero, ground[..., 1]], dim=-1)
 
 
 def heading_at_start(yaw: Tensor, step_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from magnet import weights
 from magnet.denoiser.statistics import with_pairwise_metres
+from magnet.denoiser.transformer import Transformer
+from magnet.motion.tokens import TokenLayout
+from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.module import RawPose, Tokenizer
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
+from magnet.tokenizer.normalizer import Normalizer
 
 
 def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
@@ -45,38 +46,50 @@ def denoiser_of(path: str | Path) -> dict[str, Any]:
     return checkpoint
 
 
-def start_from(model: Denoiser, path: str | Path) -> None:
+def start_from(
+    path: str | Path,
+    transformer: Transformer,
+    tokenizer: PoseTokenizer,
+    normalizer: Normalizer,
+    pairwise_metres: float = 0.0,
+) -> None:
     """Take over another denoiser's transformer, and how tokens are normalized where both tokenizers are the same.
 
-    With another tokenizer latents mean something else, and `model.normalizer` is left to be fitted anew.
+    With another tokenizer latents mean something else, and the normalizer is left to be fitted anew.
+
+    Args:
+        path: checkpoint of a denoiser, or the name of a shipped model.
+        transformer: filled.
+        tokenizer: the new model's; compared.
+        normalizer: filled, where it can be.
+        pairwise_metres: another scale of pairwise transforms; the weights are changed so that they make the same of it.
 
     Raises:
         ValueError: the checkpoint is of a model of other sizes.
     """
     state = denoiser_of(path)["state_dict"]
     try:
-        model.transformer.load_state_dict(_part(state, "transformer."))
+        transformer.load_state_dict(_part(state, "transformer."))
     except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise ValueError(
             f"start_from: {path} does not fit this model: {reason}; sizes, --data.max_agents and --data.window_frames "
             "must be those of that checkpoint"
         ) from error
-    theirs, mine = _part(state, "tokenizer."), model.tokenizer.state_dict()
+    theirs, mine = _part(state, "tokenizer."), tokenizer.state_dict()
     same = theirs.keys() == mine.keys() and all(torch.equal(value, mine[name].cpu()) for name, value in theirs.items())
     if same:
-        model.normalizer.load_state_dict(_part(state, "normalizer."))
-        _rescale(model)
+        normalizer.load_state_dict(_part(state, "normalizer."))
+        _rescale(transformer, normalizer, transformer.layout, pairwise_metres)
 
 
 @torch.no_grad()
-def _rescale(model: Denoiser) -> None:
+def _rescale(transformer: Transformer, normalizer: Normalizer, layout: TokenLayout, metres: float) -> None:
     """Another scale of pairwise transforms, with weights that make the same of it."""
-    before = model.normalizer.std.clone()
-    after = with_pairwise_metres(model.layout, before, model.hparams["pairwise_metres"])
-    model.normalizer.std.copy_(after)
-    grown = after / before
-    first, last = model.transformer.in_proj[0], model.transformer.out_proj
+    before = normalizer.std.clone()
+    normalizer.std.copy_(with_pairwise_metres(layout, before, metres))
+    grown = normalizer.std / before
+    first, last = transformer.in_proj[0], transformer.out_proj
     assert isinstance(first, nn.Linear)
     first.weight[:, : len(grown)].mul_(grown)
     last.weight.div_(grown[:, None])

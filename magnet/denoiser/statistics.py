@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from magnet.motion.tokens import STRIDE, TokenLayout
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.tokenizer.normalizer import FLOOR
 
 
@@ -35,8 +35,8 @@ def token_statistics(
         known = len(flat) > 1
         mean = flat.mean(0) if known else torch.zeros(9, device=tokens.device)
         std = flat.std(0).clamp_min(FLOOR) if known else torch.ones(9, device=tokens.device)
-        means.append(mean.repeat(STRIDE * repeats))
-        stds.append(std.repeat(STRIDE * repeats))
+        means.append(mean.repeat(TOKEN_FRAMES * repeats))
+        stds.append(std.repeat(TOKEN_FRAMES * repeats))
     return torch.cat(means), with_pairwise_metres(layout, torch.cat(stds), pairwise_metres)
 
 

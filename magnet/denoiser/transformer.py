@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from magnet.checks import require_whole
+from magnet.denoiser.options import TransformerOptions
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
-
-Rope = Literal["hidden", "heads", "none"]
 
 
 def sinusoids(values: Tensor, width: int, longest: float = 10_000.0) -> Tensor:
@@ -95,54 +92,26 @@ class Transformer(nn.Module):
 
     Args:
         layout: what a token holds.
-        width: hidden size d, paper Table A.2.
-        layers: transformer blocks, paper Table A.2.
-        heads: attention heads, paper Table A.2.
-        mlp_ratio: hidden size of a block's MLP over d, paper Table A.2.
-        dropout: the paper does not say; 0.05 is that of the authors' configuration.
-        level_width: size of the noise-level embedding, paper Table A.2.
-        agent_width: size of the agent embedding, paper Table A.2.
-        slot_width: size of the noise-level embedding of each partner slot (ours: the paper has one level a token).
-        rope: `hidden` rotates the embedded token once (paper Table A.2), `heads` rotates queries and keys
-            (usual practice), `none` leaves time out (paper Table A.5).
-        agent_embedding: False leaves the agent's identity out (paper Table A.5).
-        causal_block: token steps of a block; a token sees blocks up to its own, and all of that one, whoever's.
-            0: everything sees everything, as in the paper.
+        options: sizes and parts.
     """
 
-    def __init__(
-        self,
-        layout: TokenLayout,
-        width: int = 512,
-        layers: int = 6,
-        heads: int = 8,
-        mlp_ratio: int = 4,
-        dropout: float = 0.05,
-        level_width: int = 256,
-        agent_width: int = 256,
-        slot_width: int = 32,
-        rope: Rope = "hidden",
-        agent_embedding: bool = True,
-        causal_block: int = 0,
-    ) -> None:
+    def __init__(self, layout: TokenLayout, options: TransformerOptions = TransformerOptions()) -> None:
         super().__init__()
-        require_whole("causal_block", causal_block, 0)
         self.layout = layout
-        self.rope = rope
-        self.causal_block = causal_block
-        self.level_width = level_width
-        self.slot_width = slot_width
-        self.agent = nn.Parameter(torch.randn(layout.agents, agent_width) * 0.02) if agent_embedding else None
-        enter = layout.width + level_width + layout.slots * slot_width + (agent_width if agent_embedding else 0)
+        o = self.options = options
+        self.agent = nn.Parameter(torch.randn(layout.agents, o.agent_width) * 0.02) if o.agent_embedding else None
+        agent_width = o.agent_width if o.agent_embedding else 0
+        entered = layout.width + o.level_width + layout.slots * o.slot_width + agent_width
         self.in_proj = nn.Sequential(
-            *(nn.Linear(enter, width), nn.LayerNorm(width), nn.GELU()),
-            *(nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()),
-            *(nn.Linear(width, width), nn.LayerNorm(width)),
+            *(nn.Linear(entered, o.width), nn.LayerNorm(o.width), nn.GELU()),
+            *(nn.Linear(o.width, o.width), nn.LayerNorm(o.width), nn.GELU()),
+            *(nn.Linear(o.width, o.width), nn.LayerNorm(o.width)),
         )
+        rope_heads = o.rope == "heads"
         self.blocks = nn.ModuleList(
-            TransformerBlock(width, heads, mlp_ratio, dropout, rope_heads=rope == "heads") for _ in range(layers)
+            TransformerBlock(o.width, o.heads, o.mlp_ratio, o.dropout, rope_heads) for _ in range(o.layers)
         )
-        self.out_proj = nn.Linear(width, layout.width)
+        self.out_proj = nn.Linear(o.width, layout.width)
         self.register_buffer("groups", layout.groups(), persistent=False)
 
     groups: Tensor
@@ -156,9 +125,9 @@ class Transformer(nn.Module):
         there = self.layout.group_present(present)[:, None]  # (B, 1, P, 1 + slots)
         group_levels = torch.where(there, self.layout.group_levels(levels), LEVELS)
         noisy = torch.where(there[..., self.groups], noisy, 0.0)
-        parts = [noisy, sinusoids(group_levels[..., 0], self.level_width).to(noisy.dtype)]
+        parts = [noisy, sinusoids(group_levels[..., 0], self.options.level_width).to(noisy.dtype)]
         if self.layout.slots:
-            parts.append(sinusoids(group_levels[..., 1:], self.slot_width).flatten(-2).to(noisy.dtype))
+            parts.append(sinusoids(group_levels[..., 1:], self.options.slot_width).flatten(-2).to(noisy.dtype))
         if self.agent is not None:
             parts.append(self.agent.to(noisy.dtype).expand(B, N, P, -1))
         return self.out_proj(self._blocks(self.in_proj(torch.cat(parts, dim=-1)), present))
@@ -175,8 +144,8 @@ class Transformer(nn.Module):
             slots = slots_in_use[rows[:, 0], :size]
             y = x[rows, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
             time = torch.arange(x.shape[1], device=x.device).repeat_interleave(size)
-            sees = block_causal(time, self.causal_block) if self.causal_block else None
-            if self.rope == "hidden":
+            sees = block_causal(time, self.options.causal_block) if self.options.causal_block else None
+            if self.options.rope == "hidden":
                 y = y + rotate(y, time)
             for block in self.blocks:
                 y = block(y, time, sees)

@@ -27,7 +27,7 @@ from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_trut
 from magnet.metrics.interval import Unit, independent_units
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import require_float32_scenes
 from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.schedule import MaskSchedule
@@ -142,12 +142,12 @@ class Evaluator(L.LightningModule):
             ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
         """
         self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
-        if self.context % STRIDE:
-            raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {STRIDE}")
+        if self.context % TOKEN_FRAMES:
+            raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {TOKEN_FRAMES}")
         self.body: Body = datamodule.body.to(self.denoiser.device)
         self._read_test_scenes(datamodule)
         known = self.schedule(self.context, self.horizon, self.slots).known
-        self.past_is_given = self.context > 0 and bool(known[: self.context // STRIDE].all())
+        self.past_is_given = self.context > 0 and bool(known[: self.context // TOKEN_FRAMES].all())
         self.nothing_is_given = not bool(known.any())
         self.methods: dict[str, Predictor] = {MODEL: self.predict_joints}
         self.windows: Windows | None = None
@@ -184,8 +184,8 @@ class Evaluator(L.LightningModule):
 
     def schedule(self, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
         """The task's plan for scenes of so many frames, of people in the first `slots` slots; by default in all."""
-        tokens = -(-(context + horizon) // STRIDE)
-        past = context // STRIDE
+        tokens = -(-(context + horizon) // TOKEN_FRAMES)
+        past = context // TOKEN_FRAMES
         agents = self.denoiser.layout.agents if slots is None else slots
         return self.task.schedule(planning_grid(tokens, agents, past, self.denoiser.window, self.sampler))
 
@@ -195,7 +195,7 @@ class Evaluator(L.LightningModule):
         Scenes are sampled by a plan for the slots that somebody is in, so this is the same plan's.
         """
         schedule = self.schedule(self.context, self.horizon, occupied(scene))
-        generated = (schedule.finished & ~schedule.known).repeat_interleave(STRIDE, dim=0)
+        generated = (schedule.finished & ~schedule.known).repeat_interleave(TOKEN_FRAMES, dim=0)
         future = generated[self.context : self.context + self.horizon]
         return torch.nn.functional.pad(future, (0, scene.agents - future.shape[1])).to(scene.device)
 

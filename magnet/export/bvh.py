@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 Unit = Literal["m", "cm"]
@@ -20,7 +20,8 @@ ROTATIONS = "Zrotation Xrotation Yrotation"
 """Channels of every joint: degrees, R = Rz Rx Ry, the order most tools write."""
 
 TIPS: dict[int, tuple[float, float, float]] = {
-    10: (0.0, 0.0, 0.07), 11: (0.0, 0.0, 0.07), 15: (0.0, 0.18, 0.02), 20: (0.17, 0.0, 0.0), 21: (-0.17, 0.0, 0.0),
+    L_FOOT: (0.0, 0.0, 0.07), R_FOOT: (0.0, 0.0, 0.07), HEAD: (0.0, 0.18, 0.02),
+    L_WRIST: (0.17, 0.0, 0.0), R_WRIST: (-0.17, 0.0, 0.0),
 }  # fmt: skip
 """Metres from a leaf joint to its End Site, which only says how long the last bone is drawn."""
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.export.stage import AGENTS
 from magnet.motion.scene import BODY_JOINTS, Scene
 from magnet.version import __version__

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import JOINT_NAMES
 from magnet.motion.scene import Scene
 
 

@@ -6,10 +6,13 @@ import numpy as np
 
 from magnet.export.stage import Array
 
-PELVIS, L_HIP, R_HIP, SPINE1, L_KNEE, R_KNEE, SPINE2, L_ANKLE, R_ANKLE, SPINE3, L_FOOT, R_FOOT = range(12)
-NECK, L_COLLAR, R_COLLAR, HEAD = range(12, 16)
-L_SHOULDER, R_SHOULDER, L_ELBOW, R_ELBOW, L_WRIST, R_WRIST = range(16, 22)
-CROWN, L_HAND, R_HAND, L_TOE, R_TOE, L_HEEL, R_HEEL = range(22, 29)  # points added by `extended`
+from magnet.body.joints import (  # isort: skip
+    HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,
+    R_ELBOW, R_FOOT, R_HIP, R_KNEE, R_SHOULDER, R_WRIST, SPINE2, SPINE3,
+)  # fmt: skip
+from magnet.motion.scene import BODY_JOINTS
+
+CROWN, L_HAND, R_HAND, L_TOE, R_TOE, L_HEEL, R_HEEL = range(BODY_JOINTS, BODY_JOINTS + 7)  # points added by `extended`
 
 # (from, to, radius at each end in metres, side: 0 middle, 1 left, 2 right) for a leg of LEG metres
 Limb = tuple[int, int, float, float, int]

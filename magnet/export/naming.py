@@ -6,14 +6,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import (  # isort: skip
+    ANKLES, ELBOWS, HEAD, HIPS, JOINT_NAMES, KNEES, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER,
+    L_WRIST, NECK, SHOULDERS, WRISTS,
+)  # fmt: skip
 
 SIDED: dict[str, int] = {
-    "hip": 1, "knee": 4, "ankle": 7, "foot": 10, "collar": 13, "shoulder": 16, "elbow": 18, "wrist": 20,
+    "hip": L_HIP, "knee": L_KNEE, "ankle": L_ANKLE, "foot": L_FOOT, "collar": L_COLLAR, "shoulder": L_SHOULDER,
+    "elbow": L_ELBOW, "wrist": L_WRIST,
 }  # fmt: skip
 """Our left joint of each role; the right one follows it."""
-MIDDLE: dict[str, int] = {"neck": 12, "head": 15}
-NEEDED = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
+MIDDLE: dict[str, int] = {"neck": NECK, "head": HEAD}
+NEEDED = (*HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS, *WRISTS)
 """Without these limbs nobody can be posed; the spine is found in the hierarchy, the rest may be missing."""
 
 SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {

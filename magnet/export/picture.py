@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from magnet.body.joints import L_HIP, PELVIS, R_HIP
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.stage import BACKGROUND, INK, PALE, TILE, Array, Camera, Size, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
@@ -95,7 +96,7 @@ def topview(
     unit = cell[1] / 420
     top = round((40 if title else 0) * unit)
     page = Image.new("RGB", (columns * cell[0], top + -(-len(rows) // columns) * cell[1]), PAGE)
-    spans = [c.joints[:, :, 0, [0, 2]].reshape(-1, 2) for c in people]
+    spans = [c.joints[:, :, PELVIS, [0, 2]].reshape(-1, 2) for c in people]
     reach = max(1.5, max(float((span.max(0) - span.min(0)).max()) for span in spans) / 2 + 0.5)
     for i, ((label, scene), group) in enumerate(zip(rows, people, strict=True)):
         panel = _from_above(group, (spans[i].max(0) + spans[i].min(0)) / 2, reach, cell, scene.fps)
@@ -121,11 +122,11 @@ def _from_above(people: Cast, centre: Array, reach: float, cell: Size, fps: floa
             at = float((line - centre[axis]) * scale + size[axis] / 2)
             draw.line((at, 0, at, size[1]) if axis == 0 else (0, at, size[0], at), fill=(229, 233, 239), width=2)
     width = max(4, round(0.014 * min(size)))
-    left = people.joints[:, :, 1] - people.joints[:, :, 2]
+    left = people.joints[:, :, L_HIP] - people.joints[:, :, R_HIP]
     facing = np.stack([-left[..., 2], left[..., 0]], axis=-1)
     facing = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-6)
     for p in range(people.joints.shape[1]):
-        way = pixels(people.joints[:, p, 0, :][:, [0, 2]])
+        way = pixels(people.joints[:, p, PELVIS, :][:, [0, 2]])
         for t in range(len(way) - 1):
             colour = tuple(people.colours[t + 1, p].astype(int).tolist())
             draw.line((*way[t], *way[t + 1]), fill=colour, width=width)

@@ -13,7 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.base import JOINT_NAMES, PARENTS, Body
+from magnet.body.base import Body
+
+from magnet.body.joints import (  # isort: skip
+    ANKLES, COLLARS, ELBOWS, JOINT_NAMES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PARENTS,
+    PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
+)  # fmt: skip
 from magnet.body.fit import fit_body, floor_height, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
@@ -24,8 +29,9 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 
 Floats = NDArray[np.float64]
 
-NECK = 12
-TARGETS = {1: 1.0, 4: 1.0, 7: 1.0, 10: 0.5, NECK: 0.1, 16: 1.0, 18: 1.0, 20: 2.0}
+TARGETS = {
+    L_HIP: 1.0, L_KNEE: 1.0, L_ANKLE: 1.0, L_FOOT: 0.5, NECK: 0.1, L_SHOULDER: 1.0, L_ELBOW: 1.0, L_WRIST: 2.0,
+}  # fmt: skip
 """Left joints (and the neck) that the body's joints are drawn to, with weights. Spine, collars and head lie elsewhere
 in every rig: of them only rotations are taken."""
 FARTHEST_SWING = math.radians(110.0)
@@ -248,7 +254,7 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
     for left, child in LIMBS:
         for s in (0, 1):
             j, c = left + s, child + s
-            first = aligned[PARENTS[j]] if left in (4, 7, 18) else Q
+            first = aligned[PARENTS[j]] if left in (L_KNEE, L_ANKLE, L_ELBOW) else Q
             aligned[j] = first
             if c not in ours:
                 continue
@@ -259,10 +265,10 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
             else:
                 aligned[j] = torch.full_like(Q, torch.nan)
     for s in (0, 1):
-        aligned[10 + s], aligned[20 + s] = aligned[7 + s], aligned[18 + s]
+        aligned[TOES[s]], aligned[WRISTS[s]] = aligned[ANKLES[s]], aligned[ELBOWS[s]]
     used = dict(zip(*_spine(len(skeleton.chain)), strict=True))
     source = {joint: skeleton.chain[place] for joint, place in used.items()}
-    source |= {j: k for j, k in ours.items() if j not in (13, 14)}  # collars differ most of all from rig to rig
+    source |= {j: k for j, k in ours.items() if j not in COLLARS}  # collars differ most of all from rig to rig
     known = torch.full((skeleton.file.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
     for j, k in source.items():
         known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
@@ -273,9 +279,9 @@ def _spine(bones: int) -> tuple[list[int], list[int]]:
     """Our pelvis and spine joints, and which of so many bones from the pelvis to the chest each takes."""
     last = bones - 1
     if last < 1:
-        return [0], [0]
+        return [PELVIS], [0]
     if last == 1:
-        return [0, 9], [0, 1]
+        return [PELVIS, SPINE3], [0, 1]
     if last == 2:
-        return [0, 3, 9], [0, 1, 2]
-    return [0, 3, 6, 9], [0, 1, (1 + last) // 2, last]
+        return [PELVIS, SPINE1, SPINE3], [0, 1, 2]
+    return list(SPINE), [0, 1, (1 + last) // 2, last]

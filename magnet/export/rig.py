@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.body.joints import HIPS, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS
 from magnet.export.bvh_read import Bvh
 from magnet.export.naming import Naming, recognised
 
@@ -27,7 +28,7 @@ UP: dict[str, Floats] = {
 }
 """Up axis of a file: the rotation that takes its world to ours."""
 
-LIMBS = ((1, 4), (4, 7), (7, 10), (16, 18), (18, 20))
+LIMBS = ((L_HIP, L_KNEE), (L_KNEE, L_ANKLE), (L_ANKLE, L_FOOT), (L_SHOULDER, L_ELBOW), (L_ELBOW, L_WRIST))
 """Left joint and the child that says where its bone points in the rest pose."""
 
 
@@ -102,14 +103,15 @@ def _up_axis(torso: Floats, rest: Floats, ours: Mapping[int, int]) -> str:
     """Where torsos point on average, or in the rest pose where they lie about. torso (T, 3)"""
     mean = (torso / np.linalg.norm(torso, axis=-1, keepdims=True)).mean(axis=0)
     if np.abs(mean).max() < 0.7:
-        mean = _middle(rest, ours, 16, 17) - _middle(rest, ours, 1, 2)
+        mean = _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS)
     axis = int(np.abs(mean).argmax())
     return ("-" if mean[axis] < 0 else "") + "xyz"[axis]
 
 
 def _rest_frame(rest: Floats, ours: Mapping[int, int], path: Path) -> Floats:
-    left = (rest[ours[1]] - rest[ours[2]]) / 2 + (rest[ours[16]] - rest[ours[17]]) / 2
-    above = _middle(rest, ours, 16, 17) - _middle(rest, ours, 1, 2)
+    hips, shoulders = (rest[ours[left]] - rest[ours[right]] for left, right in (HIPS, SHOULDERS))
+    left = hips / 2 + shoulders / 2
+    above = _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS)
     ahead = np.cross(left, above)
     if np.linalg.norm(ahead) < 1e-6 * max(float(np.abs(rest).max()), 1e-9) ** 2:
         raise ValueError(f"{path}: hips and shoulders of the rest pose lie on one line, so it has no front")

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
+from magnet.body.joints import L_HIP, PELVIS, R_HIP
+
 Array = NDArray[np.floating]
 Size = tuple[int, int]
 Colour = tuple[int, int, int]
@@ -144,9 +146,9 @@ def _window(series: Array, half: int) -> Array:
 
 def _clearest_side(joints: Array) -> float:
     """Azimuth from which people stand side by side and show their faces rather than their backs. (T, P, 22, 3)"""
-    pelvis = joints[:, :, 0, [0, 2]]
+    pelvis = joints[:, :, PELVIS, [0, 2]]
     apart = pelvis[:, :, None] - pelvis[:, None, :]
-    left = joints[:, :, 1] - joints[:, :, 2]
+    left = joints[:, :, L_HIP] - joints[:, :, R_HIP]
     facing = np.stack([-left[..., 2], left[..., 0]], axis=-1)  # (x, z) of left cross up
     facing = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-6)
     best, best_score = 0.0, -np.inf

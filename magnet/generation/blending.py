@@ -6,7 +6,8 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, rotate_ground, to_planar
+from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar
+from magnet.motion.planar import rotate_ground
 from magnet.motion.scene import Scene, cat_time
 
 SPRING = 2.5

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
-
-if TYPE_CHECKING:
-    from magnet.generation.world import WorldState
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
+
+
+class World(Protocol):
+    """What bodies are made from: where everybody has been placed so far, see `WorldState`."""
+
+    model: Denoiser
+    options: SamplerOptions
+    given: Scene
+    known: Tensor
+    placed: Tensor
+    T_world_can: Tensor
+    finalized: int
+
+    def by_frame(self, rows: Tensor) -> Tensor: ...
 
 
 class Expected:
@@ -74,9 +87,7 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
     return each[:, view_of, :, agent].permute(1, 2, 0, 3)
 
 
-def finalize_bodies(
-    world: WorldState, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None
-) -> None:
+def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
     """Settle the bodies of rows up to `stop` for good: they are given from then on.
 
     Args:
@@ -86,16 +97,16 @@ def finalize_bodies(
         near: one past the last finished row, at least `stop`.
         expected: see `Expected.behind`, from row `near` on.
     """
-    frames = slice(world.finalized * STRIDE, stop * STRIDE)
+    frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
     world.finalized = stop
 
 
-def finalized_bodies(world: WorldState, tokens: Tensor, first: int, stop: int) -> Scene:
+def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
     """Rows [first, stop) as they have been shown, and from there on as they would be."""
-    known = world.given.slice(first * STRIDE, max(min(world.finalized, stop), first) * STRIDE)
+    known = world.given.slice(first * TOKEN_FRAMES, max(min(world.finalized, stop), first) * TOKEN_FRAMES)
     if world.finalized >= stop:
         return known
     rest = decode_bodies(world, tokens, max(world.finalized, first), stop, stop)
@@ -103,7 +114,7 @@ def finalized_bodies(world: WorldState, tokens: Tensor, first: int, stop: int) -
 
 
 def decode_bodies(
-    world: WorldState,
+    world: World,
     tokens: Tensor,
     first: int,
     stop: int,
@@ -118,20 +129,20 @@ def decode_bodies(
     if expected is not None:
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
-    frames = slice(first * STRIDE - lead, stop * STRIDE)
+    frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
     features = model.tokenizer.decode(latent, world.given.betas, deltas)
-    features = features[:, frames.start - low * STRIDE : frames.stop - low * STRIDE]
+    features = features[:, frames.start - low * TOKEN_FRAMES : frames.stop - low * TOKEN_FRAMES]
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
-    before = world.given.slice(first * STRIDE - 1, first * STRIDE) if first else None
+    before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
 
 
 def continuation(
-    world: WorldState, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
+    world: World, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
     tokens, told = expected

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, empty_scene
-from magnet.motion.tokens import STRIDE, by_token, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
-from magnet.tokenizer.module import Tokenizer
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -53,7 +52,7 @@ def label(scene: Scene, number: int) -> str:
 
 def receptive_field(model: Denoiser) -> tuple[int, int]:
     """Tokens before and after that a code or a decoded frame can depend on: encoder and decoder look equally far."""
-    return model.tokenizer.vqvae.decoder.receptive_field if isinstance(model.tokenizer, Tokenizer) else (0, 0)
+    return model.tokenizer.receptive_field
 
 
 def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
@@ -71,12 +70,12 @@ def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None =
         ValueError: something is known that was not recorded.
     """
     needed = int(known.any(dim=1).nonzero()[-1]) + 1 if bool(known.any()) else 0
-    if needed * STRIDE > scene.frames:
-        raise ValueError(f"the task needs {needed * STRIDE} frames, the scene has {scene.frames}")
+    if needed * TOKEN_FRAMES > scene.frames:
+        raise ValueError(f"the task needs {needed * TOKEN_FRAMES} frames, the scene has {scene.frames}")
     stop = len(known) if stop is None else stop
-    part = scene.slice(first * STRIDE, min(stop, needed) * STRIDE)
-    blank = empty_scene(scene.scenes, (stop - first) * STRIDE, scene.agents, scene.T_world_root)
-    keep = known[first : min(stop, needed)].repeat_interleave(STRIDE, dim=0).to(scene.device)  # (T, P)
+    part = scene.slice(first * TOKEN_FRAMES, min(stop, needed) * TOKEN_FRAMES)
+    blank = empty_scene(scene.scenes, (stop - first) * TOKEN_FRAMES, scene.agents, scene.T_world_root)
+    keep = known[first : min(stop, needed)].repeat_interleave(TOKEN_FRAMES, dim=0).to(scene.device)  # (T, P)
     keep = keep[:, :, None, None] & scene.present[:, None, :, None, None]
     body_rot, T_world_root = blank.body_rot.clone(), blank.T_world_root.clone()
     recorded = part.frames
@@ -136,11 +135,15 @@ def known_tokens(
     N, P = known.shape
     like = given.T_world_root
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
-    deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, STRIDE, 9).clone()
+    deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, TOKEN_FRAMES, 9).clone()
     for start, stop, agents in segments(known):
-        part = given.slice(start * STRIDE, stop * STRIDE).permute_agents(torch.tensor(agents, device=like.device))
+        part = given.slice(start * TOKEN_FRAMES, stop * TOKEN_FRAMES).permute_agents(
+            torch.tensor(agents, device=like.device)
+        )
         for low, first, last, limit, those in encodings(start, stop, agents, limits, receptive_field(model)[0]):
-            seen = given.slice(low * STRIDE, limit * STRIDE).permute_agents(torch.tensor(those, device=like.device))
+            seen = given.slice(low * TOKEN_FRAMES, limit * TOKEN_FRAMES).permute_agents(
+                torch.tensor(those, device=like.device)
+            )
             latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
         own = by_token(to_9d(canonical_deltas(canonical_frame(part.T_world_root))))
         if start > 0:

@@ -11,7 +11,7 @@ from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
 from magnet.generation.conditioning import label
 from magnet.motion.scene import Scene, require_rate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -31,8 +31,10 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
     if not model.normalizer.ready:
         raise ValueError("the denoiser has never been trained: its statistics are not set; load a checkpoint")
     require_whole("context", context, 0)
-    if context % STRIDE:
-        raise ValueError(f"context of {context} frames is not a multiple of {STRIDE}: cut the scene to whole tokens")
+    if context % TOKEN_FRAMES:
+        raise ValueError(
+            f"context of {context} frames is not a multiple of {TOKEN_FRAMES}: cut the scene to whole tokens"
+        )
     if frames is not None:
         require_whole("frames", frames, 0)
     require_whole("samples", samples, 1)
@@ -59,7 +61,7 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     if bool(unshaped.any()):
         b, agent = unshaped.nonzero()[0].tolist()
         raise ValueError(f"{label(scene, b)}, agent {agent}: betas are not finite; zeros are an average body")
-    keep = known.repeat_interleave(STRIDE, dim=0)[: scene.frames].to(scene.device)
+    keep = known.repeat_interleave(TOKEN_FRAMES, dim=0)[: scene.frames].to(scene.device)
     rows = keep.any(dim=1).nonzero()[:, 0]
     if not len(rows):
         return

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 FASTEST = 1.6
 """Metres a second that steering may ask of somebody."""
@@ -66,14 +66,14 @@ def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held
         ValueError: no such agent or frame.
     """
     last = scene.frames - 1
-    frame, pose = frame // STRIDE * STRIDE, frame // STRIDE * STRIDE if pose is None else pose
+    frame, pose = frame // TOKEN_FRAMES * TOKEN_FRAMES, frame // TOKEN_FRAMES * TOKEN_FRAMES if pose is None else pose
     if not 0 <= agent < scene.agents:
         raise ValueError(f"person {agent + 1} is not there: the scene has {scene.agents}")
     if frame < 0 or not 0 <= pose <= last:
         raise ValueError(f"keyframe at frame {frame} with the pose of frame {pose}: the scene has frames 0 to {last}")
     own = scene.T_world_root[0, :, agent : agent + 1].cpu()
     T_world_can = canonical_frame(own)[:, 0]
-    frames = torch.full((STRIDE,), pose) if held else torch.arange(pose, pose + STRIDE).clamp(max=last)
+    frames = torch.full((TOKEN_FRAMES,), pose) if held else torch.arange(pose, pose + TOKEN_FRAMES).clamp(max=last)
     return Keyframe(
         agent,
         frame,
@@ -88,7 +88,7 @@ def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
     roots, body_rot = scene.T_world_root.clone(), scene.body_rot.clone()
     given = torch.zeros(roots.shape[:3], dtype=torch.bool) if scene.given is None else scene.given.clone()
     for key in keys:
-        frames = slice(key.frame, key.frame + STRIDE)
+        frames = slice(key.frame, key.frame + TOKEN_FRAMES)
         roots[0, frames, key.agent] = key.goal.frame() @ key.T_key_root
         body_rot[0, frames, key.agent] = key.body_rot
         given[0, frames, key.agent] = True

@@ -20,7 +20,7 @@ from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
@@ -103,7 +103,7 @@ class Live:
         self.generator = generator or torch.Generator(device=model.device).manual_seed(1)
         if partner is not None:
             require_rate(partner, "partner")
-            check_given(partner, torch.ones(partner.frames // STRIDE, partner.agents, dtype=torch.bool))
+            check_given(partner, torch.ones(partner.frames // TOKEN_FRAMES, partner.agents, dtype=torch.bool))
         self.partner = partner
         self.settings = LiveSettings()
         self.keys: list[Keyframe] = []
@@ -124,7 +124,7 @@ class Live:
         else:
             self._check(start)
             scene = start.permute_agents(start.present[0].nonzero()[:, 0])
-            scene = scene.slice(0, start.frames // STRIDE * STRIDE).replace(valid=None)
+            scene = scene.slice(0, start.frames // TOKEN_FRAMES * TOKEN_FRAMES).replace(valid=None)
             if scene.given is None:
                 scene = scene.replace(given=torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool))
         with self.lock:
@@ -152,12 +152,12 @@ class Live:
         if not bool(start.present.any()):
             raise ValueError("start: nobody is there to go on")
         require_rate(start, "start")
-        check_given(start, torch.ones(start.frames // STRIDE, start.agents, dtype=torch.bool))
+        check_given(start, torch.ones(start.frames // TOKEN_FRAMES, start.agents, dtype=torch.bool))
 
     def restart(self, frame: int) -> int:
         """Forget what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
         with self.lock:
-            keep = max(min(frame // STRIDE * STRIDE, self.scene.frames), CONTEXT)
+            keep = max(min(frame // TOKEN_FRAMES * TOKEN_FRAMES, self.scene.frames), CONTEXT)
             self.scene = self.scene.slice(0, keep)
             self.version += 1
             return keep
@@ -184,7 +184,7 @@ class Live:
         fields = {name: value for name, value in self.settings.fields.items() if name in own}
         people = range(self.scene.agents)
         if "pairs" in own and "pairs" not in fields:
-            last = (CONTEXT + self._length(kind)) // STRIDE - 1
+            last = (CONTEXT + self._length(kind)) // TOKEN_FRAMES - 1
             fields["pairs"] = tuple((agent, last) for agent in self._steered() or people)
         if "target" in own and "target" not in fields:
             leads = self._steered() or people[-1:]
@@ -206,7 +206,7 @@ class Live:
             task = self.task()
             frames = self._length(type(task))
         past = scene.slice(scene.frames - CONTEXT)
-        grid = Grid((CONTEXT + frames) // STRIDE, scene.agents, CONTEXT // STRIDE, self.settings.steps)
+        grid = Grid((CONTEXT + frames) // TOKEN_FRAMES, scene.agents, CONTEXT // TOKEN_FRAMES, self.settings.steps)
         known = task.schedule(grid).known
         if not bool(known[: grid.context].all()):
             raise ValueError(
@@ -228,10 +228,10 @@ class Live:
             keys, version = sorted(self.keys, key=lambda key: key.frame), self.version
             start = self.between_from()
             scene = self.scene.slice(0, start)
-        frames = keys[-1].frame + STRIDE - start
+        frames = keys[-1].frame + TOKEN_FRAMES - start
         shifted = [dataclasses.replace(key, frame=key.frame - start + CONTEXT) for key in keys]
         given = with_keyframes(self._held(scene.slice(start - CONTEXT), frames), shifted)
-        task = Inbetweening(pairs=tuple((key.agent, key.frame // STRIDE) for key in shifted))
+        task = Inbetweening(pairs=tuple((key.agent, key.frame // TOKEN_FRAMES) for key in shifted))
         chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return dataclasses.replace(self._append(scene, chunk, version, begun, anew=True), between=True)
 
@@ -244,12 +244,12 @@ class Live:
         if not self.keys:
             raise ValueError("no keyframes: add one first")
         first = min(key.frame for key in self.keys)
-        if first < CONTEXT + STRIDE:
+        if first < CONTEXT + TOKEN_FRAMES:
             raise ValueError(
                 f"a keyframe at frame {first}: the model goes on from {CONTEXT} frames, so the first keyframe lies at "
-                f"{CONTEXT + STRIDE} or later"
+                f"{CONTEXT + TOKEN_FRAMES} or later"
             )
-        return max(CONTEXT, min(self.scene.frames, first - REACH) // STRIDE * STRIDE)
+        return max(CONTEXT, min(self.scene.frames, first - REACH) // TOKEN_FRAMES * TOKEN_FRAMES)
 
     def _append(self, scene: Scene, chunk: Scene, version: int, begun: float, anew: bool = False) -> LiveChunk:
         """Put a chunk behind the scene that it continues, unless that was restarted meanwhile."""
@@ -277,7 +277,7 @@ class Live:
         return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
 
     def _length(self, kind: type) -> int:
-        return REACH if kind is Inbetweening else max(self.settings.chunk // STRIDE, 1) * STRIDE
+        return REACH if kind is Inbetweening else max(self.settings.chunk // TOKEN_FRAMES, 1) * TOKEN_FRAMES
 
     def _steered(self) -> list[int]:
         return sorted(agent for agent in self.settings.goals if agent < self.scene.agents)
@@ -292,13 +292,13 @@ class Live:
 
     def _future(self, past: Scene, now: int, known: Tensor, frames: int) -> Scene:
         """The past and what the task is given of what comes after. known (N, P)"""
-        coming = known[CONTEXT // STRIDE :]
+        coming = known[CONTEXT // TOKEN_FRAMES :]
         scene = self._held(past, frames)
         if not bool(coming.any()):
             return scene
         whole = coming.all(dim=0)
         moments = (coming & ~whole).nonzero().tolist()
-        scene = with_keyframes(scene, [self._toward(past, p, CONTEXT + step * STRIDE) for step, p in moments])
+        scene = with_keyframes(scene, [self._toward(past, p, CONTEXT + step * TOKEN_FRAMES) for step, p in moments])
         return self._lead(scene, past, now, whole, frames) if bool(whole.any()) else scene
 
     def _lead(self, scene: Scene, past: Scene, now: int, agents: Tensor, frames: int) -> Scene:
@@ -312,8 +312,8 @@ class Live:
             length = REACH if steered else frames
             goals = self._held(past, length)
             if steered:
-                last = CONTEXT + REACH - STRIDE
-                task = Inbetweening(pairs=tuple((agent, last // STRIDE) for agent in steered))
+                last = CONTEXT + REACH - TOKEN_FRAMES
+                task = Inbetweening(pairs=tuple((agent, last // TOKEN_FRAMES) for agent in steered))
                 goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
             made = self.sample(goals, task, CONTEXT, length).replace(given=goals.given)
             source = made.slice(0, CONTEXT + frames)

@@ -11,7 +11,7 @@ from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
 from magnet.generation.rollout import CHUNK, Generators, Rollout
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class OnlineRollout(Rollout):
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
-        self.there = past.frames // STRIDE
+        self.there = past.frames // TOKEN_FRAMES
         self._advance()
 
     @property
@@ -71,7 +71,7 @@ class OnlineRollout(Rollout):
         Raises:
             ValueError: motion that is not finite, or no rotation.
         """
-        begins, ends = self.made, self.made + frames.frames // STRIDE
+        begins, ends = self.made, self.made + frames.frames // TOKEN_FRAMES
         fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
         fed = fed.pad_agents(self.model.layout.agents)
         # Where the floor is was seen in the past: an answer must not fail because somebody jumps or is carried.
@@ -90,7 +90,7 @@ class OnlineRollout(Rollout):
         made = self._decoded(begins, self.made, None, needed)
         old = max(self.stop - receptive_field(self.model)[0] - 1, 0) - self.base
         if old > 0:
-            kept = self.scene.slice(old * STRIDE)
+            kept = self.scene.slice(old * TOKEN_FRAMES)
             self.scene = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
             self.base += old
         return made

@@ -10,7 +10,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.generation.inputs import check_request
 from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl, chosen
@@ -45,20 +45,20 @@ class Partner:
     ) -> None:
         require_rate(past, "past")
         check_request(denoiser, past, 0, 0, 1)
-        if past.frames < STRIDE:
-            raise ValueError(f"past: got {past.frames} frames, expected at least {STRIDE}, of everybody")
+        if past.frames < TOKEN_FRAMES:
+            raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")
         self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents), block=block)
         self.options, self.generator = options or SamplerOptions(), generator
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present = past.present
-        whole = past.slice(past.frames % STRIDE).replace(valid=None, given=None)
+        whole = past.slice(past.frames % TOKEN_FRAMES).replace(valid=None, given=None)
         self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
 
     @property
     def past(self) -> Scene:
         """The last frames of everybody, given and answered, as far back as the model or its decoder still looks."""
         world = self.stream.world
-        held = world.given.slice(0, world.finalized * STRIDE)
+        held = world.given.slice(0, world.finalized * TOKEN_FRAMES)
         return held.permute_agents(torch.arange(self._present.shape[1]))
 
     def answer(self, frames: Scene) -> Scene:
@@ -72,10 +72,10 @@ class Partner:
             ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people or frame rate.
         """
         require_rate(frames, "frames")
-        block = self.task.block * STRIDE
+        block = self.task.block * TOKEN_FRAMES
         if not frames.frames or frames.frames % block:
             raise ValueError(
-                f"frames: got {frames.frames}, expected a multiple of {block}: a token is {STRIDE} frames"
+                f"frames: got {frames.frames}, expected a multiple of {block}: a token is {TOKEN_FRAMES} frames"
                 + (f", and {self.task.block} are answered at a time" if self.task.block > 1 else "")
             )
         if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):

@@ -24,7 +24,7 @@ from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions, planning_grid
 from magnet.sampling.sampler import begin, run_stages
@@ -141,8 +141,8 @@ class Rollout:
         if self.frames is not None and scene.frames >= self.frames:
             self.scene = whole_tokens(self.scene, self.frames)
         o = self.options
-        tokens = model.window if self.frames is None else -(-self.frames // STRIDE)
-        past = context // STRIDE
+        tokens = model.window if self.frames is None else -(-self.frames // TOKEN_FRAMES)
+        past = context // TOKEN_FRAMES
         grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
         self.rows: float = grid.tokens
         if frames is None:
@@ -161,7 +161,7 @@ class Rollout:
         self.related: Tensor | None = None
         if layout.pairwise_noise == "token":
             self.related = torch.zeros_like(self.known)
-            self.related[: scene.frames // STRIDE] = True
+            self.related[: scene.frames // TOKEN_FRAMES] = True
         check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
@@ -186,7 +186,7 @@ class Rollout:
                 while start < self.rows and ready >= min(start + self.chunk, self.rows):
                     stop = int(min(start + self.chunk, self.rows))
                     made = self._decoded(start, stop, before, needed)
-                    yield made if self.frames is None else made.slice(0, self.frames - start * STRIDE)
+                    yield made if self.frames is None else made.slice(0, self.frames - start * TOKEN_FRAMES)
                     start, before = stop, made.slice(made.frames - 1)
 
     def _ready(self, final: int) -> Iterator[float]:
@@ -217,7 +217,7 @@ class Rollout:
         before, after = receptive_field(self.model)
         if self.world.causal:
             return before + 2, 0
-        seam = -(-self.options.blend // STRIDE) if self.options.keep_given else 0
+        seam = -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
         return before + seam + 1, after + seam
 
     # Contexts are entered anew in each call: while a chunk is being looked at they would hold outside too.
@@ -269,7 +269,7 @@ class Rollout:
             self.tokens, self.mask_noise = self.tokens[:, surplus:].clone(), self.mask_noise[:, surplus:].clone()
             self.history = None if self.history is None else self.history.release(surplus)
             self.first += surplus
-        given = self._known(start, stop).repeat_interleave(STRIDE, dim=0).to(made.device)
+        given = self._known(start, stop).repeat_interleave(TOKEN_FRAMES, dim=0).to(made.device)
         return made.replace(given=given[None] & made.present[:, None])
 
     def _bring_in(self, stop: int) -> None:
@@ -290,7 +290,7 @@ class Rollout:
             self.tokens = torch.cat([self.tokens, new], dim=1)
             self.history = None if self.history is None else self.history.extend(new)
             self.mask_noise = torch.cat([self.mask_noise, mask_noise], dim=1)
-            self.world.extend(given.slice(part.start * STRIDE, part.stop * STRIDE), known[part])
+            self.world.extend(given.slice(part.start * TOKEN_FRAMES, part.stop * TOKEN_FRAMES), known[part])
             self.stop = last
 
     def _given(self, low: int, high: int) -> Scene:
@@ -313,7 +313,7 @@ class Rollout:
 
 def whole_tokens(scene: Scene, frames: int) -> Scene:
     """So many frames of a scene and, up to the end of their last token, its last pose held if there are no more."""
-    wanted = -(-frames // STRIDE) * STRIDE
+    wanted = -(-frames // TOKEN_FRAMES) * TOKEN_FRAMES
     if scene.frames >= wanted:
         return scene
     frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)

@@ -12,7 +12,7 @@ from magnet.checks import require_whole
 from magnet.generation.causal_bodies import own_view
 from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time, require_rate
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Stage, initial_levels
 
@@ -80,7 +80,7 @@ class TracedRollout(Rollout):
         generator: torch.Generator | None,
         every: int,
     ) -> None:
-        whole = -(-(context + frames) // STRIDE)  # one chunk, so that no row is let go
+        whole = -(-(context + frames) // TOKEN_FRAMES)  # one chunk, so that no row is let go
         super().__init__(model, scene, task, context, frames, 1, options, generator, None, None, whole)
         self.every = every
         self.level = initial_levels(self.known)
@@ -109,7 +109,7 @@ class TracedRollout(Rollout):
         after = stage.levels[self._step]
         self.level[stage.start : stage.stop] = after
         self.levels.append(self.level.to("cpu", torch.int16))
-        self.starts.append(stage.start * STRIDE)
+        self.starts.append(stage.start * TOKEN_FRAMES)
         wanted = stage.levels[-1] < LEVELS  # the others stay unknown
         self.windows.append(
             preview(self.world, self.tokens, estimate, stage.start - self.first, wanted, stage.decentralized)

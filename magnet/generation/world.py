@@ -28,7 +28,7 @@ from magnet.motion.frames import (
     to_9d,
 )
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.schedule import MaskSchedule
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class WorldState:
         self.options = options
         self.stats = stats or SamplingStats()
         self.samples = samples
-        self.known = schedule.known[: given.frames // STRIDE]
+        self.known = schedule.known[: given.frames // TOKEN_FRAMES]
         self.given = given.repeat(samples)
         self.placed = self.known.clone()
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
@@ -84,7 +84,7 @@ class WorldState:
     def release(self, rows: int) -> None:
         """Let the first rows go; nothing that follows may depend on them, so one row before what may still
         change must stay."""
-        frames = rows * STRIDE
+        frames = rows * TOKEN_FRAMES
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
@@ -119,7 +119,7 @@ class WorldState:
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
         true_deltas = self._deltas(begin, stop)
-        implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * STRIDE : stop * STRIDE])))
+        implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * TOKEN_FRAMES : stop * TOKEN_FRAMES])))
         settled = layout.pack(latent, true_deltas, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
         if layout.slots:
@@ -160,7 +160,7 @@ class WorldState:
         """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
         # One frame more in front, so that the first delta leads in from where each agent stood.
         lead = min(1, first)
-        deltas = canonical_deltas(self.T_world_can[:, first * STRIDE - lead : stop * STRIDE])[:, lead:]
+        deltas = canonical_deltas(self.T_world_can[:, first * TOKEN_FRAMES - lead : stop * TOKEN_FRAMES])[:, lead:]
         deltas = by_token(to_9d(deltas))
         before = torch.nn.functional.pad(self.placed[:stop], (0, 0, 1, 0))[first:stop].to(deltas.device)
         deltas[:, :, :, 0] = torch.where(before[..., None], deltas[:, :, :, 0], to_9d(torch.eye(4)).to(deltas))
@@ -239,7 +239,7 @@ class WorldState:
             fixed=known,
             anchor=first_of(there),
         )
-        frames = slice(first * STRIDE, stop * STRIDE)
+        frames = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
@@ -249,7 +249,7 @@ class WorldState:
         nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
         newcomer, who then starts at the origin; in each scene off somebody who is present.
         """
-        starts = self.T_world_can[:, max(first * STRIDE - 1, 0)].clone()
+        starts = self.T_world_can[:, max(first * TOKEN_FRAMES - 1, 0)].clone()
         there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
         present = self.given.present
         if bool((there | ~present).all()):
@@ -259,9 +259,11 @@ class WorldState:
         scene = torch.arange(len(starts), device=starts.device)
         onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
         onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
-        T_world_anchor = torch.where(now[anchor, None, None], self.T_world_can[scene, first * STRIDE, anchor], onward)
+        T_world_anchor = torch.where(
+            now[anchor, None, None], self.T_world_can[scene, first * TOKEN_FRAMES, anchor], onward
+        )
         for agent in (~there).nonzero()[:, 0].tolist():
-            T_world_first = self.T_world_can[:, first * STRIDE, agent] if bool(now[agent]) else T_world_anchor
+            T_world_first = self.T_world_can[:, first * TOKEN_FRAMES, agent] if bool(now[agent]) else T_world_anchor
             starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
         if T_self_partner is None:
             return starts
@@ -283,7 +285,7 @@ class WorldState:
         arriving = self.known[row] & new & ~self._late(row) if row < len(self.known) else torch.zeros_like(new)
         if not bool(arriving.any()):
             return moved
-        key = row * STRIDE
+        key = row * TOKEN_FRAMES
         if not self.rooted and not self.finalized and not bool(self.known[:row].any()):
             self._root(key, arriving)
             moved[:row] |= self.placed[:row]
@@ -295,8 +297,10 @@ class WorldState:
             outside = (~gap).nonzero()[:, 0]
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
-            path = self.T_world_can[:, start * STRIDE - left : key, agent]
-            self.T_world_can[:, start * STRIDE : key, agent] = warp_to_keyframe(path, T_world_key, key_delta)[:, left:]
+            path = self.T_world_can[:, start * TOKEN_FRAMES - left : key, agent]
+            self.T_world_can[:, start * TOKEN_FRAMES : key, agent] = warp_to_keyframe(path, T_world_key, key_delta)[
+                :, left:
+            ]
             moved[start:row, agent] = True
         return moved
 
@@ -316,7 +320,7 @@ class WorldState:
         path = self.T_world_can[scene, :key, lead]
         shift = T_world_key @ inverse(path[:, -1] @ delta_between(path, key_delta))
         shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
-        placed = self.by_frame(self.placed[: key // STRIDE])[..., None, None]
+        placed = self.by_frame(self.placed[: key // TOKEN_FRAMES])[..., None, None]
         now = self.T_world_can[:, :key]
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
@@ -329,27 +333,27 @@ class WorldState:
         """
         if self.causal:
             return finalized_bodies(self, tokens, first, len(self.known) if stop is None else stop)
-        layout, blend = self.model.layout, -(-self.options.blend // STRIDE) if self.options.keep_given else 0
+        layout, blend = self.model.layout, -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
         stop = len(self.known) if stop is None else stop
         low, high = max(first - blend, 0), min(stop + blend, len(self.known))
         behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
         latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
         features = self.model.tokenizer.decode(latent, self.given.betas, deltas)
-        frames = slice((low - near.start) * STRIDE, (high - near.start) * STRIDE)
-        given = self.given.slice(low * STRIDE, high * STRIDE)
-        T_world_can = self.T_world_can[:, low * STRIDE : high * STRIDE]
+        frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
+        given = self.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
+        T_world_can = self.T_world_can[:, low * TOKEN_FRAMES : high * TOKEN_FRAMES]
         decoded = posed(features[:, frames], T_world_can, given)
         if self.options.keep_given:
             decoded = crossfade_given(
                 decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
             )
-        decoded = decoded.slice((first - low) * STRIDE, (stop - low) * STRIDE)
+        decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
         return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:
         """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""
-        return rows.repeat_interleave(STRIDE, dim=0).to(self.given.device)
+        return rows.repeat_interleave(TOKEN_FRAMES, dim=0).to(self.given.device)
 
 
 def first_of(mask: Tensor) -> Tensor:

@@ -7,12 +7,10 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from magnet.body.joints import FEET
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-
-FEET = (7, 8, 10, 11)
-"""Ankles and balls of the feet."""
 
 
 def lowest_foot(joints: Tensor) -> Tensor:

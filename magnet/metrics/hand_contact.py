@@ -8,11 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from magnet.body.joints import ELBOWS, WRISTS
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-
-ELBOWS, WRISTS = (18, 19), (20, 21)
 
 BEYOND = 0.08
 """Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""

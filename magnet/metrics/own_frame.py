@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from magnet.body.joints import L_HIP, PELVIS, R_HIP
 from magnet.motion.frames import from_planar, inverse
 
 
@@ -13,8 +14,8 @@ def joint_canonical_frame(joints: Tensor) -> Tensor:
 
     Joints alone do not give the pelvis's rotation, so this is near `magnet.motion`'s frame, not equal to it.
     """
-    left = joints[..., 1, :] - joints[..., 2, :]
-    return from_planar(torch.atan2(-left[..., 2], left[..., 0]), joints[..., 0, [0, 2]])
+    left = joints[..., L_HIP, :] - joints[..., R_HIP, :]
+    return from_planar(torch.atan2(-left[..., 2], left[..., 0]), joints[..., PELVIS, [0, 2]])
 
 
 def seen_from(T_world_self: Tensor, joints: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from magnet.body.joints import PELVIS
 from magnet.metrics.base import MotionMetric, Of
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
@@ -15,7 +16,7 @@ from magnet.metrics.histogram import histogram_of, quantile
 
 def partner_distance(joints: Tensor, partner: Tensor) -> Tensor:
     """Between two pelvises over the ground. (..., 22, 3) x 2 -> (...) metres"""
-    return (joints - partner)[..., 0, [0, 2]].norm(dim=-1)
+    return (joints - partner)[..., PELVIS, [0, 2]].norm(dim=-1)
 
 
 class PartnerDistance(MotionMetric):

@@ -8,11 +8,10 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
+from magnet.body.joints import TOES
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-
-TOES = (10, 11)
 
 PRESETS = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
 """Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet.metrics.base import MotionMetric, Of
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 ORDERS = {"border_acceleration": 2, "border_jerk": 3}
 
@@ -21,7 +21,7 @@ def pelvis_difference(joints: Tensor, order: int) -> Tensor:
     return joints[..., 0, :].diff(n=order, dim=-3).norm(dim=-1)
 
 
-def at_borders(frames: int, order: int, stride: int = STRIDE) -> Tensor:
+def at_borders(frames: int, order: int, stride: int = TOKEN_FRAMES) -> Tensor:
     """Which differences have frames of two tokens; the first token begins at frame 0. -> (frames - order,) bool"""
     first = torch.arange(max(frames - order, 0))
     return first // stride != (first + order) // stride
@@ -46,7 +46,7 @@ class TokenBorders(MotionMetric):
 
     sums: Tensor  # (2, 2, 2) acceleration and jerk, inside and at borders, total and count
 
-    def __init__(self, stride: int = STRIDE, of: Of = "generated", agents: Tensor | None = None) -> None:
+    def __init__(self, stride: int = TOKEN_FRAMES, of: Of = "generated", agents: Tensor | None = None) -> None:
         super().__init__(of, agents)
         if stride < 4:
             raise ValueError(f"stride={stride}: a jerk spans 4 frames, so tokens of at least 4 have an inside")

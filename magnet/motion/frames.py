@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from magnet.motion.planar import rotate_ground
 from magnet.motion.rotations import about_y, about_y_of, from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
 
@@ -80,13 +81,6 @@ def _on_ground(rotation: Tensor, ground: Tensor) -> Tensor:
     """(..., 3, 3), (..., 2) -> (..., 4, 4)"""
     x, z = ground.unbind(-1)
     return rigid(rotation, torch.stack([x, torch.zeros_like(x), z], dim=-1))
-
-
-def rotate_ground(yaw: Tensor, ground: Tensor) -> Tensor:
-    """Turn ground vectors (x, z) about the vertical. (...), (..., 2) -> (..., 2)"""
-    cos, sin = yaw.cos(), yaw.sin()
-    x, z = ground.unbind(-1)
-    return torch.stack([cos * x + sin * z, cos * z - sin * x], dim=-1)
 
 
 # -- from a scene to what tokens hold ----------------------------------------------------------

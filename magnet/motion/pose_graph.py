@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import partners, rotate_ground
+from magnet.motion.frames import partners
+from magnet.motion.planar import rotate_ground
 
 GAUGE = 1e-6
 """Precision that holds everybody where their deltas alone would lead, where nothing else says where they are."""

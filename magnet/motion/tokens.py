@@ -1,4 +1,4 @@
-"""Tokens: what the denoiser sees. One token is one agent during `STRIDE` frames (paper Eq. 6)."""
+"""Tokens: what the denoiser sees. One token is one agent during `TOKEN_FRAMES` frames (paper Eq. 6)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, partners, to_9d
 from magnet.motion.scene import Scene
 
-STRIDE = 4
+TOKEN_FRAMES = 4
 """Frames in a token: the temporal stride omega of the paper."""
 
 
@@ -41,11 +41,11 @@ class TokenLayout:
     @property
     def width(self) -> int:
         """Numbers in a token: 512 + 36 P at the paper's sizes."""
-        return self.latent + 9 * STRIDE * (1 + self.slots)
+        return self.latent + 9 * TOKEN_FRAMES * (1 + self.slots)
 
     def groups(self, device: torch.device | None = None) -> Tensor:
         """Group of each number of a token. (D,) int"""
-        sizes = [self.latent + 9 * STRIDE] + [9 * STRIDE] * self.slots
+        sizes = [self.latent + 9 * TOKEN_FRAMES] + [9 * TOKEN_FRAMES] * self.slots
         return torch.arange(len(sizes), device=device).repeat_interleave(torch.tensor(sizes, device=device))
 
     def group_levels(self, levels: Tensor) -> Tensor:
@@ -81,9 +81,9 @@ class TokenLayout:
 
     def unpack(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Inverse of `pack`; without pairs the last one has no slots."""
-        sizes = [self.latent, 9 * STRIDE, 9 * STRIDE * self.slots]
+        sizes = [self.latent, 9 * TOKEN_FRAMES, 9 * TOKEN_FRAMES * self.slots]
         latent, deltas, pairs = tokens.split(sizes, dim=-1)
-        return latent, deltas.unflatten(-1, (STRIDE, 9)), pairs.unflatten(-1, (self.slots, STRIDE, 9))
+        return latent, deltas.unflatten(-1, (TOKEN_FRAMES, 9)), pairs.unflatten(-1, (self.slots, TOKEN_FRAMES, 9))
 
 
 def by_token(frames: Tensor) -> Tensor:
@@ -93,9 +93,9 @@ def by_token(frames: Tensor) -> Tensor:
     torch.Size([1, 16, 2, 4, 9])
     """
     B, T, P, D = frames.shape
-    if T % STRIDE:
-        raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the scene first")
-    return frames.view(B, T // STRIDE, STRIDE, P, D).transpose(2, 3)
+    if T % TOKEN_FRAMES:
+        raise ValueError(f"{T} frames are not a whole number of tokens of {TOKEN_FRAMES} frames; cut the scene first")
+    return frames.view(B, T // TOKEN_FRAMES, TOKEN_FRAMES, P, D).transpose(2, 3)
 
 
 def by_frame(tokens: Tensor) -> Tensor:

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from magnet.body.base import MIRROR
+from magnet.body.joints import ANKLES, ELBOWS, KNEES, L_HIP, MIRROR, PELVIS, R_HIP, WRISTS
 from magnet.synthesis.people import FPS
 from magnet.synthesis.planning import Truth
 from magnet.synthesis.ring import BOTH, LEFT, RIGHT
 
 LATEST = 150
 """Longest delay looked for, frames."""
-LIMBS = (4, 5, 7, 8, 18, 19, 20, 21)
+LIMBS = (*KNEES, *ANKLES, *ELBOWS, *WRISTS)
 """Knees, ankles, elbows and wrists tell what a person does."""
 
 
@@ -47,7 +47,7 @@ def _mean(values: list[Tensor]) -> float:
 def _own_frame(joints: Tensor) -> Tensor:
     """Joints seen from the pelvis, facing where the hips face. (T, P, 22, 3) -> same"""
     away = joints - joints[..., :1, :]
-    across = joints[..., 1, :] - joints[..., 2, :]
+    across = joints[..., L_HIP, :] - joints[..., R_HIP, :]
     yaw = torch.atan2(-across[..., 2], across[..., 0])[..., None]
     x, y, z = away.unbind(-1)
     return torch.stack([yaw.cos() * x - yaw.sin() * z, y, yaw.sin() * x + yaw.cos() * z], dim=-1)
@@ -80,7 +80,7 @@ def _follow(joints: Tensor, truth: Truth, start: float) -> dict[str, float]:
 
 def _wrists_apart(joints: Tensor, a: int, hand_a: int, b: int, hand_b: int) -> Tensor:
     """Distance between a wrist of one and a wrist of another. (T,) metres"""
-    return (joints[:, a, 20 + hand_a] - joints[:, b, 20 + hand_b]).norm(dim=-1)
+    return (joints[:, a, WRISTS[hand_a]] - joints[:, b, WRISTS[hand_b]]).norm(dim=-1)
 
 
 def _handshake(joints: Tensor, truth: Truth, start: float) -> dict[str, float]:
@@ -98,7 +98,7 @@ def _handshake(joints: Tensor, truth: Truth, start: float) -> dict[str, float]:
 def _circle(joints: Tensor, truth: Truth, start: float) -> dict[str, float]:
     P = joints.shape[1]
     clock = start + torch.arange(len(joints), dtype=torch.float64) / FPS
-    ground = joints[:, :, 0, [0, 2]]
+    ground = joints[:, :, PELVIS, [0, 2]]
     spoke = ground - ground.mean(dim=1, keepdim=True)
     swell = 0.5 - 0.5 * torch.cos(2 * math.pi * clock / truth["period"])
     radius = (truth["radius"] - truth["dip"] * swell)[:, None]

@@ -9,6 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from magnet.body.joints import HEAD, L_ELBOW, L_SHOULDER, L_WRIST, R_ELBOW, R_SHOULDER, R_WRIST, SHOULDERS, TOES
+
 FPS = 30.0
 PALM = 0.08
 """Metres from the wrist to the middle of the palm."""
@@ -48,17 +50,20 @@ class People:
     @property
     def arm(self) -> Tensor:
         """Shoulder to wrist, the mean of both arms. (P,) metres"""
-        bones = self.rest[:, [18, 20, 19, 21]] - self.rest[:, [16, 18, 17, 19]]
+        bones = (
+            self.rest[:, [L_ELBOW, L_WRIST, R_ELBOW, R_WRIST]]
+            - self.rest[:, [L_SHOULDER, L_ELBOW, R_SHOULDER, R_ELBOW]]
+        )
         return bones.norm(dim=-1).sum(dim=-1) / 2
 
     @property
     def shoulder_height(self) -> Tensor:
         """Over the floor when standing. (P,) metres"""
-        return self.rest[:, 16:18, 1].mean(dim=1) + self.stature
+        return self.rest[:, SHOULDERS, 1].mean(dim=1) + self.stature
 
     @property
     def head_height(self) -> Tensor:
-        return self.rest[:, 15, 1] + self.stature
+        return self.rest[:, HEAD, 1] + self.stature
 
 
 def uniform(generator: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
@@ -79,7 +84,7 @@ def gather(count: int, generator: torch.Generator, body: RestBody) -> People:
     return People(
         betas=betas,
         rest=rest,
-        stature=SOLE - rest[:, 10:12, 1].mean(dim=1),
+        stature=SOLE - rest[:, TOES, 1].mean(dim=1),
         step_time=uniform(generator, 0.66, 0.76, count),
         stance=uniform(generator, 0.085, 0.115, count),
         toe_out=uniform(generator, 0.03, 0.2, count),

@@ -8,9 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from magnet.body.base import PARENTS
+from magnet.body.joints import (  # isort: skip
+    ANKLES, COLLARS, ELBOWS, HEAD, HIPS, KNEES, L_HIP, NECK, PARENTS, PELVIS, R_HIP, SHOULDERS, SPINE1, SPINE2, SPINE3,
+    TOES, WRISTS,
+)  # fmt: skip
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import about_y
+from magnet.motion.scene import BODY_JOINTS
 from magnet.synthesis.gait import Feet
 from magnet.synthesis.ik import about, about_x, about_z, basis, ease, fraction, rotate, smooth, two_bones, under
 from magnet.synthesis.people import PALM, SOLE, People, noise
@@ -94,7 +98,7 @@ def embody(plan: Plan, people: People, generator: torch.Generator) -> tuple[Tens
     for hand in (0, 1):
         _arm(plan, people, bodies, hand, scissor, drift[..., 8 + 2 * hand : 10 + 2 * hand])
     _head(plan, bodies, drift[..., 5:8])
-    return _local(bodies), rigid(bodies.R[0], bodies.t[0])
+    return _local(bodies), rigid(bodies.R[PELVIS], bodies.t[PELVIS])
 
 
 def _strides(plan: Plan) -> tuple[Tensor, Tensor]:
@@ -123,15 +127,15 @@ def _trunk(plan: Plan, people: People, drift: Tensor, fore: Tensor, load: Tensor
         @ about_x(people.lean + 0.04 * pace + 1.0 * plan.crouch + 0.025 * drift[..., 3] + pitch)
         @ about_z(-0.03 * load + 0.02 * drift[..., 4] + roll)
     )
-    bodies = _Bodies(people.rest, {0: pelvis}, {0: torch.zeros_like(plan.gaze)})
-    bodies.attach(1, 0)
-    bodies.attach(2, 0)
+    bodies = _Bodies(people.rest, {PELVIS: pelvis}, {PELVIS: torch.zeros_like(plan.gaze)})
+    bodies.attach(L_HIP, PELVIS)
+    bodies.attach(R_HIP, PELVIS)
     bend = pelvis.transpose(-1, -2) @ chest
-    bodies.attach(3, 0, pelvis @ fraction(bend, 0.3))
-    bodies.attach(6, 3, pelvis @ fraction(bend, 0.65))
-    bodies.attach(9, 6, chest)
-    for joint in (12, 13, 14):
-        bodies.attach(joint, 9)
+    bodies.attach(SPINE1, PELVIS, pelvis @ fraction(bend, 0.3))
+    bodies.attach(SPINE2, SPINE1, pelvis @ fraction(bend, 0.65))
+    bodies.attach(SPINE3, SPINE2, chest)
+    for joint in (NECK, *COLLARS):
+        bodies.attach(joint, SPINE3)
     return bodies
 
 
@@ -139,7 +143,7 @@ def _feet(plan: Plan, people: People, bodies: _Bodies) -> list[Tensor]:
     """Rotations of both feet and toes; where their ankles are. [(T, P, 3)] * 2"""
     ankles = []
     for foot in (0, 1):
-        ankle, ball = 7 + foot, 10 + foot
+        ankle, ball = ANKLES[foot], TOES[foot]
         heel_up, toes_up = plan.feet.heel_up[..., foot], plan.feet.toes_up[..., foot]
         heading = about_y(plan.feet.yaw[..., foot])
         to_ankle = people.rest[:, ankle] - people.rest[:, ball]
@@ -164,24 +168,24 @@ def _stand(plan: Plan, people: People, bodies: _Bodies, ankles: list[Tensor], dr
     pelvis = torch.stack([ground[..., 0], torch.zeros_like(plan.yaw), ground[..., 1]], dim=-1)
     ceilings = []
     for foot in (0, 1):
-        hip, knee, ankle = 1 + foot, 4 + foot, 7 + foot
+        hip, knee, ankle = HIPS[foot], KNEES[foot], ANKLES[foot]
         leg = (bodies.bone(hip, knee).norm(dim=-1) + bodies.bone(knee, ankle).norm(dim=-1)) * STRETCH
         away = ankles[foot] - (pelvis + bodies.t[hip])
         flat = away[..., 0] ** 2 + away[..., 2] ** 2
         ceilings.append(ankles[foot][..., 1] + (leg**2 - flat).clamp_min(0.01).sqrt() - bodies.t[hip][..., 1])
     height = under(torch.minimum(*ceilings), 3) - plan.crouch
     pelvis = pelvis + height[..., None] * torch.tensor([0.0, 1.0, 0.0], dtype=height.dtype)
-    for joint in (0, 1, 2, 3, 6, 9, 12, 13, 14):
+    for joint in (PELVIS, *HIPS, SPINE1, SPINE2, SPINE3, NECK, *COLLARS):
         bodies.t[joint] = bodies.t[joint] + pelvis
 
 
 def _leg(plan: Plan, bodies: _Bodies, foot: int, ankle: Tensor) -> None:
-    hip, knee = 1 + foot, 4 + foot
+    hip, knee = HIPS[foot], KNEES[foot]
     side = 1 - 2 * foot
     middle = plan.yaw + 0.6 * (plan.feet.yaw[..., foot] - plan.yaw) + 0.06 * side
     # Knees lead over the feet: forward and a little up, so that a raised thigh still has a side to bend to.
     bend = torch.stack([middle.sin(), torch.full_like(middle, 0.2), middle.cos()], dim=-1)
-    rest = (bodies.bone(hip, knee), bodies.bone(knee, 7 + foot))
+    rest = (bodies.bone(hip, knee), bodies.bone(knee, ANKLES[foot]))
     hinge = torch.tensor([1.0, 0.0, 0.0], dtype=ankle.dtype)
     bodies.R[hip], bodies.R[knee] = two_bones(bodies.t[hip], ankle, bend, rest, hinge)
 
@@ -189,8 +193,8 @@ def _leg(plan: Plan, bodies: _Bodies, foot: int, ankle: Tensor) -> None:
 def _arm(plan: Plan, people: People, bodies: _Bodies, hand: int, scissor: Tensor, drift: Tensor) -> None:
     """Hanging and swinging against the legs, making a gesture, or bringing the palm to its place."""
     side = 1 - 2 * hand
-    collar, shoulder, elbow, wrist = 13 + hand, 16 + hand, 18 + hand, 20 + hand
-    chest = bodies.R[9]
+    collar, shoulder, elbow, wrist = COLLARS[hand], SHOULDERS[hand], ELBOWS[hand], WRISTS[hand]
+    chest = bodies.R[SPINE3]
     upper, lower = bodies.bone(shoulder, elbow), bodies.bone(elbow, wrist)
     bodies.attach(shoulder, collar)
     swing = -side * people.arm_swing * scissor + 0.05 * drift[..., 0] - 0.04
@@ -269,9 +273,9 @@ def _share(rotation: Tensor, weight: Tensor) -> Tensor:
 
 def _head(plan: Plan, bodies: _Bodies, drift: Tensor) -> None:
     """Neck and head share the turn toward what the eyes rest on."""
-    chest = bodies.R[9]
-    bodies.attach(15, 12)
-    gaze = rotate(chest.transpose(-1, -2), plan.gaze - bodies.t[15])
+    chest = bodies.R[SPINE3]
+    bodies.attach(HEAD, NECK)
+    gaze = rotate(chest.transpose(-1, -2), plan.gaze - bodies.t[HEAD])
     yaw = torch.atan2(gaze[..., 0], gaze[..., 2])
     level = gaze[..., [0, 2]].norm(dim=-1)
     # A sine: far enough aside, people no longer turn their heads that way; never a flip behind the back.
@@ -279,13 +283,13 @@ def _head(plan: Plan, bodies: _Bodies, drift: Tensor) -> None:
     pitch = 0.7 * torch.tanh(torch.atan2(-gaze[..., 1], level) / 0.7) + 0.03 * drift[..., 1]
     roll = 0.03 * drift[..., 2]
     yaw, pitch, roll = (smooth(angle, 3.0) for angle in (yaw, pitch, roll))
-    bodies.R[12] = chest @ about_y(0.4 * yaw) @ about_x(0.35 * pitch) @ about_z(0.5 * roll)
-    bodies.attach(15, 12)
-    bodies.R[15] = chest @ about_y(yaw) @ about_x(pitch) @ about_z(roll)
+    bodies.R[NECK] = chest @ about_y(0.4 * yaw) @ about_x(0.35 * pitch) @ about_z(0.5 * roll)
+    bodies.attach(HEAD, NECK)
+    bodies.R[HEAD] = chest @ about_y(yaw) @ about_x(pitch) @ about_z(roll)
 
 
 def _local(bodies: _Bodies) -> Tensor:
     """World rotations to rotations relative to the parents. -> (T, P, 21, 3, 3)"""
-    shape = bodies.R[0].shape
-    R = torch.stack([bodies.R[j].expand(shape) for j in range(22)], dim=-3)
+    shape = bodies.R[PELVIS].shape
+    R = torch.stack([bodies.R[j].expand(shape) for j in range(BODY_JOINTS)], dim=-3)
     return R[..., list(PARENTS[1:]), :, :].transpose(-1, -2) @ R[..., 1:, :, :]

@@ -13,6 +13,7 @@ from magnet.motion.scene import Scene
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
+    from magnet.tokenizer.module import Tokenizer
 
 
 def random_scene(
@@ -57,18 +58,40 @@ def without_absent(scene: Scene) -> Scene:
     )
 
 
+TINY_TOKENIZER = {"network": {"width": 16, "depth": 1}, "quantizer": {"codebook_dim": 16, "codebook_size": 32}}
+TINY_DENOISER = {"network": {"width": 32, "layers": 2, "heads": 2, "mlp_ratio": 2, "dropout": 0.0}}
+
+
+def tiny_tokenizer(seed: int = 0, **options: Any) -> Tokenizer:
+    """A tokenizer of a few thousand weights, whose codebook is set; groups of options as dictionaries."""
+    from magnet.tokenizer.module import Tokenizer
+
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        tokenizer = Tokenizer(**_grouped(TINY_TOKENIZER, options))
+        tokenizer.init_codebook([random_scene(4, 32, 2, torch.Generator().manual_seed(seed))])
+    return tokenizer
+
+
 def tiny_denoiser(max_agents: int = 3, window: int = 8, seed: int = 0, **options: Any) -> Denoiser:
-    """An untrained denoiser of a few thousand weights, with a tokenizer whose codebook is set."""
+    """An untrained denoiser of a few thousand weights, with a tokenizer whose codebook is set.
+
+    Options are those of `Denoiser`, groups as dictionaries: `network={"layers": 1}`.
+    """
     from magnet.denoiser.module import Denoiser
     from magnet.tokenizer.module import Tokenizer
 
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
+        tokenizer = Tokenizer(**_grouped(TINY_TOKENIZER, {}))
         generator = torch.Generator().manual_seed(seed)
         tokenizer.init_codebook([random_scene(4, 32, 2, generator)])
-        sizes = {"width": 32, "layers": 2, "heads": 2, "mlp_ratio": 2, "dropout": 0.0}
-        model = Denoiser(max_agents=max_agents, window=window, **{**sizes, **options})
+        model = Denoiser(max_agents=max_agents, window=window, **_grouped(TINY_DENOISER, options))
         model.build(tokenizer)
         model.fit_normalizer(*model.tokenize(random_scene(4, 32, max_agents, generator)))
     return model.eval()
+
+
+def _grouped(small: dict[str, dict[str, Any]], options: dict[str, Any]) -> dict[str, Any]:
+    """Options over small sizes, group by group."""
+    return {**small, **{k: {**small[k], **v} if k in small else v for k, v in options.items()}}

@@ -15,7 +15,7 @@ from torch import Tensor
 from magnet.generation.conditioning import task_lookahead_limit
 from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
@@ -55,7 +55,7 @@ def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> l
     if not schedule.causal:
         return []
     generator = torch.Generator().manual_seed(3)
-    scene, other = (random_scene(1, grid.tokens * STRIDE, grid.agents, generator) for _ in range(2))
+    scene, other = (random_scene(1, grid.tokens * TOKEN_FRAMES, grid.agents, generator) for _ in range(2))
     sizes = {each.name for each in dataclasses.fields(Grid)} & {
         each.name for each in dataclasses.fields(SamplerOptions)
     }
@@ -72,9 +72,9 @@ def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> l
             changed = run(replaced(scene, other, late), end, secret & ~schedule.known)
             for agent in (unseen == secret).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 parts = [(plain.body_rot, changed.body_rot), (plain.T_world_root, changed.T_world_root)]
-                if not all(torch.equal(*(x[:, : end * STRIDE, agent] for x in pair)) for pair in parts):
+                if not all(torch.equal(*(x[:, : end * TOKEN_FRAMES, agent] for x in pair)) for pair in parts):
                     raise AssertionError(
-                        f"{task} on {grid}: poses of agent {agent} before frame {end * STRIDE} depend on what it does "
+                        f"{task} on {grid}: poses of agent {agent} before frame {end * TOKEN_FRAMES} depend on what it "
                         "not know by then"
                     )
     return [blocks[number][1] for number in sorted(chosen)]
@@ -131,7 +131,7 @@ class Run:
 
     def __call__(self, scene: Scene, rows: int, other: Tensor | None = None) -> Scene:
         """The first rows, and some more. other (N, P) bool, tokens whose noise is another one"""
-        context, frames = self.grid.context * STRIDE, (self.grid.tokens - self.grid.context) * STRIDE
+        context, frames = self.grid.context * TOKEN_FRAMES, (self.grid.tokens - self.grid.context) * TOKEN_FRAMES
         generator = torch.Generator().manual_seed(4)
         stream = Rollout(self.model, scene, self.task, context, frames, 1, self.options, generator, None, None, chunk=1)
         if other is not None:
@@ -141,7 +141,7 @@ class Run:
 
 def replaced(scene: Scene, other: Scene, tokens: Tensor) -> Scene:
     """A scene that goes on otherwise: as the other in some tokens. tokens (N, P) bool"""
-    there = tokens.repeat_interleave(STRIDE, dim=0)[None, :, :, None, None]
+    there = tokens.repeat_interleave(TOKEN_FRAMES, dim=0)[None, :, :, None, None]
     return scene.replace(
         body_rot=torch.where(there[..., None], other.body_rot, scene.body_rot),
         T_world_root=torch.where(there, other.T_world_root, scene.T_world_root),

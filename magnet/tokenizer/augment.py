@@ -6,8 +6,7 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.scene import Scene
-from magnet.tokenizer.losses import FPS
+from magnet.motion.scene import FPS, Scene
 
 LIMBS = {
     "left leg": (1, 4, 7, 10),

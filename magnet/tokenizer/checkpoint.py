@@ -13,8 +13,21 @@ from torch import Tensor
 from magnet import weights
 from magnet.old_names import renamed_checkpoint
 
-SHAPING = ("latent", "hidden", "codes", "levels", "depth", "causal")
-"""Fields that decide the shape of the weights, or what they mean."""
+SHAPING = {
+    "network": ("width", "depth", "causal"),
+    "quantizer": ("kind", "codebook_size", "codebook_dim", "num_quantizers", "levels"),
+}
+"""Options that decide the shape of the weights, or what they mean, by their groups."""
+
+
+def shaping(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of `SHAPING` that some fields hold, by flag: `network.width`."""
+    found: dict[str, Any] = {}
+    for group, names in SHAPING.items():
+        said = fields.get(group) or {}
+        found |= {f"{group}.{name}": said[name] for name in names if name in said}
+    unused = ("levels",) if found.get("quantizer.kind") != "fsq" else SHAPING["quantizer"][1:4]
+    return {name: value for name, value in found.items() if name.removeprefix("quantizer.") not in unused}
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -52,12 +65,18 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 
 def check_fields(stored: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
     """Raises ValueError where a checkpoint's fields make other weights than `mine`."""
-    for name in SHAPING:
-        if name in stored and stored[name] != mine[name]:
+    own = shaping(mine)
+    for name, there in shaping(stored).items():
+        if name in own and plain_value(there) != plain_value(own[name]):
             raise ValueError(
-                f"{name}: the checkpoint's tokenizer has {stored[name]}, this one {mine[name]}; "
-                f"give --model.{name} {stored[name]}, or start without the checkpoint"
+                f"{name}: the checkpoint's tokenizer has {there}, this one {own[name]}; "
+                f"give --model.{name} {there}, or start without the checkpoint"
             )
+
+
+def plain_value(value: Any) -> Any:
+    """Tuples as the lists that files make of them."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def check_weights(path: Path, state: Mapping[str, Tensor], expected: Mapping[str, Tensor], fields: object) -> None:

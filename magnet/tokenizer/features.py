@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, pose_features, posed
 from magnet.motion.scene import Scene, require_rate
-from magnet.motion.tokens import STRIDE, scene_deltas
+from magnet.motion.tokens import TOKEN_FRAMES, scene_deltas
 from magnet.tokenizer.quantizer import sum_over_processes
 
 
@@ -33,14 +33,14 @@ def features(scene: Scene) -> Features:
         ValueError: another frame rate than the model's.
     """
     require_rate(scene)
-    scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
+    scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
     # Mixed precision would round the products of transforms.
     with torch.autocast(scene.device.type, enabled=False):
         pose, steps = pose_features(scene), scene_deltas(scene)
     counts = scene.present[:, None].expand(pose.shape[:3])
     if scene.valid is not None:
         counts = counts & scene.valid[..., None]
-    tokens = counts.unflatten(1, (-1, STRIDE)).all(dim=2)
+    tokens = counts.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=2)
     return Features(pose, steps, scene.betas, counts, tokens, scene.valid)
 
 

@@ -8,19 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.body.joints import FEET, TOES
 from magnet.motion.frames import from_9d
 from magnet.motion.rotations import from_6d, geodesic
-
-FPS = 30.0
-"""Frames a second of every training window."""
-
-FEET = (7, 8, 10, 11)
-"""Ankles and toes."""
-
-TOES = (10, 11)
+from magnet.motion.scene import FPS
 
 STANDS = (0.05, 0.2)
 """Height in metres and speed in m/s under which a recorded toe stands."""
+
+JOINT_LOSSES = ("joint", "velocity", "foot_velocity", "foot_contact")
+"""Terms that need joints, and so a body."""
 
 BODY = 21 * 6
 """Where the 21 joint rotations of a pose end and T_can_root begins."""
@@ -40,8 +37,12 @@ def matrices(pose: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean over the entries (...) of a mask, of values (..., any): what is masked out may even be NaN."""
+    """Mean over what counts, whatever the rest holds, even NaN; 0 where nothing counts.
+
+    values (..., any), mask (...) bool; a mask with as many axes as the values broadcasts to them.
+    """
     values = values.flatten(mask.ndim).mean(-1) if values.ndim > mask.ndim else values
+    mask = mask.expand_as(values)
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
@@ -62,16 +63,16 @@ def reconstruction_losses(
         truth: the same of the recording.
         mask: (B, T, P) bool, the frames that count.
         joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`,
-            `velocity` and `foot` (ours).
-        steps: (B, T, P, 9) canonical steps that the decoder was given; adds `stance` (ours).
+            `velocity` and `foot_velocity` (ours).
+        steps: (B, T, P, 9) canonical steps that the decoder was given; adds `foot_contact` (ours).
         true_steps: the same of the recording.
 
     Returns:
-        body: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of the
-        joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that
-        flicker cost nothing else, and are what an eye sees first. foot: the same of ankles and toes alone, whose
-        flicker is seen as sliding. stance: error over the ground of the velocities of toes that stand in the recording,
-        m/s, on the way that the given steps lead.
+        joint_rotation: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of
+        the joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that flicker
+        cost nothing else, and are what an eye sees first. foot_velocity: the same of ankles and toes alone, whose
+        flicker is seen as sliding. foot_contact: error of the velocities over the ground of toes that stand in the
+        recording, m/s, on the way that the given steps lead.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -80,7 +81,7 @@ def reconstruction_losses(
     turn = geodesic(T_can_root[..., :3, :3], true_T_can_root[..., :3, :3])
     both = mask[:, 1:] & mask[:, :-1]
     losses = {
-        "body": masked_mean(_huber(angle), mask),
+        "joint_rotation": masked_mean(_huber(angle), mask),
         "root_rotation": masked_mean(_huber(turn), mask),
         "root_translation": masked_mean(_huber(T_can_root[..., :3, 3] - true_T_can_root[..., :3, 3]), mask),
     }
@@ -90,10 +91,10 @@ def reconstruction_losses(
         losses["joint"] = masked_mean(length(away), mask)
         slip = FPS * length(away.diff(dim=1))
         losses["velocity"] = masked_mean(slip, both)
-        losses["foot"] = masked_mean(slip[..., FEET], both)
+        losses["foot_velocity"] = masked_mean(slip[..., FEET], both)
         if steps is not None and true_steps is not None:
             slide = (world_velocity(mine, steps) - world_velocity(real, true_steps))[..., TOES, :]
-            losses["stance"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_steps))
+            losses["foot_contact"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_steps))
     return losses
 
 

@@ -15,19 +15,23 @@ from torchmetrics import MeanMetric
 
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, by_token
+from magnet.motion.tokens import TOKEN_FRAMES, by_token
 from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
 from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
-from magnet.tokenizer.checkpoint import SHAPING, check_fields, check_weights, read_checkpoint
+from magnet.tokenizer.base import Quantized
+from magnet.tokenizer.checkpoint import check_fields, check_weights, read_checkpoint, shaping
 from magnet.tokenizer.features import Features, features, fold, put, statistics, step_known, unfold
-from magnet.tokenizer.losses import masked_mean, matrices, orthonormalize, reconstruction_losses
-from magnet.tokenizer.quantizer import KMEANS_VECTORS, Quantized, ResidualVQ
+from magnet.tokenizer.fsq import FSQ
+from magnet.tokenizer.losses import JOINT_LOSSES, masked_mean, matrices, orthonormalize, reconstruction_losses
+from magnet.tokenizer.options import AugmentOptions, AutoencoderOptions, QuantizerOptions, TokenizerLoss
+from magnet.tokenizer.quantizer import KMEANS_VECTORS, ResidualVQ
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_level
 from magnet.tokenizer.vqvae import VQVAE
 from magnet.training.optim import adamw_cosine
+from magnet.training.options import OptimizerOptions, group_of, plain
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -39,83 +43,66 @@ GLANCE = 4
 """Scenes of a training batch whose joint error is logged: enough for a curve, at no cost."""
 
 
+def make_quantizer(options: QuantizerOptions) -> ResidualVQ | FSQ:
+    """The quantizer of some options; a new kind has its line here and its file beside `fsq.py`."""
+    if options.kind == "fsq":
+        return FSQ(options.levels)
+    return ResidualVQ(
+        options.codebook_size,
+        options.codebook_dim,
+        options.num_quantizers,
+        options.ema_decay,
+        options.dead_code_threshold,
+    )
+
+
 class Tokenizer(L.LightningModule):
     """Conditional VQ-VAE of one person's pose: four frames are one code (paper 3.1, Table A.2).
 
     Args:
-        latent: numbers in a code, paper Table A.2.
-        hidden: channels of the convolutions, paper Table A.2.
-        codes: size of the codebook, paper Table A.2.
-        levels: codebooks in a row, each coding what the ones before left over (ours); the paper has 1.
-        depth: residual blocks in each of the two stages; the paper does not say.
-        causal: no token sees later frames, so tokens of a growing clip never change (ours, for streaming).
-        decay: of the moving average that the codes follow.
-        revive_below: a code chosen less often than this a batch is moved to a vector of the batch.
-        body_weight: lambda_j of paper Eq. 4, on the mean over the joints.
-        root_rotation_weight: lambda_r of paper Eq. 4, on the rotation of Eq. 5.
-        root_translation_weight: lambda_r of paper Eq. 4, on the translation of Eq. 5.
-        commitment_weight: pulls embeddings to their codes; the paper does not say.
-        joint_weight: adds the distance of the joints in metres to the loss (ours).
-        velocity_weight: adds the error of the joints' velocities in m/s to the loss, against flicker (ours).
-        foot_weight: adds the error of ankles' and toes' velocities in m/s to the loss, against sliding feet (ours).
-        stance_weight: adds the speed at which toes slide that stand in the recording, in m/s, on the way that the
-            decoder is given (ours).
-        drift: in training the steps that the decoder is given lead astray by up to so many m/s, as sampled ones do;
-            with a stance_weight it learns to keep feet where they stand (ours).
-        exchange_limbs: share of limbs that in training move as somebody else's of the batch do (ours).
-        turn_joints: radians by which joints are turned at random in training (ours); with exchanged limbs it
-            keeps a small data set from being learnt by heart.
+        network: encoder and decoder.
+        quantizer: what makes codes of the encoder's output.
+        loss: weights of the terms.
+        augment: what is changed in training batches.
+        optimizer: AdamW.
         start_from: checkpoint of a tokenizer, or of a denoiser with one, or the name of a shipped model such as `duet`,
             whose encoder and decoder training starts from; codes start anew where there is another number of them.
         decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
             trained on them takes the new decoder as it is.
-        learning_rate: paper A.3.
-        weight_decay: paper A.3.
-        warmup_steps: linear warm-up; the rate then falls to zero on a cosine (paper A.3).
         compile: compile encoder and decoder for training; worth it on a GPU, not on a CPU.
         seed: the start and the revival of codes follow from it.
     """
 
     def __init__(
         self,
-        latent: int = 512,
-        hidden: int = 512,
-        codes: int = 1024,
-        levels: int = 1,
-        depth: int = 3,
-        causal: bool = False,
-        decay: float = 0.99,
-        revive_below: float = 1.0,
-        body_weight: float = 1.0,
-        root_rotation_weight: float = 0.5,
-        root_translation_weight: float = 0.5,
-        commitment_weight: float = 0.3,
-        joint_weight: float = 0.0,
-        velocity_weight: float = 0.0,
-        foot_weight: float = 0.0,
-        stance_weight: float = 0.0,
-        drift: float = 0.0,
-        exchange_limbs: float = 0.0,
-        turn_joints: float = 0.0,
+        network: AutoencoderOptions = AutoencoderOptions(),
+        quantizer: QuantizerOptions = QuantizerOptions(),
+        loss: TokenizerLoss = TokenizerLoss(),
+        augment: AugmentOptions = AugmentOptions(),
+        optimizer: OptimizerOptions = OptimizerOptions(),
         start_from: str | None = None,
         decoder_only: bool = False,
-        learning_rate: float = 2e-4,
-        weight_decay: float = 1e-4,
-        warmup_steps: int = 0,
         compile: bool = False,
         seed: int = 1111,
     ) -> None:
-        fields = {name: value for name, value in locals().items() if name in _fields()}
         super().__init__()
+        self.network = network = group_of(AutoencoderOptions, network)
+        options = group_of(QuantizerOptions, quantizer)
+        self.loss, self.augment = group_of(TokenizerLoss, loss), group_of(AugmentOptions, augment)
+        self.optimizer = group_of(OptimizerOptions, optimizer)
+        groups = {"network": network, "quantizer": options, "loss": self.loss, "augment": self.augment}
+        rest = {"start_from": start_from, "decoder_only": decoder_only, "compile": compile, "seed": seed}
         # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
-        self.save_hyperparameters(fields)
-        self.latent = latent
-        self.vqvae = VQVAE(POSE_FEATURES, latent, hidden, depth, causal, STRIDE)
-        self.quantizer = ResidualVQ(codes, latent, levels, decay, revive_below)
+        self.save_hyperparameters(plain({**groups, "optimizer": self.optimizer, **rest}))
+        self.quantizer = made = make_quantizer(options)
+        self.codebook_dim = made.dim
+        self.vqvae = VQVAE(
+            POSE_FEATURES, made.dim, network.width, network.depth, network.causal, TOKEN_FRAMES, made.unit_input
+        )
         self.body: Body | None = None
         self.mpjpe = MeanMetric()
         self.local_mpjpe = MeanMetric()
-        self.code_use = CodeUse(levels, codes)
+        self.code_use = CodeUse(made.num_quantizers, made.size)
 
     # -- using it ------------------------------------------------------------------------------
 
@@ -134,8 +121,8 @@ class Tokenizer(L.LightningModule):
         Returns:
             (B, N, P, C) float32.
         """
-        embedded = self.embed(pose, betas, steps, valid)
-        return self.quantizer.nearest(embedded) if quantize else embedded.float()
+        latent = self.quantizer.continuous(self.embed(pose, betas, steps, valid))
+        return self.quantizer.nearest(latent) if quantize else latent
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
         """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
@@ -145,14 +132,19 @@ class Tokenizer(L.LightningModule):
         """
         if window is None or latent.shape[1] <= window:
             return self._reconstruct(latent, betas, steps)
-        before, after = self.vqvae.decoder.receptive_field
+        before, after = self.receptive_field
         parts = []
         for start in range(0, latent.shape[1], window):
             first = max(start - before, 0)
             near = slice(first, start + window + after)
             frames = self._reconstruct(latent[:, near], betas, steps[:, near])
-            parts.append(frames[:, (start - first) * STRIDE : (start - first + window) * STRIDE])
+            parts.append(frames[:, (start - first) * TOKEN_FRAMES : (start - first + window) * TOKEN_FRAMES])
         return torch.cat(parts, dim=1)
+
+    @property
+    def receptive_field(self) -> tuple[int, int]:
+        """Tokens before and after its own that a latent or a decoded frame can depend on."""
+        return self.vqvae.decoder.receptive_field  # the encoder's is no larger
 
     def requantize(self, latent: Tensor) -> Tensor:
         """The code nearest to each latent; with several levels, their sum. (..., C) -> same"""
@@ -165,7 +157,7 @@ class Tokenizer(L.LightningModule):
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
-        scene = scene.slice(0, scene.frames - scene.frames % STRIDE)
+        scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
         seen = features(scene)
         latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
         return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
@@ -173,8 +165,10 @@ class Tokenizer(L.LightningModule):
     def embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
         """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
         B, T, P, _ = pose.shape
-        if T % STRIDE:
-            raise ValueError(f"{T} frames are not a whole number of tokens of {STRIDE} frames; cut the clip first")
+        if T % TOKEN_FRAMES:
+            raise ValueError(
+                f"{T} frames are not a whole number of tokens of {TOKEN_FRAMES} frames; cut the clip first"
+            )
         known = pose.new_ones(B, T, 2, dtype=torch.bool)
         if valid is not None:
             known = torch.stack([valid, step_known(valid)], dim=-1)
@@ -184,7 +178,9 @@ class Tokenizer(L.LightningModule):
 
     def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
         P = latent.shape[2]
-        known = None if valid is None else step_known(valid).unflatten(1, (-1, STRIDE)).repeat_interleave(P, dim=0)
+        known = (
+            None if valid is None else step_known(valid).unflatten(1, (-1, TOKEN_FRAMES)).repeat_interleave(P, dim=0)
+        )
         pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
         with torch.autocast(pose.device.type, enabled=False):
             return orthonormalize(unfold(pose, latent))
@@ -264,11 +260,11 @@ class Tokenizer(L.LightningModule):
         self.load_state_dict(kept, strict=False)
 
     def augmented(self, scene: Scene, batch_idx: int) -> Scene:
-        h = self.hparams
+        augment = self.augment
         generator = self._generator("augment", self.global_step, batch_idx)
-        if h["exchange_limbs"]:
-            scene = swap_limbs(scene, h["exchange_limbs"], generator)
-        return joint_noise(scene, h["turn_joints"], generator) if h["turn_joints"] else scene
+        if augment.limb_swap_prob:
+            scene = swap_limbs(scene, augment.limb_swap_prob, generator)
+        return joint_noise(scene, augment.joint_noise, generator) if augment.joint_noise else scene
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         batch = self.augmented(batch, batch_idx)
@@ -287,20 +283,19 @@ class Tokenizer(L.LightningModule):
 
     def losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
-        h = self.hparams
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not h["decoder_only"]):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.hparams["decoder_only"]):
             embedded = self.embed(seen.pose, seen.betas, seen.steps, seen.valid)
         quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         steps = seen.steps
-        if self.training and h["drift"]:
-            steps = root_noise(steps, h["drift"], self._generator("drift", self.global_step, batch_idx))
+        if self.training and self.augment.root_noise:
+            steps = root_noise(steps, self.augment.root_noise, self._generator("drift", self.global_step, batch_idx))
         pose = self._reconstruct(quantized.latent, seen.betas, by_token(steps), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
-            bodies = any(h[f"{name}_weight"] for name in ("joint", "velocity", "foot", "stance"))
-            joints = self._canonical_joints(seen) if bodies else None
+            joints = self._canonical_joints(seen) if any(getattr(self.loss, name) for name in JOINT_LOSSES) else None
             losses = reconstruction_losses(pose, seen.pose, seen.counts, joints, steps, seen.steps)
         losses["commitment"] = quantized.commitment
-        return {"loss": sum(h[f"{name}_weight"] * value for name, value in losses.items()), **losses}, pose, quantized
+        total = sum(getattr(self.loss, name) * value for name, value in losses.items())
+        return {"loss": total, **losses}, pose, quantized
 
     def _canonical_joints(self, seen: Features):  # type: ignore[no-untyped-def]
         body = self._require_body()
@@ -357,10 +352,8 @@ class Tokenizer(L.LightningModule):
         self.code_use.reset()
 
     def configure_optimizers(self) -> Any:
-        h = self.hparams
-        rates = (h["learning_rate"], h["weight_decay"], h["warmup_steps"])
-        trained = self.vqvae.decoder if h["decoder_only"] else self.vqvae
-        return adamw_cosine(self, trained.parameters(), *rates)
+        trained = self.vqvae.decoder if self.hparams["decoder_only"] else self.vqvae
+        return adamw_cosine(self, trained.parameters(), self.optimizer)
 
     # -- freezing and loading ------------------------------------------------------------------
 
@@ -385,7 +378,7 @@ class Tokenizer(L.LightningModule):
         fields = {name: value for name, value in fields.items() if name in _fields()}
         tokenizer = cls(**fields)
         expected = tokenizer.state_dict()
-        check_weights(Path(path), state, expected, {name: tokenizer.hparams[name] for name in SHAPING})
+        check_weights(Path(path), state, expected, shaping(tokenizer.hparams))
         tokenizer.load_state_dict({name: state[name] for name in expected})
         return tokenizer.eval()
 

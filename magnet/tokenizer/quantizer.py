@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.precision import Float32
+from magnet.tokenizer.base import Quantized
 
 KMEANS_ROUNDS = 10
 KMEANS_VECTORS = 8
 """Vectors a code, over all processes, that the k-means start looks at; more only cost time."""
 
 CROWD = 4.0
-"""With at least this many vectors a code in a batch, `revive_below` means what it says."""
-
-
-@dataclass(frozen=True)
-class Quantized:
-    """What a codebook makes of vectors (..., D)."""
-
-    latent: Tensor  # (..., D) sum of the chosen codes; gradients pass straight to the vectors
-    index: Tensor  # (..., levels) int, the code chosen at each level; -1 where masked out
-    commitment: Tensor  # () mean squared distance from a vector to its code, gradient to the vectors only
-    counts: Tensor  # (levels, codes) how often each code was chosen, over all processes in training
+"""With at least this many vectors a code in a batch, `dead_code_threshold` means what it says."""
 
 
 class ResidualVQ(Float32):
@@ -38,30 +27,36 @@ class ResidualVQ(Float32):
     holds the same bits.
 
     Args:
-        codes: codes a level, paper Table A.2.
-        dim: numbers in a code, paper Table A.2.
-        levels: 1 is the paper's single codebook.
-        decay: of the moving averages.
-        revive_below: a code whose average count a batch falls below this is moved to a vector of the batch. With
+        codebook_size: codes a level, paper Table A.2.
+        codebook_dim: numbers in a code, paper Table A.2.
+        num_quantizers: levels; 1 is the paper's single codebook.
+        ema_decay: of the moving averages.
+        dead_code_threshold: a code whose average count a batch falls below this is moved to a vector of the batch. With
             fewer than 4 vectors a code in a batch the bar is lowered in proportion, or small batches would
             keep throwing good codes away (ours).
     """
 
+    unit_input = True
     codes: Tensor  # (levels, codes, D)
     ema_count: Tensor  # (levels, codes)
     ema_sum: Tensor  # (levels, codes, D)
     initialized: Tensor  # () bool
 
     def __init__(
-        self, codes: int = 1024, dim: int = 512, levels: int = 1, decay: float = 0.99, revive_below: float = 1.0
+        self,
+        codebook_size: int = 1024,
+        codebook_dim: int = 512,
+        num_quantizers: int = 1,
+        ema_decay: float = 0.99,
+        dead_code_threshold: float = 1.0,
     ) -> None:
         super().__init__()
-        self.size, self.dim, self.levels = codes, dim, levels
-        self.decay, self.revive_below = decay, revive_below
+        self.size, self.dim, self.num_quantizers = codebook_size, codebook_dim, num_quantizers
+        self.ema_decay, self.dead_code_threshold = ema_decay, dead_code_threshold
         self.frozen = False
-        self.register_buffer("codes", torch.zeros(levels, codes, dim))
-        self.register_buffer("ema_count", torch.ones(levels, codes))
-        self.register_buffer("ema_sum", torch.zeros(levels, codes, dim))
+        self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
+        self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
+        self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
         self.register_buffer("initialized", torch.tensor(False))
 
     # -- looking up ----------------------------------------------------------------------------
@@ -84,7 +79,7 @@ class ResidualVQ(Float32):
                 self.kmeans_init(flat.detach()[keep], generator)
             residual, latent = flat, torch.zeros_like(flat)
             index, commitment, counts = [], flat.new_zeros(()), []
-            for level in range(self.levels):
+            for level in range(self.num_quantizers):
                 chosen = self._nearest(residual.detach(), level)
                 code = self.codes[level][chosen]
                 distance = (residual - code).square().mean(-1)
@@ -96,10 +91,14 @@ class ResidualVQ(Float32):
                 latent = flat + (latent - flat).detach()
             return Quantized(
                 latent=latent.view(vectors.shape),
-                index=torch.stack(index, dim=-1).view(*vectors.shape[:-1], self.levels),
-                commitment=commitment / self.levels,
+                index=torch.stack(index, dim=-1).view(*vectors.shape[:-1], self.num_quantizers),
+                commitment=commitment / self.num_quantizers,
                 counts=torch.stack(counts),
             )
+
+    def continuous(self, vectors: Tensor) -> Tensor:
+        """The vectors as they are: codes lie among them."""
+        return vectors.float()
 
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
@@ -107,7 +106,7 @@ class ResidualVQ(Float32):
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
             latent = torch.zeros_like(residual)
-            for level in range(self.levels):
+            for level in range(self.num_quantizers):
                 code = self.codes[level][self._nearest(residual, level)]
                 latent, residual = latent + code, residual - code
             return latent.view(vectors.shape)
@@ -137,11 +136,11 @@ class ResidualVQ(Float32):
         summed = sum_over_processes(torch.cat([count[:, None], total], dim=1))
         count, total = summed[:, 0], summed[:, 1:]
         several = count.sum()
-        decay = torch.where(several > 0, self.decay, 1.0)
+        decay = torch.where(several > 0, self.ema_decay, 1.0)
         ema_count = decay * self.ema_count[level] + (1 - decay) * count
         ema_sum = decay * self.ema_sum[level] + (1 - decay) * total
 
-        least = self.revive_below * (several / (CROWD * self.size)).clamp(max=1.0)
+        least = self.dead_code_threshold * (several / (CROWD * self.size)).clamp(max=1.0)
         dead = ema_count < least
         fresh = self._picks(vectors, keep, generator)
         # Just enough weight to stay if the coming batches choose it.
@@ -177,7 +176,7 @@ class ResidualVQ(Float32):
         if not len(pool):
             return
         pool = _some(pool, KMEANS_VECTORS * self.size, generator)
-        for level in range(self.levels):
+        for level in range(self.num_quantizers):
             codes = _broadcast(_kmeans(pool, self.size, generator))
             self.codes[level] = codes
             pool = pool - codes[_nearest(pool, codes)]

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, by_frame, by_token
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token
 from magnet.tokenizer.features import features, statistics
 from magnet.tokenizer.losses import orthonormalize
 from magnet.tokenizer.normalizer import Normalizer
@@ -17,7 +17,8 @@ from magnet.tokenizer.normalizer import Normalizer
 class RawPose(nn.Module):
     """Stands in for a tokenizer: the latent is the z-scored pose of four frames, 540 numbers. Nothing to train."""
 
-    latent: int = STRIDE * POSE_FEATURES
+    codebook_dim: int = TOKEN_FRAMES * POSE_FEATURES
+    receptive_field = (0, 0)
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,7 +36,7 @@ class RawPose(nn.Module):
 
     def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
         """(B, N, P, 540) -> (B, T, P, 135); the rest is not read."""
-        return orthonormalize(self.pose.denormalize(by_frame(latent.unflatten(-1, (STRIDE, POSE_FEATURES)))))
+        return orthonormalize(self.pose.denormalize(by_frame(latent.unflatten(-1, (TOKEN_FRAMES, POSE_FEATURES)))))
 
     def requantize(self, latent: Tensor) -> Tensor:
         """There is no codebook: the same latent."""

@@ -67,14 +67,16 @@ class Upsample(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Frames to token embeddings, of unit spread each. (B, T, inputs) -> (B, T / 4, latent)"""
+    """Frames to token embeddings, of unit spread each where `unit`. (B, T, inputs) -> (B, T / 4, latent)"""
 
-    def __init__(self, inputs: int, hidden: int, latent: int, depth: int, causal: bool) -> None:
+    def __init__(self, inputs: int, width: int, latent: int, depth: int, causal: bool, unit: bool = True) -> None:
         super().__init__()
-        layers: list[nn.Module] = [Conv(inputs, hidden, 3, causal=causal), nn.GELU()]
+        layers: list[nn.Module] = [Conv(inputs, width, 3, causal=causal), nn.GELU()]
         for _ in range(STAGES):
-            layers += [Conv(hidden, hidden, 4, stride=2, causal=causal), stack(hidden, depth, causal)]
-        layers += [Conv(hidden, latent, 3, causal=causal), nn.LayerNorm(latent)]
+            layers += [Conv(width, width, 4, stride=2, causal=causal), stack(width, depth, causal)]
+        layers.append(Conv(width, latent, 3, causal=causal))
+        if unit:
+            layers.append(nn.LayerNorm(latent))
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -84,12 +86,12 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """Token latents and conditions to frames. (B, N, inputs) -> (B, 4 N, outputs)"""
 
-    def __init__(self, inputs: int, hidden: int, outputs: int, depth: int, causal: bool) -> None:
+    def __init__(self, inputs: int, width: int, outputs: int, depth: int, causal: bool) -> None:
         super().__init__()
-        layers: list[nn.Module] = [Conv(inputs, hidden, 3, causal=causal), nn.GELU()]
+        layers: list[nn.Module] = [Conv(inputs, width, 3, causal=causal), nn.GELU()]
         for _ in range(STAGES):
-            layers += [stack(hidden, depth, causal), Upsample(), Conv(hidden, hidden, 3, causal=causal)]
-        layers += [nn.LayerNorm(hidden), nn.GELU(), Conv(hidden, outputs, 3, causal=causal)]
+            layers += [stack(width, depth, causal), Upsample(), Conv(width, width, 3, causal=causal)]
+        layers += [nn.LayerNorm(width), nn.GELU(), Conv(width, outputs, 3, causal=causal)]
         self.layers = nn.Sequential(*layers)
         self.depth, self.causal = depth, causal
 
@@ -117,13 +119,16 @@ class VQVAE(nn.Module):
     Args:
         pose: numbers of a pose.
         latent: numbers of a token's latent.
-        hidden: channels of the convolutions.
+        width: channels of the convolutions.
         depth: residual blocks a stage.
         causal: no frame sees later ones.
         stride: frames in a token.
+        unit: bring the encoder's output to unit spread.
     """
 
-    def __init__(self, pose: int, latent: int, hidden: int, depth: int, causal: bool, stride: int) -> None:
+    def __init__(
+        self, pose: int, latent: int, width: int, depth: int, causal: bool, stride: int, unit: bool = True
+    ) -> None:
         super().__init__()
         self.stride, self.latent = stride, latent
         self.pose = Normalizer(pose)
@@ -131,8 +136,8 @@ class VQVAE(nn.Module):
         # Shape numbers come in units of a population's spread; few people in training must not narrow that,
         # or a new person would lie hundreds of deviations away.
         self.betas = Normalizer(10, floor=1.0)
-        self.encoder = Encoder(pose + 10 + 9, hidden, latent, depth, causal)
-        self.decoder = Decoder(latent + 10 + 9 * stride, hidden, pose, depth, causal)
+        self.encoder = Encoder(pose + 10 + 9, width, latent, depth, causal, unit)
+        self.decoder = Decoder(latent + 10 + 9 * stride, width, pose, depth, causal)
 
     def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, known: Tensor) -> Tensor:
         """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)

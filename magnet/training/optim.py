@@ -10,26 +10,29 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import nn
 
+from magnet.training.options import OptimizerOptions
+
 
 def adamw_cosine(
     module: LightningModule,
     parameters: Iterable[nn.Parameter],
-    learning_rate: float,
-    weight_decay: float,
-    warmup_steps: int,
+    options: OptimizerOptions,
 ) -> dict[str, Any]:
     """AdamW whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
 
     In a run without an end the rate stays where the warm-up has brought it.
     """
     optimizer = torch.optim.AdamW(
-        parameters, lr=learning_rate, weight_decay=weight_decay, fused=module.device.type == "cuda"
+        parameters,
+        lr=options.learning_rate,
+        weight_decay=options.weight_decay,
+        fused=module.device.type == "cuda",
     )
-    total = module.trainer.estimated_stepping_batches
+    total, warmup = module.trainer.estimated_stepping_batches, options.warmup_steps
 
     def rate(step: int) -> float:
-        rise = min(1.0, (step + 1) / (warmup_steps + 1))
-        done = min(1.0, max(0.0, (step - warmup_steps) / max(total - warmup_steps, 1)))
+        rise = min(1.0, (step + 1) / (warmup + 1))
+        done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1)))
         return rise * 0.5 * (1 + math.cos(math.pi * done))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)

@@ -9,13 +9,13 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body.capsules import capsule_segments
+from magnet.body.joints import WRISTS
 from magnet.metrics.penetration import penetration_depth
 from magnet.metrics.skating import PRESETS, TOES
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-WRISTS = (20, 21)
 HANDS_TOUCH = 0.2
 """Metres between two people's wrists under which their hands are taken to touch."""
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from magnet.body.joints import PELVIS, TOES
 from magnet.export.page.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.export.page.rig import Array, Index, capsule
 from magnet.export.stage import SHADOW
@@ -118,8 +119,8 @@ class Shades:
 
     def show(self, joints: Array) -> None:
         """joints: (P, 22, 3)"""
-        ground = joints[:, [0, 10, 11]] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.004, 0.0])
-        low = np.clip(1.0 - joints[:, [10, 11], 1] / 0.5, 0.0, 1.0)
+        ground = joints[:, [PELVIS, *TOES]] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.004, 0.0])
+        low = np.clip(1.0 - joints[:, TOES, 1] / 0.5, 0.0, 1.0)
         sizes = np.concatenate([np.full((len(joints), 1), 0.26), 0.05 + 0.09 * low], axis=1)
         self.spots.show(ground.reshape(-1, 3), np.array(SHADOW), sizes.ravel())
 

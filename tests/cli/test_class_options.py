@@ -187,7 +187,7 @@ def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsy
     said = told(config)
     got = printed(capsys, "fit", "--config", str(config))
     fields = said["model"].get("init_args", {})
-    model = own(MODELS[said["model"]["class_path"]]) | taken_over(fields.get("start_from")) | fields
+    model = merged(own(MODELS[said["model"]["class_path"]]), merged(taken_over(fields.get("start_from")), fields))
     assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
 
     def resolved(spec: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magnet.body.base import PARENTS
+from magnet.body.joints import PARENTS
 from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import rest_joints
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take

@@ -130,7 +130,7 @@ def renamed(root: Path, change) -> None:
 
 
 def test_names_that_nobody_knows_are_mapped_by_a_file(tmp_path: Path) -> None:
-    from magnet.body.base import JOINT_NAMES
+    from magnet.body.joints import JOINT_NAMES
 
     root = written(tmp_path / "dl", walk=walk(8))
     bones = {named(joint): f"Bone{k}" for k, joint in enumerate(JOINT_NAMES)}

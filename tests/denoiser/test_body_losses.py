@@ -3,7 +3,6 @@ import torch
 
 from magnet.body import load_body
 from magnet.denoiser.body_losses import BODY_LOSSES, WITHIN_REACH, body_losses, least_noisy
-from magnet.denoiser.starting import start_from
 from magnet.denoiser.statistics import pairwise_ground
 from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
@@ -60,9 +59,9 @@ def test_the_terms_are_distances_and_speeds_of_joints(body, generator):
         return points @ T[:, :3, :3].transpose(-1, -2) + T[:, None, :3, 3]
 
     own = torch.stack([(local(0, p, p) - local(1, p, p)).norm(dim=-1) for p in range(3)])
-    assert got["pose"] == pytest.approx(float(own.mean()), rel=1e-4)
+    assert got["joint"] == pytest.approx(float(own.mean()), rel=1e-4)
     way = [torch.stack([local(w, p, p, 1) - local(w, p, p)[:-1] for p in range(3)]) for w in (0, 1)]
-    assert got["motion"] == pytest.approx(float(30 * (way[0] - way[1]).norm(dim=-1).mean()), rel=1e-4)
+    assert got["velocity"] == pytest.approx(float(30 * (way[0] - way[1]).norm(dim=-1).mean()), rel=1e-4)
     pairs = [(of, by) for of in range(3) for by in range(3) if of != by]
     seen_away = torch.stack([(local(0, of, by) - local(1, of, by)).norm(dim=-1) for of, by in pairs])
     assert got["partner"] == pytest.approx(float(seen_away.mean()), rel=1e-4)
@@ -118,7 +117,7 @@ def test_the_surest_scenes_are_those_with_the_least_noise():
 
 
 def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
-    model = tiny_denoiser(max_agents=3, window=8, pose_weight=1.0, motion_weight=0.1, partner_weight=0.5)
+    model = tiny_denoiser(max_agents=3, window=8, loss={"joint": 1.0, "velocity": 0.1, "partner": 0.5})
     model.train()
     losses = model.losses(random_scene(4, 32, 3, generator), generator)
     losses["loss"].backward()
@@ -130,14 +129,14 @@ def test_the_loss_reaches_the_transformer_and_not_the_tokenizer(generator):
 
 def test_another_scale_of_pairwise_transforms_starts_as_the_same_model(tmp_path):
     """What it makes of clean tokens is the same in metres, and noise hides fewer of them."""
-    first, second = tiny_denoiser(seed=1), tiny_denoiser(seed=2, pairwise_metres=0.25)
+    first, second = tiny_denoiser(seed=1), tiny_denoiser(seed=2, noise={"pairwise_metres": 0.25})
     first.normalizer.std.copy_(torch.rand(first.layout.width) + 0.5)
     first.normalizer.ready.fill_(True)
     checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
     first.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, tmp_path / "first.ckpt")
     second.tokenizer.load_state_dict(first.tokenizer.state_dict())
-    start_from(second, tmp_path / "first.ckpt")
+    second.take_over(tmp_path / "first.ckpt")
     ground = pairwise_ground(second.layout)
     assert int(ground.sum()) == 2 * 4 * second.layout.slots
     assert torch.all(second.normalizer.std[ground] == 0.25)
@@ -158,15 +157,15 @@ def test_a_denoiser_starts_from_anothers_weights(tmp_path):
     checkpoint = {"state_dict": first.state_dict(), "hyper_parameters": dict(first.hparams)}
     first.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, tmp_path / "first.ckpt")
-    start_from(second, tmp_path / "first.ckpt")
+    second.take_over(tmp_path / "first.ckpt")
     for name, value in second.transformer.state_dict().items():
         assert torch.equal(value, first.transformer.state_dict()[name])
     with pytest.raises(ValueError, match=r"start_from: .* does not fit this model: size mismatch"):
-        start_from(tiny_denoiser(width=64), tmp_path / "first.ckpt")
+        tiny_denoiser(network={"width": 64}).take_over(tmp_path / "first.ckpt")
 
 
 def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, monkeypatch):
-    model = tiny_denoiser(max_agents=3, window=8, pose_weight=1.0, decoded_share=1.0).eval()
+    model = tiny_denoiser(max_agents=3, window=8, loss={"joint": 1.0, "decoded_share": 1.0}).eval()
     scene = random_scene(4, 32, 3, generator)
     scene.present[1:, 2] = False
     decoded = []
@@ -174,7 +173,7 @@ def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, mon
     monkeypatch.setattr(
         model.tokenizer, "decode", lambda *given: decoded.append((given, plain(*given))) or decoded[-1][1]
     )
-    assert model.losses(scene, generator)["pose"].isfinite()
+    assert model.losses(scene, generator)["joint"].isfinite()
     (latent, betas, steps), poses = decoded[0]
     assert latent.shape == (9, 8, 1, model.layout.latent), "nine people of four scenes"
     together = [x.transpose(0, 2) for x in (latent, steps)]  # the same people as one scene of nine

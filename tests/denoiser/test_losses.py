@@ -72,7 +72,7 @@ def test_each_part_is_averaged_by_itself(scene: Scene):
     clean[..., :8] += 2.0  # Huber of 2 is 1.5
     losses = token_losses(clean, truth, LAYOUT, everybody(scene))
     assert losses["latent"].item() == 1.5
-    assert losses["step"] == losses["pairwise"] == 0
+    assert losses["delta"] == losses["pairwise"] == 0
 
 
 def test_steps_and_relations_have_finite_gradients_at_zero():
@@ -106,7 +106,7 @@ def test_weights_count_each_group_of_a_token_by_its_own(scene: Scene):
     weights[:, :, 0, 0], weights[:, :, 1, 2] = 3.0, 0.5
     losses = token_losses(truth + 2.0, truth, LAYOUT, there, weights)  # Huber of 2 is 1.5
     assert losses["latent"].item() == pytest.approx(1.5 * 3 / 3)
-    assert losses["step"].item() == pytest.approx(1.5 * 3 / 3)
+    assert losses["delta"].item() == pytest.approx(1.5 * 3 / 3)
     assert losses["pairwise"].item() == pytest.approx(1.5 * 0.5 / 6)
     ones = token_losses(truth + 2.0, truth, LAYOUT, there, torch.ones_like(weights))
     assert ones == token_losses(truth + 2.0, truth, LAYOUT, there)

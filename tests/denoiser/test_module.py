@@ -5,19 +5,15 @@ import torch
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from tests.datamodules.fakes import FakeData, couples_and_singles
 
-SIZES = {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "level_width": 16}
+SIZES = {"network": {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "level_width": 16}}
 
 
 def tokenizer_file(tmp_path) -> str:
     """A tokenizer's checkpoint, as its own training would leave it."""
-    from magnet.tokenizer.module import Tokenizer
-
-    tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1)
-    tokenizer.init_codebook([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
-    return save(tokenizer, tmp_path / "tokenizer.ckpt")
+    return save(tiny_tokenizer(), tmp_path / "tokenizer.ckpt")
 
 
 def save(module: L.LightningModule, path) -> str:
@@ -52,7 +48,11 @@ def fitted(model: Denoiser, steps: int, ckpt_path: str | None = None, **options)
 
 def build(tmp_path, **options) -> Denoiser:
     torch.manual_seed(3)
-    return Denoiser(tokenizer_file(tmp_path), max_agents=3, window=8, warmup_steps=1, **{**SIZES, **options})
+    fields = {**SIZES, "optimizer": {"warmup_steps": 1}}
+    fields |= {
+        key: {**fields.get(key, {}), **value} if isinstance(value, dict) else value for key, value in options.items()
+    }
+    return Denoiser(tokenizer_file(tmp_path), max_agents=3, window=8, **fields)
 
 
 def same_weights(a: Denoiser, b: Denoiser) -> bool:
@@ -122,7 +122,7 @@ def test_statistics_make_training_tokens_standard(tmp_path):
 
 
 def test_a_few_scenes_can_be_learnt(tmp_path):
-    model = build(tmp_path, learning_rate=3e-3, width=64)
+    model = build(tmp_path, optimizer={"learning_rate": 3e-3}, network={"width": 64})
     fitted(model, 1)
     batch = next(iter(data().train_dataloader()))
     generator = torch.Generator().manual_seed(0)
@@ -140,18 +140,18 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
 @pytest.mark.parametrize(
     "ablation",
     [
-        {"pairwise": False},
-        {"rope": "none"},
-        {"agent_embedding": False},
-        {"noise_levels": "per_timestep"},
-        {"noise_levels": "per_sequence"},
-        {"noise_levels": "mixture"},
-        {"pairwise_noise": "token"},
-        {"rope": "heads"},
-        {"causal_block": 2},
+        {"network": {"pairwise": False}},
+        {"network": {"rope": "none"}},
+        {"network": {"agent_embedding": False}},
+        {"noise": {"distribution": "per_timestep"}},
+        {"noise": {"distribution": "per_sequence"}},
+        {"noise": {"distribution": "mixture"}},
+        {"noise": {"pairwise": "token"}},
+        {"network": {"rope": "heads"}},
+        {"network": {"causal_block": 2}},
         {"target": "continuous"},
-        {"target": "continuous", "own_past": 1.0, "noise_levels": "mixture"},
-        {"weighting": "min_snr"},
+        {"target": "continuous", "self_forcing": {"share": 1.0}, "noise": {"distribution": "mixture"}},
+        {"loss": {"weighting": "min_snr"}},
     ],
     ids=str,
 )

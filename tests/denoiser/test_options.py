@@ -5,6 +5,7 @@ import torch
 
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import SelfForcing
 from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
@@ -15,7 +16,7 @@ from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_denoiser
 
 FAST = SamplerOptions(steps=2, stride=2)
-OPTIONS = [{"causal_block": 2}, {"causal_block": 3}, {"target": "continuous"}]
+OPTIONS = [{"network": {"causal_block": 2}}, {"network": {"causal_block": 3}}, {"target": "continuous"}]
 
 
 @pytest.fixture(scope="module", params=OPTIONS, ids=str)
@@ -46,7 +47,7 @@ def test_options_come_back_with_a_checkpoint(model: Denoiser, tmp_path):
     from tests.denoiser.test_module import save
 
     loaded = Denoiser.load(save(model, tmp_path / "model.ckpt"))
-    assert loaded.transformer.causal_block == model.hparams["causal_block"]
+    assert loaded.transformer.options.causal_block == model.network.causal_block
     assert loaded.quantized == model.quantized
 
 
@@ -56,20 +57,21 @@ def test_checkpoints_of_before_are_as_they_were(tmp_path):
 
     path = save(tiny_denoiser(), tmp_path / "old.ckpt")
     checkpoint = torch.load(path, weights_only=True)
-    for name in ("causal_block", "target", "weighting", "snr_most"):
-        del checkpoint["hyper_parameters"][name]
+    fields = checkpoint["hyper_parameters"]
+    del fields["target"], fields["network"]["causal_block"], fields["loss"]["weighting"], fields["loss"]["snr_gamma"]
     torch.save(checkpoint, path)
     old = Denoiser.load(path)
-    assert (old.transformer.causal_block, old.quantized, old.hparams["weighting"]) == (0, True, "uniform")
-    assert Denoiser.load("duet").transformer.causal_block == 0
+    assert (old.transformer.options.causal_block, old.quantized, old.loss.weighting) == (0, True, "uniform")
+    assert Denoiser.load("duet").transformer.options.causal_block == 0
 
 
 @pytest.mark.parametrize(
     ("field", "message"),
     [
         ({"target": "both"}, "target: got 'both', expected quantized or continuous"),
-        ({"weighting": "max"}, "weighting: got 'max', expected uniform or min_snr"),
-        ({"snr_most": 0.0}, "snr_most: got 0, expected a number, over 0|snr_most: got 0, expected over 0"),
+        ({"loss": {"weighting": "max"}}, "weighting: got 'max', expected uniform or min_snr"),
+        ({"loss": {"snr_gamma": 0.0}}, "snr_gamma: got 0, expected over 0"),
+        ({"loss": {"snr_game": 0.0}}, "no option snr_game; did you mean snr_gamma?"),
     ],
 )
 def test_values_that_mean_nothing_are_refused(field, message):
@@ -111,7 +113,8 @@ def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
     levels = torch.full((4, 8, 3), 700)
     levels[:, :4] = 0
     truth = continuous.normalizer.normalize(continuous.tokenize(scene)[0])
-    made = with_self_forcing(continuous, truth, levels, scene, 1.0, torch.Generator().manual_seed(1))
+    parts = (continuous.denoise, None, continuous.normalizer, continuous.layout)
+    made = with_self_forcing(*parts, truth, levels, scene, SelfForcing(1.0), torch.Generator().manual_seed(1))
     latent = continuous.layout.unpack(continuous.normalizer.denormalize(made))[0][:, :4]
     assert (continuous.tokenizer.requantize(latent) - latent).abs().amax(dim=-1).min() > 1e-3
 
@@ -121,15 +124,15 @@ def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
 
 def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, monkeypatch):
     """All at one level: the token losses are the plain ones times that level's weight."""
-    from magnet.denoiser import objective
+    from magnet.denoiser import module
 
-    plain, weighted = tiny_denoiser(), tiny_denoiser(weighting="min_snr", snr_most=3.0)
+    plain, weighted = tiny_denoiser(), tiny_denoiser(loss={"weighting": "min_snr", "snr_gamma": 3.0})
     scene = scene.slice(0, 32)
     for level in (0, 300, 600, 900, 1000):
         at = torch.full((2, 8, 3), level)
-        monkeypatch.setattr(objective, "draw_levels", lambda *_, at=at: at)
+        monkeypatch.setattr(module, "draw_levels", lambda *_, at=at: at)
         a, b = (model.losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
         weight = snr_weights(torch.tensor(level), 3.0)
-        for name in ("latent", "step", "pairwise"):
+        for name in ("latent", "delta", "pairwise"):
             assert torch.allclose(b[name], weight * a[name], rtol=1e-5)
         assert torch.equal(a["consistency"], b["consistency"])

@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.pairwise_posterior import PairwisePosterior, planar_of
+from magnet.denoiser.pairwise_posterior import PairwisePosterior
+from magnet.motion.planar import yaw_ground
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.testing import random_scene, reordered, tiny_denoiser
 
@@ -37,7 +38,7 @@ def shown(model: Denoiser, level: int, people: int = 3, off: float = 0.1, seed: 
 def error(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor) -> float:
     """Mean distance in metres between where partners are seen and where they are."""
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(-1, tokens.shape[1], -1, -1, 4)
-    each = [planar_of(model.layout.unpack(model.normalizer.denormalize(x))[2])[1] for x in (tokens, truth)]
+    each = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x))[2])[1] for x in (tokens, truth)]
     return float((each[0] - each[1]).norm(dim=-1)[there].mean())
 
 
@@ -94,7 +95,7 @@ def test_absent_people_change_nothing(model: Denoiser):
 def test_both_ends_say_the_same_of_a_pair(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100)
     better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
-    yaw, ground = planar_of(model.layout.unpack(model.normalizer.denormalize(better))[2])  # (B, N, P, 2, 4)
+    yaw, ground = yaw_ground(model.layout.unpack(model.normalizer.denormalize(better))[2])  # (B, N, P, 2, 4)
     assert torch.allclose(torch.cos(yaw[:, :, 0, 0] + yaw[:, :, 1, 0]), torch.ones(()), atol=1e-4)
     assert torch.allclose(ground[:, :, 0, 0].norm(dim=-1), ground[:, :, 1, 0].norm(dim=-1), atol=1e-4)
 
@@ -135,7 +136,7 @@ def test_deviations_can_be_learnt(model: Denoiser):
 
 
 def test_a_checkpoint_from_before_can_be_given_one(tmp_path, model: Denoiser):
-    with_one = tiny_denoiser(max_agents=3, window=8, pairwise_posterior=True)
+    with_one = tiny_denoiser(max_agents=3, window=8, network={"pairwise_posterior": True})
     checkpoint = {
         "state_dict": dict(model.state_dict()),
         "tokenizer_hyper_parameters": dict(model.tokenizer.hparams),

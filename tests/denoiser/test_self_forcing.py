@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from magnet.denoiser.options import SelfForcing
 from magnet.denoiser.self_forcing import with_self_forcing
 from magnet.motion.frames import from_9d, propagate_pairwise
 from magnet.motion.tokens import by_frame, pairwise_by_frame
@@ -25,7 +26,8 @@ def scene():
 def shown(model, scene, levels, share=1.0, seed=1):
     truth = model.normalizer.normalize(model.tokenize(scene)[0])
     generator = torch.Generator().manual_seed(seed)
-    return truth, with_self_forcing(model, truth, levels, scene, share, generator)
+    parts = (model.denoise, model.tokenizer.requantize, model.normalizer, model.layout)
+    return truth, with_self_forcing(*parts, truth, levels, scene, SelfForcing(share), generator)
 
 
 def rolled_out() -> torch.Tensor:

@@ -11,9 +11,9 @@ import yaml
 
 from magnet import cli, weights
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.starting import start_from, tokenizer_of
+from magnet.denoiser.starting import tokenizer_of
 from magnet.testing import tiny_denoiser
-from magnet.tokenizer.checkpoint import SHAPING
+from magnet.tokenizer.checkpoint import shaping
 from magnet.tokenizer.module import RawPose, Tokenizer
 
 
@@ -32,11 +32,11 @@ def equal(a: torch.nn.Module, b: torch.nn.Module) -> bool:
 def test_without_a_tokenizer_that_of_the_start_is_kept_and_how_tokens_are_normalised(tmp_path: Path) -> None:
     first = tiny_denoiser(seed=1)
     path = saved(first, tmp_path / "first.ckpt")
-    sizes = {name: first.hparams[name] for name in ("max_agents", "window", "width", "layers", "heads", "mlp_ratio")}
+    sizes = {name: first.hparams[name] for name in ("max_agents", "window", "network")}
     second = Denoiser(start_from=str(path), **sizes)
     assert equal(second.tokenizer, first.tokenizer) and not second.normalizer.ready
     assert not any(weight.requires_grad for weight in second.tokenizer.parameters())
-    start_from(second, path)
+    second.take_over(path)
     assert equal(second.transformer, first.transformer) and equal(second.normalizer, first.normalizer)
 
 
@@ -44,7 +44,7 @@ def test_with_another_tokenizer_tokens_are_normalised_anew(tmp_path: Path) -> No
     path = saved(tiny_denoiser(seed=1), tmp_path / "first.ckpt")
     second = tiny_denoiser(seed=2)
     before = second.normalizer.mean.clone()
-    start_from(second, path)
+    second.take_over(path)
     assert torch.equal(second.normalizer.mean, before)
 
 
@@ -81,12 +81,13 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
 @pytest.mark.parametrize("name", weights.names())
 def test_a_start_brings_its_sizes_and_losses_and_the_user_says_otherwise(name: str, capsys) -> None:
     stored = weights.read(weights.resolve(name))["hyper_parameters"]
-    got = printed(capsys, "--model.start_from", name, "--model.dropout", "0.3")
+    got = printed(capsys, "--model.start_from", name, "--model.network.dropout", "0.3")
     model, data = got["model"]["init_args"], got["data"]["init_args"]
-    for option in ("width", "layers", "heads", "rope", "noise_levels", "level_shift", "pose_weight", "own_past"):
-        assert model[option] == stored[option], option
-    assert (model["start_from"], model["tokenizer"], model["dropout"]) == (name, None, 0.3)
-    assert model["learning_rate"] == 2e-4, "how fast it learns is no part of what is taken over"
+    for group in ("network", "noise", "loss", "self_forcing"):
+        taken = {key: value for key, value in stored[group].items() if key != "dropout"}
+        assert taken and taken == {key: model[group][key] for key in taken}, group
+    assert (model["start_from"], model["tokenizer"], model["network"]["dropout"]) == (name, None, 0.3)
+    assert model["optimizer"]["learning_rate"] == 2e-4, "how fast it learns is no part of what is taken over"
     assert (data["max_agents"], data["window_frames"]) == (stored["max_agents"], 4 * stored["window"])
 
 
@@ -94,7 +95,7 @@ def test_a_start_brings_its_sizes_and_losses_and_the_user_says_otherwise(name: s
 def test_a_tokenizer_starts_from_that_inside_a_shipped_model(name: str, capsys) -> None:
     stored = weights.read(weights.resolve(name))["tokenizer_hyper_parameters"]
     model = printed(capsys, "--model", "Tokenizer", "--model.start_from", name)["model"]["init_args"]
-    assert {option: model[option] for option in SHAPING} == {option: stored[option] for option in SHAPING}
+    assert shaping(stored) and shaping(stored).items() <= shaping(model).items()
     assert (model["start_from"], model["decoder_only"]) == (name, False)
 
 
@@ -102,7 +103,7 @@ def test_the_configuration_for_fine_tuning_starts_from_the_shipped_model(capsys)
     config = Path(__file__).parents[2] / "configs/finetune.yaml"
     got = printed(capsys, "--config", str(config), "--data.path", "store")
     assert got["data"]["class_path"].endswith(".Prepared") and got["data"]["init_args"]["max_agents"] == 4
-    assert got["model"]["init_args"]["width"] == Denoiser.load("duet").hparams["width"]
+    assert got["model"]["init_args"]["network"]["width"] == Denoiser.load("duet").network.width
 
 
 def test_a_start_that_is_not_there_is_said_before_anything_is_made(tmp_path, monkeypatch, capsys) -> None:
@@ -119,9 +120,9 @@ def test_training_goes_on_from_the_start_with_its_tokenizer_untouched(tmp_path, 
     data = ("--data.train_clips", "2", "--data.val_clips", "1", "--data.people", "[2]", "--data.batch_size", "2")
     few = ("--data.epoch_size", "2", "--trainer.max_steps", "1", "--trainer.limit_val_batches", "0")
     rest = (
-        "--model.learning_rate",
+        "--model.optimizer.learning_rate",
         "0.0",
-        "--model.weight_decay",
+        "--model.optimizer.weight_decay",
         "0.0",
         "--out",
         "run",

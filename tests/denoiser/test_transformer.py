@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer, block_causal, rotate
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS
@@ -14,7 +15,7 @@ SMALL = {"width": 32, "layers": 2, "heads": 2, "level_width": 16, "agent_width":
 
 def build(layout: TokenLayout = LAYOUT, **options) -> Transformer:
     torch.manual_seed(0)
-    return Transformer(layout, **{**SMALL, **options}).eval()
+    return Transformer(layout, TransformerOptions(**{**SMALL, **options})).eval()
 
 
 def batch(generator: torch.Generator, layout: TokenLayout = LAYOUT):

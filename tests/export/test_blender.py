@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from magnet.body import Body
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_bvh, save_glb
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from magnet.body import Body
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import JOINT_NAMES
 from magnet.export import load_bvh, save_bvh
 from magnet.export.bvh import euler_zxy
 from magnet.export.bvh_read import read_bvh

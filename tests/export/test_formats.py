@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magnet import cli
 from magnet.body import Body, load_body
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import JOINT_NAMES
 from magnet.export import formats, resampled
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.body import Body
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_glb
 from magnet.export.glb import influences, linear, unbroken, vertex_normals
 from magnet.export.stage import AGENTS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.datamodules.preparing.fit_whole import fit_recordings
 from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, read_asf
 from magnet.export import load_bvh, save_bvh

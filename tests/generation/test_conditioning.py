@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.generation.blending import seam_weights
-from magnet.generation.conditioning import known_tokens, mask_unknown, stretches
+from magnet.generation.conditioning import known_tokens, mask_unknown, segments
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
@@ -80,7 +80,7 @@ def test_no_task_leaks(model, scene, generator, name):
 
 def test_the_literal_reading_leaks_where_the_unknown_partner_is(scene, generator):
     """pairwise_noise="token": the same replacement changes the sample, which is why it is not the default."""
-    leaking = tiny_denoiser(max_agents=3, window=8, pairwise_noise="token")
+    leaking = tiny_denoiser(max_agents=3, window=8, noise={"pairwise": "token"})
     task = registry.get("partner_inpainting")()
     known = task.schedule(Grid(12, 3, 4, 3, 8, 2)).known
     other = unknown_replaced(scene, known, generator)
@@ -265,7 +265,7 @@ def test_the_step_into_a_keyframe_is_shown_as_the_keyframes_own_next_step(model,
 
 def test_each_agents_unbroken_stretches_are_found():
     known = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 1], [1, 1, 1]], dtype=torch.bool)
-    assert stretches(known) == [(0, 2, [0]), (0, 4, [1]), (2, 4, [2]), (3, 4, [0])]
+    assert segments(known) == [(0, 2, [0]), (0, 4, [1]), (2, 4, [2]), (3, 4, [0])]
 
 
 def test_scrubbed_scenes_hold_nothing_unknown(scene):

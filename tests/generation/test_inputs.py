@@ -253,13 +253,13 @@ def test_counts_that_are_none_are_named(numbers, message, model, duet):
 
 
 def test_a_model_that_was_never_trained_is_refused(duet):
-    model = Denoiser(tokenizer="raw", width=16, layers=1, heads=2)
+    model = Denoiser(tokenizer="raw", network={"width": 16, "layers": 1, "heads": 2})
     with pytest.raises(ValueError, match="never been trained"):
         WAYS["generate"](model, duet)
 
 
 def test_sampling_a_model_in_training_mode_drops_nothing_out(duet):
-    model = tiny_denoiser(max_agents=2, dropout=0.5)
+    model = tiny_denoiser(max_agents=2, network={"dropout": 0.5})
 
     def sampled() -> torch.Tensor:
         return generate(model, duet, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0)).body_rot

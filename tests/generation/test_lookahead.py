@@ -13,8 +13,7 @@ from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.partner import MotionControl, PartnerInpainting
-from magnet.testing import random_scene, tiny_denoiser
-from magnet.tokenizer.module import Tokenizer
+from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS, PAST = 24, 3
@@ -24,7 +23,7 @@ def denoiser(causal: bool = False):
     model = tiny_denoiser(max_agents=3, window=8)
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        model.tokenizer = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=causal)
+        model.tokenizer = tiny_tokenizer(network={"causal": causal})
     generator = torch.Generator().manual_seed(1)
     model.tokenizer.init_codebook([random_scene(4, 32, 3, generator)])
     return model.eval()

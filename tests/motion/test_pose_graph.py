@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from magnet.motion.frames import from_planar, inverse, pairwise, partners, rotate_ground, to_planar
+from magnet.motion.frames import from_planar, inverse, pairwise, partners, to_planar
+from magnet.motion.planar import rotate_ground
 from magnet.motion.pose_graph import GAUGE, Planar, solve_block_tridiagonal, solve_pose_graph
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE, TokenLayout, by_frame, by_token, scene_transforms
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, by_token, scene_transforms
 
 
 @pytest.mark.parametrize("agents", [1, 2, 3, 4])
@@ -28,7 +28,7 @@ def test_groups_lie_where_unpack_finds_them():
 def test_frames_and_tokens_are_two_views_of_the_same():
     frames = torch.arange(2 * 12 * 3 * 5).view(2, 12, 3, 5)
     tokens = by_token(frames)
-    assert tokens.shape == (2, 3, 3, STRIDE, 5)
+    assert tokens.shape == (2, 3, 3, TOKEN_FRAMES, 5)
     assert torch.equal(tokens[1, 2, 0, 1], frames[1, 9, 0])
     assert torch.equal(by_frame(tokens), frames)
 

@@ -68,11 +68,12 @@ def test_augmented_people_are_still_lawful(people, generator):
 
 
 def tiny(**options) -> Tokenizer:
-    return Tokenizer(latent=16, hidden=16, codes=32, depth=1, **options)
+    sizes = {"codebook_dim": 16, "codebook_size": 32, **options.pop("quantizer", {})}
+    return Tokenizer(**{"network": {"width": 16, "depth": 1}, "quantizer": sizes, **options})
 
 
 def test_training_augments_and_evaluation_does_not(people):
-    tokenizer = tiny(exchange_limbs=1.0, turn_joints=0.2)
+    tokenizer = tiny(augment={"limb_swap_prob": 1.0, "joint_noise": 0.2})
     tokenizer.init_codebook([people])
     assert torch.equal(tokenizer.augmented(people, 0).body_rot, tokenizer.augmented(people, 0).body_rot)
     assert not torch.equal(tokenizer.augmented(people, 0).body_rot, tokenizer.augmented(people, 1).body_rot)
@@ -84,10 +85,12 @@ def test_a_tokenizer_starts_from_anothers_networks(people, tmp_path):
     first.init_codebook([people])
     path = tmp_path / "first.ckpt"
     torch.save({"hyper_parameters": dict(first.hparams), "state_dict": first.state_dict()}, path)
-    second = tiny(levels=2)
+    second = tiny(quantizer={"num_quantizers": 2})
     second.take_weights(path)
     for name, value in second.vqvae.state_dict().items():
         assert torch.equal(value, first.vqvae.state_dict()[name])
     assert not second.quantizer.initialized, "another number of codebooks starts anew"
     with pytest.raises(ValueError, match=r"start_from: .* does not fit"):
-        Tokenizer(latent=16, hidden=24, codes=32, depth=1).take_weights(path)
+        Tokenizer(network={"width": 24, "depth": 1}, quantizer={"codebook_dim": 16, "codebook_size": 32}).take_weights(
+            path
+        )

@@ -43,7 +43,7 @@ def test_a_toe_stands_that_is_low_and_slow(height, speed, stands):
     assert standing(*toes(height, speed)).all() == stands
 
 
-def test_stance_is_the_speed_at_which_given_steps_make_standing_toes_slide(body):
+def test_foot_contact_is_the_speed_at_which_given_steps_make_standing_toes_slide(body):
     """Somebody stands; the steps that the decoder was given lead over the ground at 0.3 m/s."""
     scene = random_scene(1, 1, 2, torch.Generator().manual_seed(1))
     still = scene.replace(
@@ -63,9 +63,9 @@ def test_stance_is_the_speed_at_which_given_steps_make_standing_toes_slide(body)
 
     assert standing(joints(pose), steps).all()
     got = reconstruction_losses(pose, pose, mask, joints, away, steps)
-    assert got["stance"] == pytest.approx(0.3, rel=1e-2)
-    assert reconstruction_losses(pose, pose, mask, joints, steps, steps)["stance"] == pytest.approx(0, abs=1e-2)
-    assert "stance" not in reconstruction_losses(pose, pose, mask, joints)
+    assert got["foot_contact"] == pytest.approx(0.3, rel=1e-2)
+    assert reconstruction_losses(pose, pose, mask, joints, steps, steps)["foot_contact"] == pytest.approx(0, abs=1e-2)
+    assert "foot_contact" not in reconstruction_losses(pose, pose, mask, joints)
 
 
 def test_moving_points_is_what_a_turn_and_a_shift_do():

@@ -27,7 +27,9 @@ CLOSE = {"rtol": 0.0, "atol": 2e-5}
 
 def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
     torch.manual_seed(0)
-    tokenizer = Tokenizer(**{"latent": 16, "hidden": 24, "codes": 32, "depth": 2, **fields})
+    small = {"network": {"width": 24, "depth": 2}, "quantizer": {"codebook_dim": 16, "codebook_size": 32}}
+    groups = {key: {**small[key], **value} if key in small else value for key, value in fields.items()}
+    tokenizer = Tokenizer(**{**small, **groups})
     if scene is not None:
         tokenizer.init_codebook([scene])
     return tokenizer
@@ -108,7 +110,7 @@ def test_where_a_scene_lies_in_the_world_does_not_matter(scene: Scene) -> None:
 @pytest.mark.parametrize("window", [1, 3, 16])
 def test_decoding_by_windows_gives_the_same_poses(window: int, causal: bool, generator: torch.Generator) -> None:
     scene = random_scene(1, 200, 2, generator)
-    tokenizer = tiny(scene, causal=causal, depth=1).eval()
+    tokenizer = tiny(scene, network={"causal": causal, "depth": 1}).eval()
     latent = tokenizer.encode_scene(scene)
     whole = tokenizer.decode(latent, *conditions(scene))
     torch.testing.assert_close(tokenizer.decode(latent, *conditions(scene), window=window), whole, **CLOSE)
@@ -116,7 +118,7 @@ def test_decoding_by_windows_gives_the_same_poses(window: int, causal: bool, gen
 
 def test_causal_tokens_of_a_growing_clip_do_not_change(generator: torch.Generator) -> None:
     scene = random_scene(2, 96, 2, generator)
-    tokenizer = tiny(scene, causal=True, depth=3).eval()
+    tokenizer = tiny(scene, network={"causal": True, "depth": 3}).eval()
     whole = tokenizer.encode_scene(scene)
     frames = tokenizer.decode(whole, *conditions(scene))
     betas, steps = conditions(scene)
@@ -184,12 +186,12 @@ def test_statistics_are_those_of_the_people_present(scene: Scene) -> None:
 
 def test_a_handful_of_windows_is_learnt(generator: torch.Generator) -> None:
     scene = random_scene(2, 32, 2, generator)
-    tokenizer = tiny(scene, latent=32, hidden=48, codes=64)
+    tokenizer = tiny(scene, network={"width": 48}, quantizer={"codebook_dim": 32, "codebook_size": 64})
     optimizer = torch.optim.AdamW(tokenizer.vqvae.parameters(), 3e-3)
 
     def angle() -> float:
         with torch.no_grad():
-            _, body = (tokenizer.losses(features(scene))[0][name] for name in ("loss", "body"))
+            _, body = (tokenizer.losses(features(scene))[0][name] for name in ("loss", "joint_rotation"))
         return float((2 * body).sqrt().rad2deg())
 
     tokenizer.eval()
@@ -204,7 +206,7 @@ def test_a_handful_of_windows_is_learnt(generator: torch.Generator) -> None:
 
 
 def test_all_weights_get_gradients_through_the_codebook(scene: Scene) -> None:
-    tokenizer = tiny(scene, velocity_weight=0.1, joint_weight=0.1)
+    tokenizer = tiny(scene, loss={"velocity": 0.1, "joint": 0.1})
     tokenizer.body = load_body()
     tokenizer.training_step(scene, 0).backward()
     for name, parameter in tokenizer.vqvae.named_parameters():
@@ -233,7 +235,7 @@ def test_freezing_the_model_freezes_the_codes(scene: Scene) -> None:
 
 
 def test_training_reports_what_it_should(tmp_path: Path) -> None:
-    tokenizer = tiny(levels=2, joint_weight=1.0)
+    tokenizer = tiny(quantizer={"num_quantizers": 2}, loss={"joint": 1.0})
     run = trainer(tmp_path, max_epochs=2, log_every_n_steps=1, enable_checkpointing=False)
     run.fit(tokenizer, datamodule=Scenes())
     logged = {name: float(value) for name, value in run.callback_metrics.items()}
@@ -259,7 +261,7 @@ def test_training_reports_what_it_should(tmp_path: Path) -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tokenizer, Path]:
     """A trained tokenizer and the folder with the checkpoint of each of its four epochs."""
     folder = tmp_path_factory.mktemp("run")
-    tokenizer = tiny(warmup_steps=2)
+    tokenizer = tiny(optimizer={"warmup_steps": 2})
     keep = ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
     trainer(folder, max_epochs=4, callbacks=[keep]).fit(tokenizer, datamodule=Scenes())
     return tokenizer, folder
@@ -278,7 +280,7 @@ def test_resumed_training_ends_bit_identical(
     run: tuple[Tokenizer, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tokenizer, folder = run
-    again = tiny(warmup_steps=2)
+    again = tiny(optimizer={"warmup_steps": 2})
     monkeypatch.setattr(again.quantizer, "kmeans_init", None)  # must not start a second time
     resume = {"ckpt_path": folder / "epoch=1.ckpt", "weights_only": True}
     trainer(tmp_path, max_epochs=4, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
@@ -291,7 +293,12 @@ def test_training_the_decoder_alone_leaves_the_meaning_of_codes(
 ) -> None:
     before, folder = run
     start = str(folder / "epoch=3.ckpt")
-    after = tiny(start_from=start, decoder_only=True, joint_weight=0.1, foot_weight=0.1, revive_below=5.0)
+    after = tiny(
+        start_from=start,
+        decoder_only=True,
+        loss={"joint": 0.1, "foot_velocity": 0.1},
+        quantizer={"dead_code_threshold": 5.0},
+    )
     trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(after, datamodule=Scenes())
     changed = [name for name, value in after.state_dict().items() if not torch.equal(before.state_dict()[name], value)]
     assert changed and all(name.startswith("vqvae.decoder.") for name in changed)
@@ -309,9 +316,13 @@ def test_the_learning_rate_falls_to_zero_on_a_cosine(run: tuple[Tokenizer, Path]
 
 
 def test_resuming_with_another_size_names_the_field(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"codes: the checkpoint's tokenizer has 32, this one 64.*--model.codes 32"):
+    said = r"quantizer.codebook_size: the checkpoint's tokenizer has 32, this one 64.*--model.quantizer.codebook_size"
+    with pytest.raises(ValueError, match=said):
         trainer(tmp_path, enable_checkpointing=False).fit(
-            tiny(codes=64), datamodule=Scenes(), ckpt_path=run[1] / "epoch=1.ckpt", weights_only=True
+            tiny(quantizer={"codebook_size": 64}),
+            datamodule=Scenes(),
+            ckpt_path=run[1] / "epoch=1.ckpt",
+            weights_only=True,
         )
 
 
@@ -329,9 +340,11 @@ def test_what_is_no_tokenizer_is_refused(run: tuple[Tokenizer, Path], tmp_path: 
         with pytest.raises(ValueError, match=f"{path.name}: not a tokenizer's checkpoint"):
             Tokenizer.load(path)
     checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
-    checkpoint["hyper_parameters"]["codes"] = 64
+    checkpoint["hyper_parameters"]["quantizer"]["codebook_size"] = 64
     torch.save(checkpoint, tmp_path / "shape.ckpt")
-    with pytest.raises(ValueError, match=r"quantizer.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'codes': 64"):
+    with pytest.raises(
+        ValueError, match=r"quantizer.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'quantizer.codebook_size': 64"
+    ):
         Tokenizer.load(tmp_path / "shape.ckpt")
 
 
@@ -351,7 +364,7 @@ def test_a_denoisers_checkpoint_gives_its_tokenizer(run: tuple[Tokenizer, Path],
 def test_a_tokenizer_inside_another_module_keeps_its_own_fields() -> None:
     with _given_hyperparameters_context({"width": 99}, "anything"):
         tokenizer = tiny()
-    assert "width" not in tokenizer.hparams and tokenizer.hparams["codes"] == 32
+    assert "layers" not in tokenizer.hparams and tokenizer.hparams["quantizer"]["codebook_size"] == 32
 
 
 # -- without a codebook ------------------------------------------------------------------------
@@ -361,7 +374,7 @@ def test_raw_poses_return_exactly(scene: Scene) -> None:
     raw = RawPose()
     for _ in range(2):
         latent = raw.encode_scene(scene)
-        assert latent.shape == (2, 16, 3, 540) and raw.latent == 540
+        assert latent.shape == (2, 16, 3, 540) and raw.codebook_dim == 540
         assert torch.equal(raw.requantize(latent), latent)
         torch.testing.assert_close(raw.decode(latent, *conditions(scene)), pose_features(scene), rtol=0, atol=1e-5)
         raw.fit_normalizers([scene])
@@ -380,7 +393,7 @@ def test_nothing_in_nothing_out():
         (scene.slice(0, 0), (2, 0, 2)),
         (scene.slice(0, 3), (2, 0, 2)),
     ]:
-        assert tokenizer.encode_scene(empty).shape == (*shape, tokenizer.latent)
+        assert tokenizer.encode_scene(empty).shape == (*shape, tokenizer.codebook_dim)
         again = tokenizer.reconstruct(empty)
         assert (again.scenes, again.frames, again.agents) == (shape[0], 4 * shape[1], shape[2])
 

@@ -40,7 +40,7 @@ def test_quantising_a_code_returns_it_bit_identical(generator: torch.Generator) 
 
 
 def test_codes_follow_the_moving_average_of_their_vectors(generator: torch.Generator) -> None:
-    book = ResidualVQ(4, 8, decay=0.9, revive_below=0.0)
+    book = ResidualVQ(4, 8, ema_decay=0.9, dead_code_threshold=0.0)
     book.kmeans_init(clusters(100, generator), generator)
     count, total = book.ema_count[0].double(), book.ema_sum[0].double()
     for _ in range(5):
@@ -71,7 +71,7 @@ def test_same_seed_starts_the_same_codes() -> None:
 
 
 def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator) -> None:
-    book = ResidualVQ(16, 8, revive_below=1.0)
+    book = ResidualVQ(16, 8, dead_code_threshold=1.0)
     book.kmeans_init(clusters(300, generator), generator)
     book.codes[0, 3] = 1e3
     book.ema_sum[0, 3] = 1e3
@@ -82,7 +82,7 @@ def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator
 
 
 def test_without_revival_an_unused_code_does_not_move(generator: torch.Generator) -> None:
-    book = ResidualVQ(16, 8, revive_below=0.0)
+    book = ResidualVQ(16, 8, dead_code_threshold=0.0)
     book.kmeans_init(clusters(300, generator), generator)
     book.codes[0, 3] = 1e3
     book.ema_sum[0, 3] = 1e3
@@ -137,7 +137,7 @@ def test_frozen_codebook_never_moves(how: str, generator: torch.Generator) -> No
 
 
 def test_each_residual_level_lowers_the_error(generator: torch.Generator) -> None:
-    book = ResidualVQ(8, 8, levels=4)
+    book = ResidualVQ(8, 8, num_quantizers=4)
     vectors = clusters(1000, generator)
     for _ in range(20):
         book(vectors, generator=generator)
@@ -152,7 +152,7 @@ def test_each_residual_level_lowers_the_error(generator: torch.Generator) -> Non
 
 
 def test_gradient_passes_straight_through(generator: torch.Generator) -> None:
-    book = ResidualVQ(16, 8, levels=2)
+    book = ResidualVQ(16, 8, num_quantizers=2)
     vectors = clusters(50, generator).requires_grad_()
     out = book(vectors, generator=generator)
     slope = torch.randn(50, 8, generator=generator)
@@ -163,10 +163,10 @@ def test_gradient_passes_straight_through(generator: torch.Generator) -> None:
 
 
 def test_loading_neither_moves_nor_restarts_the_codebook(generator: torch.Generator) -> None:
-    book = ResidualVQ(16, 8, levels=2)
+    book = ResidualVQ(16, 8, num_quantizers=2)
     for _ in range(3):
         book(clusters(200, generator), generator=generator)
-    loaded = ResidualVQ(16, 8, levels=2)
+    loaded = ResidualVQ(16, 8, num_quantizers=2)
     loaded.load_state_dict(book.state_dict())
     vectors = clusters(200, generator) + 1
     looked_up = book.eval()(vectors)
@@ -216,8 +216,8 @@ def test_half_precision_autocast_looks_up_in_float32(generator: torch.Generator)
 
 def _rank(rank: int, world: int, folder: str) -> None:
     torch.set_num_threads(1)
-    book = ResidualVQ(16, 8, levels=2)  # made before the process group, as Lightning does
-    given = ResidualVQ(16, 8, revive_below=0.0)
+    book = ResidualVQ(16, 8, num_quantizers=2)  # made before the process group, as Lightning does
+    given = ResidualVQ(16, 8, dead_code_threshold=0.0)
     given.load_state_dict(torch.load(f"{folder}/given.pt"))
     meet = f"file://{folder}/meet"
     patience = datetime.timedelta(seconds=60)
@@ -234,7 +234,7 @@ def _rank(rank: int, world: int, folder: str) -> None:
 
 
 def test_codebooks_of_two_processes_stay_bit_identical(tmp_path: Path, generator: torch.Generator) -> None:
-    alone = ResidualVQ(16, 8, revive_below=0.0)
+    alone = ResidualVQ(16, 8, dead_code_threshold=0.0)
     alone.kmeans_init(clusters(300, generator), generator)
     torch.save(alone.state_dict(), tmp_path / "given.pt")
     # Forked and not spawned: importing torch anew takes half a minute on a busy machine.

@@ -93,7 +93,7 @@ def test_body_loss_is_half_the_square_of_a_small_angle(scene: Scene) -> None:
     turned = (body_rot @ about_x)[..., :2].transpose(-1, -2).flatten(-3)
     decoded = torch.cat([turned, truth[..., 126:]], dim=-1)
     losses = reconstruction_losses(decoded, truth, torch.ones(truth.shape[:3], dtype=torch.bool))
-    torch.testing.assert_close(losses["body"], angle.square() / 2, rtol=1e-4, atol=0)
+    torch.testing.assert_close(losses["joint_rotation"], angle.square() / 2, rtol=1e-4, atol=0)
     assert losses["root_rotation"] < 1e-10 and losses["root_translation"] == 0
 
 

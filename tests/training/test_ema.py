@@ -2,8 +2,7 @@ import torch
 
 from magnet import weights
 from magnet.denoiser.module import Denoiser
-from magnet.testing import random_scene
-from magnet.tokenizer.module import Tokenizer
+from magnet.testing import random_scene, tiny_tokenizer
 from magnet.training.ema import WeightEMA
 from tests.denoiser.test_module import build, data, save, trainer
 
@@ -21,7 +20,7 @@ class Watch(WeightEMA):
 
 
 def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_path):
-    model = build(tmp_path, learning_rate=1e-2)
+    model = build(tmp_path, optimizer={"learning_rate": 1e-2})
     before = {name: value.clone() for name, value in model.tokenizer.state_dict().items()}
     watch = Watch(0.5)
     run = trainer(6, callbacks=[watch])
@@ -57,9 +56,9 @@ def test_a_denoiser_never_runs_with_another_tokenizer_than_its_own(tmp_path):
     run.save_checkpoint(tmp_path / "model.ckpt")
     scene = random_scene(1, 16, 2, torch.Generator().manual_seed(1))
     expected = model.eval().encode(scene)
-    other = Tokenizer(latent=16, hidden=16, codes=32, depth=1, causal=True)
+    other = tiny_tokenizer(network={"causal": True})
     other.init_codebook([random_scene(4, 32, 2, torch.Generator().manual_seed(0))])
     save(other, tmp_path / "tokenizer.ckpt")
     loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True).eval()
-    assert not loaded.tokenizer.hparams["causal"]
+    assert not loaded.tokenizer.network.causal
     assert torch.equal(loaded.encode(scene), expected)

@@ -9,7 +9,7 @@ import numpy as np
 import roma
 import torch
 
-from magnet.body.base import JOINT_NAMES, PARENTS
+from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import (  # isort: skip
+    ANKLES, HEAD, HIPS, JOINT_NAMES, L_ANKLE, L_FOOT, NECK, PELVIS, R_ANKLE, R_FOOT, SHOULDERS,
+)  # fmt: skip
 from magnet.datamodules.preparing.check_people import WILD_ANGLE, who
 from magnet.datamodules.reading.recording import Axis, DataError, Recording
 
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-HEAD, NECK, ANKLES, HIPS, SHOULDERS = 15, 12, (7, 8), (1, 2), (16, 17)
 FEET = ((7, 10), (8, 11))
-WALKING = [0, 7, 10, 8, 11]
+WALKING = [PELVIS, L_ANKLE, L_FOOT, R_ANKLE, R_FOOT]
 """Joints that tell the frame rate: the pelvis, then each foot's two."""
 TURN = 2 * math.pi * 1.05
 """A rotation vector longer than a full turn is not one; recordings that unwrap angles stay below."""

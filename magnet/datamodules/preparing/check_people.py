@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.body.base import JOINT_NAMES
+from magnet.body.joints import ANKLES, HEAD, JOINT_NAMES
 from magnet.datamodules.reading.recording import DataError, Recording
 
 Array = NDArray[np.floating[Any]]
@@ -95,7 +95,7 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
     Raises:
         DataError: one is not.
     """
-    tall = rest[:, 15, 1] - rest[:, [7, 8], 1].mean(axis=1)
+    tall = rest[:, HEAD, 1] - rest[:, ANKLES, 1].mean(axis=1)
     for p in np.flatnonzero(~((tall >= STATURE[0]) & (tall <= STATURE[1]))).tolist():
         raise DataError(
             f"{who(p, names)}: the head is {tall[p]:.2f} m over the ankles in the body that betas make, expected "

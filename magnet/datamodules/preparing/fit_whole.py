@@ -13,6 +13,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.fit import BodyFit, floor_height
+from magnet.body.joints import ELBOWS, FEET, HIPS, KNEES, SHOULDERS, WRISTS
 from magnet.datamodules.preparing.canonicalize import fit_positions
 from magnet.datamodules.reading.asf_amc import AmcRecording
 from magnet.datamodules.reading.cmu_glitches import Glitches
@@ -20,7 +21,7 @@ from magnet.datamodules.reading.cmu_joints import measured
 from magnet.datamodules.reading.recording import Recording
 from magnet.motion.scene import Scene
 
-LIMBS = (1, 2, 4, 5, 7, 8, 10, 11, 16, 17, 18, 19, 20, 21)
+LIMBS = (*HIPS, *KNEES, *FEET, *SHOULDERS, *ELBOWS, *WRISTS)
 HELD = 0.20
 """Metres within which two people's wrists say that they may hold hands."""
 
@@ -73,8 +74,8 @@ def fit_whole(
     limbs = [joints.index(j) for j in LIMBS]
     found = body.joints(fit.scene)[0]
     scene, floor = on_floor(fit.scene, found, body)
-    wrists = [joints.index(20), joints.index(21)]
-    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, 20:22]))
+    wrists = [joints.index(joint) for joint in WRISTS]
+    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, WRISTS]))
     return Fitted(
         fit=BodyFit(scene, fit.residual),
         glitches=glitches,

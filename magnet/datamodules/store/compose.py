@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import from_planar, rotate_ground
+from magnet.motion.frames import from_planar
+from magnet.motion.planar import rotate_ground
 
 
 def place_apart(

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.body.base import PARENTS, Body
+from magnet.body.base import Body
+from magnet.body.joints import PARENTS
 from magnet.export.page.palette import GHOST, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes

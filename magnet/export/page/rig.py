@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.base import PARENTS, Body
+from magnet.body.base import Body
+from magnet.body.joints import PARENTS
 from magnet.export.limbs import CAPSULES, CROWN, L_HAND, L_HEEL, L_TOE, R_HAND, R_HEEL, R_TOE, STICKS, Limb, limbs
 from magnet.export.page.light import light
 from magnet.motion.scene import BODY_JOINTS, Scene

@@ -1,22 +1,16 @@
-"""What is watched: scenes read from files, who is in them, and which frames a model was given."""
+"""What is watched: scenes, who is in them, and which frames a model was given."""
 
 from __future__ import annotations
 
-import json
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.body.base import Body, load_body
 from magnet.export.page.rig import Array
 from magnet.export.trace import DenoisingTrace
-from magnet.files import load_npz
 from magnet.motion.scene import Scene
 
 SAMPLES = 4
@@ -88,67 +82,6 @@ def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLE
         take(f"{names[b]} · {b + 1}" if many else names[b], scene.select([b]), context)
         for b in range(min(scene.scenes, samples))
     ]
-
-
-def read_takes(
-    paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
-) -> tuple[list[ShownTake], Body]:
-    """All that several files hold, and the body it is shown on.
-
-    body: the user's; by default the open one.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file that cannot be read, files of different frame rates or bodies; says which and what to do.
-    """
-    body = body or load_body("open")
-    found: list[tuple[Path, ShownTake]] = []
-    for path in map(Path, paths):
-        scene, recording = read_scene(path, body)
-        here = takes(scene, path.stem, context, samples)
-        if recording is not None:
-            here = [take(path.stem, scene, context, recording)]
-        found += [(path, each) for each in here]
-    if not found:
-        raise ValueError("no file to show: magnet view FILE...")
-    rates = {each.scene.fps: path for path, each in found}
-    if len(rates) > 1:
-        listed = ", ".join(f"{path.name} has {fps:g}" for fps, path in rates.items())
-        raise ValueError(f"mixed frame rates (frames a second): {listed}; show files of one rate at a time")
-    return [each for _, each in found], body
-
-
-def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
-    """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not one of these, damaged, or of another body.
-    """
-    from magnet.export.formats import read  # late: it brings every format's code
-
-    if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_trace(path):
-        recording = DenoisingTrace.load(path)
-        if recording.scene.body != body.id:
-            raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
-        return recording.scene, recording
-    try:
-        return read(path, body).scene, None
-    except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
-
-
-def is_trace(path: Path) -> bool:
-    """Whether an npz holds denoising steps.
-
-    Raises:
-        ValueError: the archive is damaged.
-    """
-    try:
-        with load_npz(path) as file:
-            return "meta" in file.files and "recording" in json.loads(str(file["meta"]))
-    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error
 
 
 def same_length(one: ShownTake, other: ShownTake) -> Scene:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from magnet.body import Body
-from magnet.body.base import PARENTS
+from magnet.body.joints import PARENTS
 from magnet.export.page.html import FULL, page, save_html
 from magnet.export.page.takes import take
 from magnet.motion.scene import Scene

@@ -9,9 +9,10 @@ import torch
 
 from magnet.body import Body
 from magnet.export.npz import save_smplx
-from magnet.export.page.takes import read_takes, same_length, take, takes
+from magnet.export.page.takes import same_length, take, takes
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
+from magnet.viewer.takes import read_takes
 
 
 def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path, scene: Scene, body: Body) -> None:

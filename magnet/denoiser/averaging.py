@@ -1,3 +1,0 @@
-"""Where `WeightEMA` was, for configurations that name it here."""
-
-from magnet.training.ema import WeightEMA as WeightEMA

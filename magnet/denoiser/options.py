@@ -1,0 +1,158 @@
+"""Options of the denoiser, in groups; each is a group of flags, such as `--model.network.width`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from magnet.checks import require_choice, require_number, require_whole
+from magnet.motion.frames import Placement
+
+Rope = Literal["hidden", "heads", "none"]
+Distribution = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
+PairwiseNoise = Literal["noisier_end", "token"]
+Weighting = Literal["uniform", "min_snr"]
+
+
+@dataclass(frozen=True)
+class TransformerOptions:
+    """Size and parts of the network, paper Table A.2.
+
+    Args:
+        width: hidden size d.
+        layers: transformer blocks.
+        heads: attention heads.
+        mlp_ratio: MLP size over d.
+        dropout: in attention and MLPs; the paper does not say.
+        level_width: size of the noise-level embedding.
+        agent_width: size of the agent embedding.
+        slot_width: size of the level embedding of each partner slot (ours: the paper has one level a token).
+        rope: where time enters: `hidden` rotates the embedded token once, as in the paper, `heads` rotates queries and
+            keys, as usual elsewhere, `none` leaves time out (ablation, paper Table A.5).
+        agent_embedding: false takes the agents' identities away (ablation, paper Table A.5).
+        pairwise: false takes pairwise transforms out of the tokens (ablation, paper Table 5).
+        causal_block: token steps of a block of attention: a token sees blocks up to its own, so that what is finished
+            is not changed by what is not (ours). 0: everything sees everything, as in the paper.
+        pairwise_posterior: replaces predicted pairwise transforms by their posterior, given what is shown of them and
+            the predicted deltas (ours), see `PairwisePosterior`.
+        cond_dim: numbers C of a condition, such as a text's embedding (ours); 0: there is none.
+        cond_dropout: share of training scenes whose condition is hidden, so that the model can also do without one
+            (classifier-free guidance, Ho and Salimans 2022).
+    """
+
+    width: int = 512
+    layers: int = 6
+    heads: int = 8
+    mlp_ratio: int = 4
+    dropout: float = 0.05
+    level_width: int = 256
+    agent_width: int = 256
+    slot_width: int = 32
+    rope: Rope = "hidden"
+    agent_embedding: bool = True
+    pairwise: bool = True
+    causal_block: int = 0
+    pairwise_posterior: bool = False
+    cond_dim: int = 0
+    cond_dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("width", "layers", "heads", "mlp_ratio", "level_width", "agent_width", "slot_width"):
+            require_whole(name, getattr(self, name), 1)
+        for name in ("causal_block", "cond_dim"):
+            require_whole(name, getattr(self, name), 0)
+        for name in ("dropout", "cond_dropout"):
+            require_number(name, getattr(self, name), 0, 1)
+        require_choice("rope", self.rope, Rope)
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Which noise levels are trained on.
+
+    Args:
+        distribution: how levels are drawn: `per_token` (paper 3.2), `per_timestep`, `per_sequence` (A.6.2), or
+            `mixture` (ours: these and the patterns that sampling asks about).
+        shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
+        pairwise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents. `token`: one level a
+            token as the paper reads literally, which leaks where unknown agents are.
+        pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
+            smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
+    """
+
+    distribution: Distribution = "per_token"
+    shift: float = 1.0
+    pairwise: PairwiseNoise = "noisier_end"
+    pairwise_metres: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_choice("distribution", self.distribution, Distribution)
+        require_number("shift", self.shift, over=0)
+        require_choice("pairwise", self.pairwise, PairwiseNoise)
+        require_number("pairwise_metres", self.pairwise_metres, least=0)
+
+
+@dataclass(frozen=True)
+class DenoiserLoss:
+    """Weights of the terms of the loss, and what each error counts. The paper gives no numbers for its lambdas.
+
+    Args:
+        latent: lambda_0 of paper Eq. 10.
+        delta: lambda_1 of paper Eq. 10, on the canonical deltas from frame to frame.
+        pairwise: lambda_2 of paper Eq. 10.
+        consistency: lambda_3 of paper Eq. 10, for rotation and translation alike.
+        consistency_warmup: training steps over which lambda_3 grows from 0.
+        near: error of pairwise transforms in which centimetres near a partner count (ours); see
+            `magnet.denoiser.losses.near_loss`.
+        joint: distance of the decoded joints, in metres (ours); see `magnet.denoiser.body_losses`.
+        velocity: error of the decoded joints' velocities, in m/s (ours).
+        partner: distance of the partners' decoded joints, as each sees them, in metres (ours).
+        hands: error of the vectors between people's wrists within reach, in metres (ours).
+        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these four.
+        weighting: how much a token's error counts by its noise: `uniform`, as in the paper, or `min_snr`; see
+            `magnet.denoiser.losses.snr_weights`.
+        snr_gamma: gamma of `min_snr`, the most that an error counts.
+    """
+
+    latent: float = 1.0
+    delta: float = 1.0
+    pairwise: float = 1.0
+    consistency: float = 0.1
+    consistency_warmup: int = 1000
+    near: float = 0.0
+    joint: float = 0.0
+    velocity: float = 0.0
+    partner: float = 0.0
+    hands: float = 0.0
+    decoded_share: float = 0.25
+    weighting: Weighting = "uniform"
+    snr_gamma: float = 5.0
+
+    def __post_init__(self) -> None:
+        require_whole("consistency_warmup", self.consistency_warmup, 0)
+        require_number("decoded_share", self.decoded_share, 0, 1)
+        require_choice("weighting", self.weighting, Weighting)
+        require_number("snr_gamma", self.snr_gamma, over=0)
+
+
+@dataclass(frozen=True)
+class SelfForcing:
+    """Training on a past that the model has made itself (ours); see `magnet.denoiser.self_forcing`.
+
+    How such a past is placed in the world is said here, and not taken from the sampler, so that tuning the sampler
+    changes no training.
+
+    Args:
+        share: of the training scenes with a past, how many show it as the model would have made it.
+        placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.frames.place`.
+        pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
+    """
+
+    share: float = 0.0
+    placement: Placement = "fuse"
+    pairwise_weight: float = 0.02
+
+    def __post_init__(self) -> None:
+        require_number("share", self.share, 0, 1)
+        require_choice("placement", self.placement, Placement)
+        require_number("pairwise_weight", self.pairwise_weight, least=0)

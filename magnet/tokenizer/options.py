@@ -1,0 +1,112 @@
+"""Options of the tokenizer, in groups; each is a group of flags, such as `--model.quantizer.codebook_size`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from magnet.checks import require_choice, require_number, require_whole
+
+QuantizerKind = Literal["residual_vq", "fsq"]
+
+
+@dataclass(frozen=True)
+class AutoencoderOptions:
+    """Size of encoder and decoder.
+
+    Args:
+        width: channels of the convolutions, paper Table A.2.
+        depth: residual blocks in each of the two stages; the paper does not say.
+        causal: no token sees later frames, so tokens of a growing clip never change (ours, for streaming).
+    """
+
+    width: int = 512
+    depth: int = 3
+    causal: bool = False
+
+    def __post_init__(self) -> None:
+        require_whole("width", self.width, 1)
+        require_whole("depth", self.depth, 1)
+
+
+@dataclass(frozen=True)
+class QuantizerOptions:
+    """What makes codes of the encoder's output.
+
+    Args:
+        kind: `residual_vq`: codebooks that are learned, of which the paper has one. `fsq`: finite scalar quantization,
+            which has no codebook to learn (ours): each number of a code is rounded to one of a few levels.
+        codebook_size: codes in each codebook, paper Table A.2. Only of `residual_vq`, as all that follows up to levels.
+        codebook_dim: numbers in a code, paper Table A.2.
+        num_quantizers: codebooks in a row, each coding what the ones before left over (ours); the paper has 1.
+        ema_decay: of the moving averages that the codes follow.
+        dead_code_threshold: a code chosen less often than this a batch is moved to a vector of the batch.
+        levels: of `fsq`, so many values each number of a code can have. The default makes 64,000 codes (Mentzer et al.
+            2023, Finite scalar quantization: VQ-VAE made simple, Table 1).
+    """
+
+    kind: QuantizerKind = "residual_vq"
+    codebook_size: int = 1024
+    codebook_dim: int = 512
+    num_quantizers: int = 1
+    ema_decay: float = 0.99
+    dead_code_threshold: float = 1.0
+    levels: tuple[int, ...] = (8, 8, 8, 5, 5, 5)
+
+    def __post_init__(self) -> None:
+        require_choice("kind", self.kind, QuantizerKind)
+        for name in ("codebook_size", "codebook_dim", "num_quantizers"):
+            require_whole(name, getattr(self, name), 1)
+        require_number("ema_decay", self.ema_decay, 0, 1)
+        require_number("dead_code_threshold", self.dead_code_threshold, least=0)
+        object.__setattr__(self, "levels", tuple(self.levels))  # lists come from files
+        if not self.levels:
+            raise ValueError("levels: got none, expected how many values each number of a code can have, such as [8,5]")
+        for level in self.levels:
+            require_whole("levels", level, 2)
+
+
+@dataclass(frozen=True)
+class TokenizerLoss:
+    """Weights of the terms of the loss; see `magnet.tokenizer.losses.reconstruction_losses`.
+
+    Args:
+        joint_rotation: lambda_j of paper Eq. 4, on the mean angle of the 21 joints.
+        root_rotation: lambda_r of paper Eq. 4, on the rotation of Eq. 5.
+        root_translation: lambda_r of paper Eq. 4, on the translation of Eq. 5.
+        commitment: pulls embeddings to their codes; the paper does not say.
+        joint: distance of the decoded joints, in metres (ours).
+        velocity: error of the decoded joints' velocities, in m/s, against flicker (ours).
+        foot_velocity: the same of ankles and toes alone, against sliding feet (ours).
+        foot_contact: speed over the ground at which toes slide that stand in the recording, in m/s (ours).
+    """
+
+    joint_rotation: float = 1.0
+    root_rotation: float = 0.5
+    root_translation: float = 0.5
+    commitment: float = 0.3
+    joint: float = 0.0
+    velocity: float = 0.0
+    foot_velocity: float = 0.0
+    foot_contact: float = 0.0
+
+
+@dataclass(frozen=True)
+class AugmentOptions:
+    """What is changed in training batches, so that a small data set is not learnt by heart (ours).
+
+    Args:
+        limb_swap_prob: share of limbs that move as somebody else's of the batch do.
+        joint_noise: standard deviation in radians of a random rotation of each joint, the same in all frames.
+        root_noise: the deltas that the decoder is given are off by up to so many m/s, as sampled ones are; with the
+            loss `foot_contact` the decoder learns to keep feet where they stand.
+    """
+
+    limb_swap_prob: float = 0.0
+    joint_noise: float = 0.0
+    root_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_number("limb_swap_prob", self.limb_swap_prob, 0, 1)
+        require_number("joint_noise", self.joint_noise, least=0)
+        require_number("root_noise", self.root_noise, least=0)
