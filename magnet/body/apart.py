@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.body.capsules import CAPSULES, capsule_segments
+from magnet.body.joints import PELVIS
 
 ARMS = [capsule.name.endswith("arm") for capsule in CAPSULES]
 """Capsules of arms: people hold, link arms and lay them around each other."""
 
-PELVIS = 0
 FARTHEST = 0.6
 """Metres that two people are moved apart at most: nobody is thicker than that."""
 
@@ -188,7 +188,7 @@ def kept_apart(
             if not bool(inside.any()):
                 continue
             away = direction(one, other, widened(inside, 2 * keep.ease))
-            needed = distance_needed(*(x.flatten(0, 1) for x in (one, other, away)), keep).view(B, T)
+            needed = distance_needed(one.flatten(0, 1), other.flatten(0, 1), away.flatten(0, 1), keep).view(B, T)
             movable = free[:, :, i].int() + free[:, :, j].int()
             needed = eased(
                 torch.where((present[:, i] & present[:, j])[:, None] & (movable > 0), needed, 0.0), keep.ease

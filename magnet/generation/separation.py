@@ -12,7 +12,7 @@ from magnet.body import Body, load_body
 from magnet.body.apart import APART, kept_apart
 from magnet.motion.frames import from_planar, posed
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
 """latent (B, n, P, C), betas (B, P, 10), deltas (B, n, P, 4, 9) -> poses (B, 4 n, P, 135)"""
@@ -61,17 +61,20 @@ def separated(
 
     def bodies(rows: slice) -> Tensor:
         """Joints in some of the rows, decoded from these alone. -> (B, 4 n, P, 22, 3)"""
-        frames = slice((rows.start or 0) * STRIDE, None if rows.stop is None else rows.stop * STRIDE)
+        frames = slice((rows.start or 0) * TOKEN_FRAMES, None if rows.stop is None else rows.stop * TOKEN_FRAMES)
         recorded = given.frames_at(frames)
         made = posed(decode(latent[:, rows], given.betas, deltas[:, rows]), T_world_can[:, frames], recorded)
-        body, there = _body(latent.device), known[rows].repeat_interleave(STRIDE, dim=0)
-        return torch.where(there[..., None, None], *(body.joints(s.replace(body=body.id)) for s in (recorded, made)))
+        body, there = _body(latent.device), known[rows].repeat_interleave(TOKEN_FRAMES, dim=0)
+        real, decoded = (body.joints(scene.replace(body=body.id)) for scene in (recorded, made))
+        return torch.where(there[..., None, None], real, decoded)
 
-    joints, rows = bodies(slice(None)), new.repeat_interleave(STRIDE, dim=0)
+    joints, rows = bodies(slice(None)), new.repeat_interleave(TOKEN_FRAMES, dim=0)
     still = joints
     if begun:
         last = bodies(slice(0, 1))[:, -1:]
-        still = torch.cat([joints[:, :STRIDE], last.expand(-1, joints.shape[1] - STRIDE, -1, -1, -1)], dim=1)
+        still = torch.cat(
+            [joints[:, :TOKEN_FRAMES], last.expand(-1, joints.shape[1] - TOKEN_FRAMES, -1, -1, -1)], dim=1
+        )
     moved = torch.zeros_like(T_world_can[..., :2, 3])
     agents = torch.arange(new.shape[1], device=new.device)
     for who in [agents == agent for agent in agents[new.any(dim=0)]] if decentralized else [new.any(dim=0)]:

@@ -140,7 +140,7 @@ class WorldState:
         if lead:
             before = self.model.normalizer.denormalize(tokens[:, first - 1 : first])
             latent = torch.cat([self.model.layout.unpack(before)[0], latent], dim=1)
-        low, frames = first - lead, slice((first - lead) * STRIDE, stop * STRIDE)
+        low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
         self.T_world_can[:, frames] = separated(
             self.model.tokenizer.decode,

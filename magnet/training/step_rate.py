@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import nn
 
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import STRIDE
+from magnet.motion.tokens import TOKEN_FRAMES
 
 WARM_UP = 3
 """Steps that are not counted: they compile, allocate and choose kernels."""
@@ -84,7 +84,7 @@ class StepRate(Callback):
 
 def tokens_of(batch: Any) -> int:
     """Tokens of a batch of scenes, free slots among them."""
-    return batch.scenes * batch.agents * (batch.frames // STRIDE) if isinstance(batch, Scene) else 0
+    return batch.scenes * batch.agents * (batch.frames // TOKEN_FRAMES) if isinstance(batch, Scene) else 0
 
 
 def _now(device: torch.device) -> float:
