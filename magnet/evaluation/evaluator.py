@@ -230,6 +230,7 @@ class Evaluator(L.LightningModule):
             generators,
             self.progress,
             self.stats,
+            self.denoiser.condition(scene),
         )
 
     def _training_windows(self, datamodule: MotionDataModule) -> Windows:
