@@ -23,6 +23,7 @@ from magnet.baselines.predictor import Generators
 from magnet.cli import run_folder
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
+from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import TRUTH, Evaluator
 from magnet.evaluation.results import Results, machine
@@ -137,7 +138,7 @@ def main() -> None:
     file = given.out / "results.json"
     found = Results.load_json(file) if file.exists() else Results({}, {})
     model = Denoiser.load(given.ckpt_path)
-    data = CMU(singles=False, test_stride=given.stride, test_batch_size=12, max_agents=model.layout.agents)
+    data = CMU(singles=False, test=HeldOutScenes(stride=given.stride, batch_size=12), max_agents=model.layout.agents)
     wanted = rows(SamplerOptions(steps=given.steps))
     plain, inpainting = SamplerOptions(steps=given.steps), PARTNER + "partner_inpainting"
     wanted["joint_future" + REPLACED] = (JointFuture(), plain)

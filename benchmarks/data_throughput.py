@@ -118,7 +118,7 @@ def measure(given: argparse.Namespace, way: str, store: Path) -> dict[str, Any]:
     device = "meta" if way == "for a GPU" else given.device
     if device != "cpu":
         there: Any = data.store("train").to(device)
-        frames, clearance = data.window_frames, data.compose_clearance
+        frames, clearance = data.window_frames, data.augment.compose_clearance
         if not resident:
             loader.fetch = lambda draw: there.fetch(draw, frames, clearance)
         loader.gather = {

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from magnet.datamodules.cmu import CMU
+from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.evaluation.results import machine
@@ -54,7 +55,8 @@ def main() -> None:
     options = parser.parse_args()
     model = Denoiser.load(options.ckpt_path)
     frames = model.window * TOKEN_FRAMES
-    data = CMU(singles=False, test_takes=options.takes, test_stride=frames, horizon_frames=frames - 32, batch_size=16)
+    test = HeldOutScenes(stride=frames, horizon_frames=frames - 32)
+    data = CMU(singles=False, test_takes=options.takes, test=test, batch_size=16)
     data.prepare_data()
     data.setup("test")
     scenes = concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)

@@ -86,7 +86,21 @@ TOKENIZER: dict[str, str | None] = {
     "drift": "augment.root_noise",
 }
 
-DATA: dict[str, str | None] = {}
+DATA: dict[str, str | None] = {
+    "mirror": "augment.mirror",
+    "shuffle_agents": "augment.shuffle",
+    "drop_agent": "augment.drop",
+    "drop_at_most": "augment.drop_at_most",
+    "compose": "augment.compose",
+    "compose_apart": "augment.compose_apart",
+    "compose_clearance": "augment.compose_clearance",
+    "context_frames": "test.context_frames",
+    "horizon_frames": "test.horizon_frames",
+    "test_stride": "test.stride",
+    "test_limit": "test.limit",
+    "composed_test": "test.composed",
+    "test_batch_size": "test.batch_size",
+}
 
 SAMPLER: dict[str, str | None] = {
     "requantise": "requantize",

@@ -137,13 +137,13 @@ def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -
     for run in (tokenizer, denoiser):
         assert run["data.class_path"].endswith(SETS[name])
         assert (run["data.init_args.batch_size"], run["data.init_args.window_frames"]) == (256, 64)
-        assert run["data.init_args.mirror"] and run["data.init_args.shuffle_agents"]
-        assert run["data.init_args.compose"] == 0
+        assert run["data.init_args.augment.mirror"] and run["data.init_args.augment.shuffle"]
+        assert run["data.init_args.augment.compose"] == 0
         optimizer = [run[f"model.init_args.optimizer.{name}"] for name in ("learning_rate", "weight_decay")]
         assert optimizer == [2e-4, 1e-4]
         people = 4 if name == "embody3d" else 2
         assert run["data.init_args.max_agents"] == people
-        masked = (run["data.init_args.drop_agent"] > 0, run["data.init_args.drop_at_most"])
+        masked = (run["data.init_args.augment.drop"] > 0, run["data.init_args.augment.drop_at_most"])
         assert masked == ((True, 2) if people == 4 else (False, 1))
     sizes = {"network.width": 512, "quantizer.codebook_dim": 512, "quantizer.codebook_size": 1024}
     sizes |= {"quantizer.num_quantizers": 1}
@@ -249,7 +249,7 @@ def test_every_ablation_trains_and_both_ways_of_sampling_sample(folder: Path, tm
         raw = "tokenizer" in yaml.safe_load(row.read_text())["model"]["init_args"]
         more = () if raw else ("--model.tokenizer", tokenizer)
         checkpoint = two_steps(row, data, tmp_path / row.stem, *more)
-    short = ("--data.context_frames", "8", "--data.horizon_frames", "8", "--data.test_limit", "2")
+    short = ("--data.test.context_frames", "8", "--data.test.horizon_frames", "8", "--data.test.limit", "2")
     quick = ("--sampler.steps", "3", "--samples", "1", "--baselines", "false", "--ckpt_path", str(checkpoint))
     for row in sorted((PAPER / "ablations").glob("tableA6_*.yaml")):
         out = tmp_path / f"tested_{row.stem}"

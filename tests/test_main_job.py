@@ -17,12 +17,12 @@ DATA = {
     "train_clips": "5",
     "val_clips": "2",
     "test_clips": "4",
-    "test_limit": "2",
+    "test.limit": "2",
     "clip_frames": "200",
     "batch_size": "4",
     "epoch_size": "8",
     "window_frames": "32",
-    "horizon_frames": "40",
+    "test.horizon_frames": "40",
 }
 FAST = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 

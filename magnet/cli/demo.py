@@ -17,6 +17,7 @@ from magnet import weights
 from magnet.body import Body
 from magnet.cli import outputs, run_folder
 from magnet.cli.train import quiet
+from magnet.datamodules.options import HeldOutScenes
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import Evaluator, aligned
@@ -93,7 +94,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         f"{HORIZON / 30:.0f} seconds go for everybody in them. All numbers below are computed now."
     )
     data = Synthetic(
-        test_clips=options.scenes, test_limit=options.scenes, train_clips=60, test_batch_size=options.scenes
+        test_clips=options.scenes,
+        train_clips=60,
+        test=HeldOutScenes(limit=options.scenes, batch_size=options.scenes),
     )
     sampler = SamplerOptions.preset(options.sampler, **({} if options.steps is None else {"steps": options.steps}))
     results = measure(model, data, sampler, options.samples)

@@ -95,7 +95,7 @@ def write_scenes(
             scene.save(folder / "scenes" / f"{name}.npz")
             if picture != "none" and number < pictures and evaluator.global_rank == 0:
                 shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
-                look = {"context_frames": data.context_frames, "body": data.body.to("cpu")}
+                look = {"context_frames": data.test.context_frames, "body": data.body.to("cpu")}
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1

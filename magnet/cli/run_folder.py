@@ -167,7 +167,7 @@ class SamplingProgress(ProgressBar):
 
     def _begin(self, what: str, batches: float, trainer: Trainer, model: Any) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        plan = model.schedule(data.context_frames, data.horizon_frames)
+        plan = model.schedule(data.test.context_frames, data.test.horizon_frames)
         self.what, self.done, self.total = what, 0, int(batches) * plan.evaluations
         model.progress = self._advance
         self.lines._start()

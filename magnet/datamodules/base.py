@@ -14,11 +14,12 @@ from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.datamodules.clip import Clip, Split, at_least
+from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store.mapped import MappedStore, SplitData
 from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.window_index import WindowIndex
-from magnet.datamodules.store.windows import Augmentation, RandomWindows, composed_windows, fixed_windows
+from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 
@@ -33,32 +34,17 @@ class MotionDataModule(LightningDataModule):
     """Base of all data sets; a subclass implements `clips` and perhaps `prepare_data`.
 
     All frames of a split live in memory, on the trainer's device where there is one, and batches are gathered
-    there. Without a trainer the loaders yield scenes on the CPU. Augmentation is training's alone. A random
-    yaw is not among it: tokens do not change under one (paper 3.1).
+    there. Without a trainer the loaders yield scenes on the CPU.
 
     Args:
         window_frames: frames of a training and validation window; 64 are 16 tokens (the paper does not say).
         batch_size: scenes a training batch and process (paper A.3).
         max_agents: slots P of every batch; smaller scenes leave slots empty (paper 4, 2 to 4 people).
-        mirror: mirror every other training window, left and right exchanged (paper A.4.1).
-        shuffle_agents: random order of slots, empty ones included, in every training window (paper A.4.1).
-        drop_agent: probability that a training scene of two or more loses somebody (paper 4: p agents are
-            randomly masked during training; it does not say how often).
-        drop_at_most: the most people that such a scene loses; how many is drawn evenly, and never everybody.
-        compose: probability that a second, independent clip's people join a training scene where slots are
-            free, which makes scenes of three and four (ours); has no effect with two slots.
-        compose_apart: shortest and longest distance in metres between the two groups' centres, drawn evenly.
-        compose_clearance: metres that pelvises of different groups keep apart at every frame; they are placed
-            further away than drawn where that takes it.
+        augment: what happens to training windows.
+        test: which scenes test.
         weights: share of each source of clips among training windows; None: as many as it has frames.
         epoch_size: training windows an epoch over all processes; None: as many as fit side by side into the
             training frames, times four.
-        context_frames: known frames of a test scene; 0 for tasks that start from nothing.
-        horizon_frames: frames of a test scene to predict; 150 are five seconds.
-        test_stride: frames between the starts of test scenes of a clip; None: they do not overlap.
-        test_limit: at most so many test scenes, evenly spaced over all; None: all.
-        composed_test: so many more test scenes of three and four people in turn, composed of two clips.
-        test_batch_size: scenes a test and prediction batch.
         val_batch_size: scenes a validation batch.
         seed: of all randomness here: sample i of epoch e depends only on (seed, e, i).
         body_model: "open" or the path of a body file in SMPL-X's npz layout.
@@ -78,21 +64,10 @@ class MotionDataModule(LightningDataModule):
         window_frames: int = 64,
         batch_size: int = 256,
         max_agents: int = 2,
-        mirror: bool = True,
-        shuffle_agents: bool = True,
-        drop_agent: float = 0.1,
-        drop_at_most: int = 1,
-        compose: float = 0.25,
-        compose_apart: tuple[float, float] = (1.6, 3.5),
-        compose_clearance: float = 0.9,
+        augment: Augmentation = AUGMENTATION,
+        test: HeldOutScenes = HELD_OUT,
         weights: dict[str, float] | None = None,
         epoch_size: int | None = None,
-        context_frames: int = 32,
-        horizon_frames: int = 150,
-        test_stride: int | None = None,
-        test_limit: int | None = None,
-        composed_test: int = 0,
-        test_batch_size: int = 16,
         val_batch_size: int = 256,
         seed: int = 1111,
         body_model: str = "open",
@@ -101,29 +76,15 @@ class MotionDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         at_least(1, window_frames=window_frames, batch_size=batch_size, max_agents=max_agents, epoch_size=epoch_size)
-        at_least(1, horizon_frames=horizon_frames, test_stride=test_stride, test_limit=test_limit)
-        at_least(1, test_batch_size=test_batch_size, val_batch_size=val_batch_size)
-        at_least(0, context_frames=context_frames, composed_test=composed_test, read_ahead=read_ahead)
+        at_least(1, val_batch_size=val_batch_size)
+        at_least(0, read_ahead=read_ahead)
         self.window_frames = window_frames
         self.batch_size = batch_size
         self.max_agents = max_agents
-        self.augmentation = Augmentation(
-            mirror=0.5 if mirror else 0.0,
-            shuffle=shuffle_agents,
-            drop=drop_agent,
-            drop_at_most=drop_at_most,
-            compose=compose,
-            apart=(compose_apart[0], compose_apart[1]),
-        )
-        self.compose_clearance = compose_clearance
+        self.augment = augment
+        self.test = test
         self.weights: Mapping[str, float] | None = weights
         self.epoch_size = epoch_size
-        self.context_frames = context_frames
-        self.horizon_frames = horizon_frames
-        self.test_stride = test_stride
-        self.test_limit = test_limit
-        self.composed_test = composed_test
-        self.test_batch_size = test_batch_size
         self.val_batch_size = val_batch_size
         self.seed = seed
         self.body_model = body_model
@@ -187,7 +148,7 @@ class MotionDataModule(LightningDataModule):
         return self.store(split, device)
 
     def _gather(self, split: Split, frames: int, windows: WindowIndex) -> Scene:
-        return self._placed(split).gather(windows, frames, self.compose_clearance)
+        return self._placed(split).gather(windows, frames, self.augment.compose_clearance)
 
     def _shard(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
@@ -205,9 +166,9 @@ class MotionDataModule(LightningDataModule):
         self._close()
         store = self.store("train")
         place = self._shard()
-        draws = RandomWindows(store, self.window_frames, self.weights, self.augmentation, self.seed, *place)
+        draws = RandomWindows(store, self.window_frames, self.weights, self.augment, self.seed, *place)
         size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
-        placed, frames, clearance = self._placed("train"), self.window_frames, self.compose_clearance
+        placed, frames, clearance = self._placed("train"), self.window_frames, self.augment.compose_clearance
         if isinstance(placed, MappedStore):
             self._train_loader = TrainLoader(
                 draws,
@@ -230,9 +191,7 @@ class MotionDataModule(LightningDataModule):
     def statistics_batches(self, batches: int = 8) -> Iterator[Scene]:
         """Training batches to take statistics from: the same on every rank, and no part of the training stream."""
         store = self.store("train")
-        draws = RandomWindows(
-            store, self.window_frames, self.weights, self.augmentation, derive(self.seed, "statistics")
-        )
+        draws = RandomWindows(store, self.window_frames, self.weights, self.augment, derive(self.seed, "statistics"))
         for number in range(batches):
             yield self._gather("train", self.window_frames, draws(0, number * self.batch_size, self.batch_size))
 
@@ -250,9 +209,8 @@ class MotionDataModule(LightningDataModule):
         return self._fixed("val", windows, self.window_frames, self.val_batch_size)
 
     def test_dataloader(self) -> FixedLoader:
-        """Context and horizon of scenes of the test split (test_batch_size, context + horizon, max_agents)."""
-        frames = self.context_frames + self.horizon_frames
-        return self._fixed("test", self.test_windows(), frames, self.test_batch_size)
+        """Context and horizon of scenes of the test split (test.batch_size, context + horizon, max_agents)."""
+        return self._fixed("test", self.test_windows(), self.test.frames, self.test.batch_size)
 
     def predict_dataloader(self) -> FixedLoader:
         """The same scenes as `test_dataloader`."""
@@ -269,13 +227,13 @@ class MotionDataModule(LightningDataModule):
 
     def test_windows(self) -> WindowIndex:
         """Which windows the test scenes are; composed ones come last."""
-        store, frames = self.store("test"), self.context_frames + self.horizon_frames
-        plain = windows = fixed_windows(store, frames, self.test_stride or frames)
-        if self.test_limit is not None and len(plain) > self.test_limit:
-            kept = np.arange(self.test_limit) * len(plain) // self.test_limit
+        store, frames = self.store("test"), self.test.frames
+        plain = windows = fixed_windows(store, frames, self.test.stride or frames)
+        if self.test.limit is not None and len(plain) > self.test.limit:
+            kept = np.arange(self.test.limit) * len(plain) // self.test.limit
             windows = WindowIndex.concatenate([plain[slice(k, k + 1)] for k in kept])
-        if self.composed_test and len(plain):
-            composed = composed_windows(store, plain, self.composed_test, self.augmentation.apart, self.seed)
+        if self.test.composed and len(plain):
+            composed = composed_windows(store, plain, self.test.composed, self.augment.compose_apart, self.seed)
             windows = WindowIndex.concatenate([windows, composed])
         return windows
 
@@ -285,7 +243,9 @@ class MotionDataModule(LightningDataModule):
         Raises:
             ValueError: no clip is long enough.
         """
-        return self.store("train").gather(self._train_index(frames, stride, composed), frames, self.compose_clearance)
+        return self.store("train").gather(
+            self._train_index(frames, stride, composed), frames, self.augment.compose_clearance
+        )
 
     def train_windows(self, frames: int, stride: int = 30, composed: int = 0, chunk: int = 64) -> Iterator[Scene]:
         """The same as `train_scenes`, in batches of at most `chunk` scenes.
@@ -295,7 +255,7 @@ class MotionDataModule(LightningDataModule):
         """
         store, windows = self.store("train"), self._train_index(frames, stride, composed)
         for first in range(0, len(windows), chunk):
-            yield store.gather(windows[first : first + chunk], frames, self.compose_clearance)
+            yield store.gather(windows[first : first + chunk], frames, self.augment.compose_clearance)
 
     def _train_index(self, frames: int, stride: int, composed: int) -> WindowIndex:
         store = self.store("train")
@@ -307,7 +267,7 @@ class MotionDataModule(LightningDataModule):
             )
         if composed:
             windows = WindowIndex.concatenate(
-                [windows, composed_windows(store, windows, composed, self.augmentation.apart, self.seed)]
+                [windows, composed_windows(store, windows, composed, self.augment.compose_apart, self.seed)]
             )
         return windows
 

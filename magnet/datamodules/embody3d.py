@@ -238,7 +238,7 @@ class Embody3D(Prepared):
     """Embody 3D from a prepared store: scenes of two to four people.
 
     A model of two, three or four people trains on a store that was prepared with `people` of that number; the mixed
-    one on a store of all, where `drop_agent` and `drop_at_most` mask people at random (paper 4).
+    one on a store of all, where `augment.drop` and `augment.drop_at_most` mask people at random (paper 4).
 
     Args:
         path: the store's folder.

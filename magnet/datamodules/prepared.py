@@ -27,7 +27,7 @@ class Prepared(MotionDataModule):
         root: another name of `path`, as the folders of other data sets are called.
         spread: let each process read a length of its own, where there are enough clips; False: all draw from all.
         roles: words such as leader and follower; people whose names in the store hold the first stand in the first
-            slots, and so on, others after them in the order of the recording. To be seen with `shuffle_agents` off.
+            slots, and so on, others after them in the order of the recording. To be seen with `augment.shuffle` off.
         device_resident: keep all frames decoded in memory, on the trainer's device; for stores that fit there.
         body_model: "open", or the path of the body file that the store was prepared with.
         max_agents: slots P of every batch; at least the store's largest group.

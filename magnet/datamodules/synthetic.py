@@ -9,9 +9,11 @@ import torch
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.clip import SPLITS
+from magnet.datamodules.options import Augmentation
 from magnet.datamodules.registry import register_data
 from magnet.synthesis import COUPLINGS, CoupledScene, synthesize
 
+NOT_COMPOSED = Augmentation(compose=0.0)
 SEEDS = 1_000_000
 """Seeds a split owns: clips of different splits never share one."""
 
@@ -32,8 +34,7 @@ class Synthetic(MotionDataModule):
         clip_frames: frames of a clip at 30 fps, at least 120.
         scene_seed: which world of scenes; not the seed of windows and augmentation.
         max_agents: slots P of every batch; at least the largest group.
-        compose: probability that a second clip's people join a training scene; groups of all sizes are here
-            already.
+        augment: what happens to training windows; groups of all sizes are here already, and none is composed.
         **kwargs: as for MotionDataModule.
 
     Raises:
@@ -50,10 +51,10 @@ class Synthetic(MotionDataModule):
         clip_frames: int = 300,
         scene_seed: int = 0,
         max_agents: int = 4,
-        compose: float = 0.0,
+        augment: Augmentation = NOT_COMPOSED,
         **kwargs: Any,
     ) -> None:
-        super().__init__(max_agents=max_agents, compose=compose, **kwargs)
+        super().__init__(max_agents=max_agents, augment=augment, **kwargs)
         names = list(COUPLINGS) if couplings is None else list(couplings)
         unknown = [name for name in names if name not in COUPLINGS]
         if unknown or not names:

@@ -185,13 +185,23 @@ class Denoiser(L.LightningModule):
         latent[scene.present] = people
         return latent.transpose(1, 2)
 
-    def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+    def condition(self, scene: Scene) -> Tensor | None:
+        """What scenes are conditioned on, (B, C) or (B, N, C); None: nothing, as in the paper.
+
+        The place for text, music or a goal: a subclass embeds them here, C is `network.cond_dim`. Training and testing
+        ask for it; who samples gives it to `generate` as `cond`. It must tell nothing that a user would not know.
+        """
+        return None
+
+    def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
         """Predict clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
+
+        `cond` is that of `Transformer.forward`.
 
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        clean = self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present)
+        clean = self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
         if self.posterior is None:
             return clean
         with torch.autocast(noisy.device.type, enabled=False):  # half precision would blur the transforms
@@ -279,9 +289,10 @@ class Denoiser(L.LightningModule):
             levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
             group_levels = layout.group_levels(levels)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
-            shown = self._self_forced(truth, levels, scene, generator)
+            cond = self.shown_condition(scene, generator)
+            shown = self._self_forced(truth, levels, scene, cond, generator)
             noisy = add_noise(shown, noise, layout.spread(group_levels))
-        clean = self.denoise(noisy, levels, scene.present).float()
+        clean = self.denoise(noisy, levels, scene.present, cond).float()
         snr = snr_weights(group_levels, weight.snr_gamma) if weight.weighting == "min_snr" else None
         losses = token_losses(clean, truth, layout, there, snr)
         total = weight.latent * losses["latent"] + weight.delta * losses["delta"]
@@ -301,12 +312,22 @@ class Denoiser(L.LightningModule):
             losses |= bodies
         return {"loss": total, **losses}
 
-    def _self_forced(self, truth: Tensor, levels: Tensor, scene: Scene, generator: torch.Generator) -> Tensor:
+    def shown_condition(self, scene: Scene, generator: torch.Generator) -> Tensor | None:
+        """The condition of a batch, hidden from some of its scenes in training."""
+        cond = self.condition(scene)
+        if cond is None or not (self.training and self.network.cond_dropout):
+            return cond
+        hidden = torch.rand(len(cond), generator=generator, device=cond.device) < self.network.cond_dropout
+        return torch.where(hidden.view(-1, *[1] * (cond.ndim - 1)), torch.nan, cond)
+
+    def _self_forced(
+        self, truth: Tensor, levels: Tensor, scene: Scene, cond: Tensor | None, generator: torch.Generator
+    ) -> Tensor:
         if not (self.training and self.self_forcing.share):
             return truth
         requantize = self.tokenizer.requantize if self.quantized else None
         parts = (self.denoise, requantize, self.normalizer, self.layout)
-        return with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift)
+        return with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift, cond)
 
     def require_body(self) -> Body:
         """The body whose joints decoded losses compare, on this model's device."""

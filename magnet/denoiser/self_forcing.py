@@ -14,8 +14,8 @@ from magnet.motion.tokens import TokenLayout, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
 from magnet.tokenizer.normalizer import Normalizer
 
-Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""noisy (B, N, P, D), levels (B, N, P), present (B, P) -> clean (B, N, P, D), all normalized"""
+Denoise = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
+"""noisy (B, N, P, D), levels (B, N, P), present (B, P), condition (B, ...) -> clean (B, N, P, D), all normalized"""
 
 MOST_NOISE, LEAST_NOISE = 0.75, 0.1
 """Between which of the even levels, as shares of K, a past is made noisy before the model restores it."""
@@ -33,6 +33,7 @@ def with_self_forcing(
     options: SelfForcing,
     generator: torch.Generator,
     shift: float = 1.0,
+    cond: Tensor | None = None,
 ) -> Tensor:
     """Normalized tokens in which the clean pasts of some scenes are the model's own work; the rest is the truth.
 
@@ -43,17 +44,17 @@ def with_self_forcing(
     Args:
         denoise: the model.
         requantize: latents to their nearest codes; None: they stay as they are.
-        normalizer: of the tokens.
-        layout: of the tokens.
+        normalizer, layout: of the tokens.
         truth: (B, N, P, D) normalized.
         levels: (B, N, P) int; the past of an agent is what is clean before something that is not.
         scene: the same scenes, of P agents.
         options: the share of scenes, and how a past is placed.
-        generator: source of all randomness.
+        generator: of all randomness.
         shift: of the added noise, see `magnet.sampling.noise.shifted`.
+        cond: condition of the scenes.
 
     Returns:
-        (B, N, P, D)
+        (B, N, P, D).
     """
     clean = levels == 0
     past = clean & (levels.flip(1).cummax(dim=1).values.flip(1) > 0)
@@ -62,13 +63,12 @@ def with_self_forcing(
     if not len(few):
         return truth
     past, T_world_can = past[few], canonical_frame(scene.T_world_root[few])
-    even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * torch.rand(
-        len(few), 1, 1, generator=generator, device=levels.device
-    )
+    even = torch.rand(len(few), 1, 1, generator=generator, device=levels.device)
+    even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * even
     renoised = torch.where(past, shifted((even * LEVELS).long(), shift), levels[few])
     noise = torch.randn(truth[few].shape, generator=generator, device=truth.device)
     noisy = add_noise(truth[few], noise, layout.spread(layout.group_levels(renoised)))
-    restored = denoise(noisy, renoised, scene.present[few]).float()
+    restored = denoise(noisy, renoised, scene.present[few], None if cond is None else cond[few]).float()
     with torch.autocast(truth.device.type, enabled=False):
         latent, steps, _ = layout.unpack(normalizer.denormalize(restored))
         own = by_frame(past[..., None, None].expand(*past.shape, steps.shape[-2], 1))[..., 0]  # (b, T, P)

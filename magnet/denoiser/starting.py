@@ -68,8 +68,11 @@ def start_from(
         ValueError: the checkpoint is of a model of other sizes.
     """
     state = denoiser_of(path)["state_dict"]
+    unconditional = {
+        name: x for name, x in transformer.state_dict().items() if name.startswith(("cond_proj", "no_cond"))
+    }
     try:
-        transformer.load_state_dict(_part(state, "transformer."))
+        transformer.load_state_dict(unconditional | _part(state, "transformer."))
     except RuntimeError as error:
         reason = str(error).splitlines()[1].strip()
         raise ValueError(

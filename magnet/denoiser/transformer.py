@@ -112,14 +112,33 @@ class Transformer(nn.Module):
             TransformerBlock(o.width, o.heads, o.mlp_ratio, o.dropout, rope_heads) for _ in range(o.layers)
         )
         self.out_proj = nn.Linear(o.width, layout.width)
+        if o.cond_dim:
+            # Zeros: a model that starts from one without conditions begins as the same model.
+            self.cond_proj = nn.Linear(o.cond_dim, o.width)
+            nn.init.zeros_(self.cond_proj.weight)
+            nn.init.zeros_(self.cond_proj.bias)
+            self.no_cond = nn.Parameter(torch.zeros(o.width))
         self.register_buffer("groups", layout.groups(), persistent=False)
 
     groups: Tensor
 
-    def forward(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """noisy (B, N, P, D) normalized, levels (B, N, P) int in 0..K, present (B, P) bool -> (B, N, P, D)
+    def forward(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+        """Predict clean tokens.
 
         Absent agents are not looked at, so they change nothing; their own output is meaningless.
+
+        Args:
+            noisy: (B, N, P, D) normalized.
+            levels: (B, N, P) int in 0..K.
+            present: (B, P) bool.
+            cond: (B, C) for whole scenes or (B, N, C) for each token step. Where it is NaN, and everywhere where it is
+                None, there is no condition.
+
+        Returns:
+            (B, N, P, D).
+
+        Raises:
+            ValueError: a condition for a model without one, or of another size.
         """
         B, N, P, _ = noisy.shape
         there = self.layout.group_present(present)[:, None]  # (B, 1, P, 1 + slots)
@@ -130,7 +149,24 @@ class Transformer(nn.Module):
             parts.append(sinusoids(group_levels[..., 1:], self.options.slot_width).flatten(-2).to(noisy.dtype))
         if self.agent is not None:
             parts.append(self.agent.to(noisy.dtype).expand(B, N, P, -1))
-        return self.out_proj(self._blocks(self.in_proj(torch.cat(parts, dim=-1)), present))
+        x = self.in_proj(torch.cat(parts, dim=-1))
+        condition = self._condition(cond, B, N)
+        return self.out_proj(self._blocks(x if condition is None else x + condition, present))
+
+    def _condition(self, cond: Tensor | None, B: int, N: int) -> Tensor | None:
+        """What a condition adds to each token. -> (B or 1, N or 1, 1, d)"""
+        size = self.options.cond_dim
+        if cond is not None and (not size or cond.shape not in ((B, size), (B, N, size))):
+            wanted = f"({B}, {size}) or ({B}, {N}, {size})" if size else "none: the model has network.cond_dim 0"
+            raise ValueError(f"cond: got {tuple(cond.shape)}, expected {wanted}")
+        if not size:
+            return None
+        if cond is None:
+            return self.no_cond[None, None, None]
+        cond = cond[:, None, None] if cond.ndim == 2 else cond[:, :, None]
+        known = cond.isfinite().all(dim=-1, keepdim=True)
+        embedded = self.cond_proj(torch.where(known, cond, 0.0).to(self.no_cond.dtype))
+        return torch.where(known, embedded, self.no_cond)
 
     def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
         """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)"""

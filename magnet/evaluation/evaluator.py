@@ -122,7 +122,7 @@ class Evaluator(L.LightningModule):
 
     def on_predict_start(self) -> None:
         datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        self.context, self.horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
         self.stats, self.scenes = SamplingStats(), 0
 
     def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
@@ -141,9 +141,9 @@ class Evaluator(L.LightningModule):
         Raises:
             ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
         """
-        self.context, self.horizon = datamodule.context_frames, datamodule.horizon_frames
+        self.context, self.horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
         if self.context % TOKEN_FRAMES:
-            raise ValueError(f"data.context_frames is {self.context}, which is not a multiple of {TOKEN_FRAMES}")
+            raise ValueError(f"data.test.context_frames is {self.context}, which is not a multiple of {TOKEN_FRAMES}")
         self.body: Body = datamodule.body.to(self.denoiser.device)
         self._read_test_scenes(datamodule)
         known = self.schedule(self.context, self.horizon, self.slots).known
@@ -230,19 +230,20 @@ class Evaluator(L.LightningModule):
             generators,
             self.progress,
             self.stats,
+            self.denoiser.condition(scene),
         )
 
     def _training_windows(self, datamodule: MotionDataModule) -> Windows:
         frames = self.context + self.horizon
         stride = max(WINDOW_STRIDE, int(datamodule.store("train").length.sum()) // MAX_WINDOWS)
-        composed = BASELINE_COMPOSED if datamodule.composed_test else 0
+        composed = BASELINE_COMPOSED if datamodule.test.composed else 0
         scenes = datamodule.train_windows(frames, min(stride, self.baseline_stride), composed)
-        mirror = datamodule.augmentation.mirror > 0
+        mirror = datamodule.augment.mirror
         return Windows.of((scene.to(self.denoiser.device) for scene in scenes), self.body, self.context, mirror)
 
     def _baselines(self, datamodule: MotionDataModule, windows: Windows) -> dict[str, Predictor]:
         frames = self.context + self.horizon
-        composed = BASELINE_COMPOSED if datamodule.composed_test else 0
+        composed = BASELINE_COMPOSED if datamodule.test.composed else 0
         train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(self.denoiser.device)
 
         def of_scenes(method: Callable[..., Scene], draws: bool = False) -> Predictor:

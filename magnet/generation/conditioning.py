@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to_9d
+from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
@@ -177,10 +178,7 @@ def encodings(
 def segments(known: Tensor) -> list[tuple[int, int, list[int]]]:
     """Runs of known token steps as (start, stop, agents that share it). known (N, P) bool"""
     found: dict[tuple[int, int], list[int]] = {}
-    edges = torch.nn.functional.pad(known.int(), (0, 0, 1, 1)).diff(dim=0)
     for agent in range(known.shape[1]):
-        starts = (edges[:, agent] == 1).nonzero()[:, 0].tolist()
-        stops = (edges[:, agent] == -1).nonzero()[:, 0].tolist()
-        for span in zip(starts, stops, strict=True):
-            found.setdefault(span, []).append(agent)
+        for run in true_runs(known[:, agent].tolist()):
+            found.setdefault(run, []).append(agent)
     return [(start, stop, agents) for (start, stop), agents in sorted(found.items())]

@@ -52,6 +52,7 @@ def generate(
     generator: Generators = None,
     progress: Callable[[int], None] | None = None,
     stats: SamplingStats | None = None,
+    cond: Tensor | None = None,
 ) -> Scene:
     """Sample a task.
 
@@ -67,6 +68,8 @@ def generate(
             are then the same whatever else is in the batch.
         progress: told 1 after each denoising step.
         stats: filled with how well the sampled tokens hang together, and how often the network ran.
+        cond: what the model is conditioned on, (B, C), or (B, N, C) for each token step of context and frames; see
+            `Denoiser.condition`. None, and steps behind the N: nothing.
 
     Returns:
         Scene of B * samples, context + frames frames, the given frames included.
@@ -75,7 +78,8 @@ def generate(
         ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
-    return cat_time(list(stream(model, scene, task, context, frames, samples, options, generator, progress, stats)))
+    more = (options, generator, progress, stats)
+    return cat_time(list(stream(model, scene, task, context, frames, samples, *more, cond=cond)))
 
 
 def stream(
@@ -90,6 +94,7 @@ def stream(
     progress: Callable[[int], None] | None = None,
     stats: SamplingStats | None = None,
     chunk: int = CHUNK,
+    cond: Tensor | None = None,
 ) -> Iterator[Scene]:
     """Sample a task in consecutive chunks of frames, which make up what `generate` returns.
 
@@ -106,7 +111,8 @@ def stream(
     """
     if chunk < 1:
         raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
-    return Rollout(model, scene, task, context, frames, samples, options, generator, progress, stats, chunk).chunks()
+    more = (options, generator, progress, stats, chunk, cond)
+    return Rollout(model, scene, task, context, frames, samples, *more).chunks()
 
 
 class Rollout:
@@ -131,6 +137,7 @@ class Rollout:
         progress: Callable[[int], None] | None,
         stats: SamplingStats | None,
         chunk: int,
+        cond: Tensor | None = None,
     ) -> None:
         check_request(model, scene, context, frames, samples)
         layout = model.layout
@@ -165,6 +172,11 @@ class Rollout:
         check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta)
+        self.cond = None if cond is None else cond.to(model.device).repeat_interleave(samples, dim=0)
+        if self.cond is not None and len(self.cond) != B:
+            raise ValueError(
+                f"cond: got {len(self.cond) // samples} rows, expected one for each of {scene.scenes} scenes"
+            )
         self.stats.begin(B)
         self.first = self.stop = 0
         self.there: float = self.rows
@@ -224,7 +236,7 @@ class Rollout:
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
-        self._ahead = stage.ahead
+        self._ahead, self._begins = stage.ahead, stage.start
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the step into the token behind the window is written too
             self.tokens = run_stages(
@@ -252,9 +264,19 @@ class Rollout:
         noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
         levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
-            clean = self.model.denoise(noisy, levels, present).float()
+            clean = self.model.denoise(noisy, levels, present, self._condition(*noisy.shape[:2])).float()
         self._clean = clean.detach()
         return clean[:, :width]
+
+    def _condition(self, rows: int, width: int) -> Tensor | None:
+        """The condition of a window, for all views and branches of guidance of each scene."""
+        cond = self.cond
+        if cond is None:
+            return None
+        if cond.ndim == 3:
+            cond = cond[:, self._begins : self._begins + width]
+            cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
+        return cond.repeat_interleave(rows // len(cond), dim=0)
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:

@@ -1,4 +1,4 @@
-"""What plans of noise levels are made of: levels of each token, places of the window, runs of time steps."""
+"""What plans of noise levels are made of: levels of each token, places of the window, blocks of time steps."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from magnet.motion.runs import true_runs
 from magnet.sampling.grid import Grid
 from magnet.sampling.noise import (
     HIGHEST_NOISE,
@@ -67,19 +68,11 @@ def changing(rows: Tensor) -> Tensor:
     return torch.cat([rows[:1], rows[1:][changes]])
 
 
-def runs(target: Tensor, block: int) -> Iterator[tuple[int, int]]:
-    """Time steps with targets, in runs of at most `block`. target (N, P) bool -> (first, one past the last)"""
-    wanted = target.any(dim=1).tolist()
-    first = 0
-    while first < len(wanted):
-        if not wanted[first]:
-            first += 1
-            continue
-        last = first
-        while last < min(first + block, len(wanted)) and wanted[last]:
-            last += 1
-        yield first, last
-        first = last
+def blocks(target: Tensor, block: int) -> Iterator[tuple[int, int]]:
+    """Time steps with targets, at most `block` at a time. target (N, P) bool -> (first, one past the last)"""
+    for start, stop in true_runs(target.any(dim=1).tolist()):
+        for first in range(start, stop, block):
+            yield first, min(first + block, stop)
 
 
 def initial_levels(known: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.checks import require_whole
 from magnet.sampling.grid import Grid
 from magnet.sampling.noise import LEVELS
-from magnet.sampling.plans import changing, initial_levels, levels_at, runs, token_levels, window_positions
+from magnet.sampling.plans import blocks, changing, initial_levels, levels_at, token_levels, window_positions
 
 __all__ = ["Grid", "MaskSchedule", "Stage", "initial_levels", "window_positions"]
 
@@ -293,7 +293,7 @@ class MaskSchedule:
         plan = token_levels(grid)
         starts = [*delay.unique().tolist(), grid.steps + int(delay.max())]
         level, stages = initial_levels(known), []
-        for first, last in runs(target, block):
+        for first, last in blocks(target, block):
             ahead = min(max(grid.stride - 1, AHEAD), (grid.window - last + first) // 2)
             start = max(0, last + ahead - grid.window)
             given = known[last : start + grid.window].any(dim=1).nonzero()[:, 0]

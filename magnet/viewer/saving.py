@@ -8,11 +8,12 @@ import zipfile
 from pathlib import Path
 
 from magnet.body.base import Body
+from magnet.export import formats
 from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
 
-FORMATS = ("npz", "html", "glb", "bvh", "csv", "gif", "mp4", "png")
-"""What a take can be saved as; see `magnet.export.formats.WRITTEN`."""
+FORMATS = tuple(suffix.removeprefix(".") for suffix in formats.WRITTEN)
+"""What a take can be saved as."""
 
 
 def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
@@ -21,8 +22,6 @@ def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) ->
     Raises:
         ImportError: the format needs an optional package; says which.
     """
-    from magnet.export import formats  # late: it brings every format's code
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"
         if kind == "html":

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
+import operator
 import re
 import shlex
 from collections.abc import Sequence
@@ -148,7 +150,7 @@ def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
     parts = [{"class_path": name, "init_args": {"seed": 3}} for name in inside]
     mixed = {"class_path": "Mixed", "init_args": {"data": parts, "max_agents": 3}}
     below = SPELT | {"class_path": "Synthetic"}
-    lower = {"class_path": "Mixed", "init_args": {"data": [below] * len(inside), "compose": 0.5}}
+    lower = {"class_path": "Mixed", "init_args": {"data": [below] * len(inside), "epoch_size": 9}}
     words = ("--config", written(tmp_path / "lower.yaml", model="Tokenizer", data=lower))
     more = ("--config", written(tmp_path / "mixed.yaml", data=mixed))
     flag = ("--data.data", json.dumps(parts))
@@ -156,7 +158,7 @@ def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
         got = printed(capsys, "fit", *given)["data"]["init_args"]
         found = [part["init_args"] for part in got.pop("data")]
         assert found == [own(DATA[name]) | {"seed": 3} for name in inside]
-        rest = own(DATA["Mixed"]) | {"max_agents": agents, "compose": 0.5}
+        rest = own(DATA["Mixed"]) | {"max_agents": agents, "epoch_size": 9}
         assert got == {key: value for key, value in rest.items() if key != "data"}
 
 
@@ -191,7 +193,7 @@ def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsy
     assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
 
     def resolved(spec: dict[str, Any]) -> dict[str, Any]:
-        options = own(DATA[spec["class_path"]]) | spec.get("init_args", {})
+        options = merged(own(DATA[spec["class_path"]]), spec.get("init_args", {}))
         return options | ({"data": [resolved(part) for part in options["data"]]} if "data" in options else {})
 
     found = got["data"]["init_args"]
@@ -222,7 +224,10 @@ def test_a_command_that_a_page_shows_for_a_data_set_runs_what_it_says(
     given.pop("--ckpt_path", None)  # of somebody's own run
     said = {name.removeprefix("--data."): value for name, value in given.items() if name.startswith("--data.")}
     got = printed(capsys, words[0], *(word for pair in given.items() for word in pair))["data"]
-    expected = own(DATA[given["--data"]]) | {name: yaml.safe_load(value) for name, value in said.items()}
+    expected = own(DATA[given["--data"]])
+    for name, value in said.items():
+        *groups, option = name.split(".")
+        functools.reduce(operator.getitem, groups, expected)[option] = yaml.safe_load(value)
     assert got["init_args"] == expected
 
 

@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import Tensor, nn
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.options import Augmentation
 from magnet.motion.scene import Scene, concatenate
 from magnet.testing import random_scene
 
@@ -40,7 +41,8 @@ class FakeData(MotionDataModule):
         return [clip for clip in self.given if clip.split == split]
 
 
-PLAIN: dict[str, Any] = {"mirror": False, "shuffle_agents": False, "drop_agent": 0.0, "compose": 0.0}
+NOTHING = Augmentation(mirror=False, shuffle=False, drop=0.0, compose=0.0)
+PLAIN: dict[str, Any] = {"augment": NOTHING}
 """No augmentation at all."""
 
 

@@ -2,6 +2,8 @@
 
 import re
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,10 +12,11 @@ import torch
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules import Clip, Mixed
 from magnet.datamodules.base import EmptySplitError
+from magnet.datamodules.options import Augmentation, HeldOutScenes
 from magnet.datamodules.store.windows import dropped
 from magnet.motion.scene import concatenate
 from magnet.testing import random_scene
-from tests.datamodules.fakes import PLAIN, FakeData, couples_and_singles, one_epoch, random_clip, same
+from tests.datamodules.fakes import NOTHING, PLAIN, FakeData, couples_and_singles, one_epoch, random_clip, same
 
 
 def shown(name: str) -> tuple[str, int, int]:
@@ -91,9 +94,9 @@ def test_a_source_without_weight_is_never_shown() -> None:
 
 
 def test_agent_order_permutes_everything_of_a_person() -> None:
-    options: dict[str, Any] = {**PLAIN, "max_agents": 4, "drop_agent": 0.3, "compose": 0.5}
-    ordered = one_epoch(FakeData(couples_and_singles(), **options))
-    shuffled = one_epoch(FakeData(couples_and_singles(), **{**options, "shuffle_agents": True}))
+    augment = replace(NOTHING, drop=0.3, compose=0.5)
+    ordered = one_epoch(FakeData(couples_and_singles(), max_agents=4, augment=augment))
+    shuffled = one_epoch(FakeData(couples_and_singles(), max_agents=4, augment=replace(augment, shuffle=True)))
     moved = 0
     for b in range(ordered.scenes):
         left, right = ordered.select([b]), shuffled.select([b])
@@ -118,14 +121,15 @@ def test_agent_order_permutes_everything_of_a_person() -> None:
 
 def test_every_person_stands_in_every_slot_equally_often() -> None:
     clip = random_clip("a", 64)
-    batch = one_epoch(FakeData([clip], max_agents=4, epoch_size=2000, batch_size=250, drop_agent=0, mirror=False))
+    augment = Augmentation(drop=0, mirror=False)
+    batch = one_epoch(FakeData([clip], max_agents=4, epoch_size=2000, batch_size=250, augment=augment))
     for person in range(2):
         where = (batch.betas == clip.scene.betas[0, person]).all(dim=-1).float().mean(dim=0)
         torch.testing.assert_close(where, torch.full((4,), 0.25), atol=0.05, rtol=0)
 
 
 def test_empty_slots_hold_nobody() -> None:
-    batch = one_epoch(FakeData(couples_and_singles(), max_agents=4, drop_agent=0.5))
+    batch = one_epoch(FakeData(couples_and_singles(), max_agents=4, augment=Augmentation(drop=0.5)))
     empty = ~batch.present
     assert bool(empty.any())
     assert bool((batch.betas[empty] == 0).all())
@@ -137,7 +141,7 @@ def test_empty_slots_hold_nobody() -> None:
 def test_dropping_one_leaves_the_others_as_they_were() -> None:
     clips = [random_clip("trio", 150, 3), random_clip("single", 150, 1)]
     whole = one_epoch(FakeData(clips, max_agents=3, epoch_size=512, **PLAIN))
-    fewer = one_epoch(FakeData(clips, max_agents=3, epoch_size=512, **{**PLAIN, "drop_agent": 0.4}))
+    fewer = one_epoch(FakeData(clips, max_agents=3, epoch_size=512, augment=replace(NOTHING, drop=0.4)))
     lost = whole.present.sum(dim=1) - fewer.present.sum(dim=1)
     trios = whole.present.all(dim=1)
     assert set(lost.tolist()) == {0, 1} and bool((lost[~trios] == 0).all())
@@ -148,8 +152,8 @@ def test_dropping_one_leaves_the_others_as_they_were() -> None:
 
 def test_several_people_can_be_dropped_each_number_and_everybody_equally_often() -> None:
     """Paper 4: p agents are masked. Of four with at most three lost, each of the 4 + 6 + 4 choices; never all."""
-    options = {**PLAIN, "max_agents": 4, "window_frames": 4, "drop_agent": 0.6, "drop_at_most": 3}
-    options |= {"epoch_size": 4096, "batch_size": 512}
+    options: dict[str, Any] = {"max_agents": 4, "window_frames": 4, "epoch_size": 4096, "batch_size": 512}
+    options["augment"] = replace(NOTHING, drop=0.6, drop_at_most=3)
     there = one_epoch(FakeData([random_clip("four", 64, 4)], **options)).present
     lost = 4 - there.sum(dim=1)
     shares = torch.bincount(lost, minlength=5).double() / len(lost)
@@ -171,13 +175,13 @@ def test_everybody_is_never_dropped() -> None:
     assert {len(dropped(2, 9, share, 0.5)) for share in (0.0, 0.5, 0.999, 1.0)} == {1}
     assert {len(dropped(4, 2, share, 0.5)) for share in (0.0, 0.49, 0.5, 1.0)} == {1, 2}
     with pytest.raises(ValueError, match="drop_at_most: got 0, expected at least 1"):
-        FakeData([], drop_at_most=0)
+        Augmentation(drop_at_most=0)
 
 
 def test_half_of_the_windows_are_mirror_images() -> None:
     clips = couples_and_singles()
     plain = one_epoch(FakeData(clips, epoch_size=256, **PLAIN))
-    batch = one_epoch(FakeData(clips, epoch_size=256, **{**PLAIN, "mirror": True}))
+    batch = one_epoch(FakeData(clips, epoch_size=256, augment=replace(NOTHING, mirror=True)))
     mirrored = (plain.T_world_root != batch.T_world_root).flatten(1).any(dim=1)
     assert 0.4 < mirrored.float().mean().item() < 0.6
     assert same(batch.select(mirrored), mirror_scene(plain.select(mirrored)))
@@ -195,13 +199,16 @@ def test_validation_windows_lie_side_by_side_and_repeat() -> None:
 
 
 def test_test_scenes_step_over_invalid_frames() -> None:
-    data = FakeData([random_clip("a", 400, split="test", bad=(50,))], test_batch_size=2, horizon_frames=68)
+    data = FakeData(
+        [random_clip("a", 400, split="test", bad=(50,))], test=HeldOutScenes(batch_size=2, horizon_frames=68)
+    )
     assert concatenate(list(data.test_dataloader())).names == ("a [51:151]", "a [151:251]", "a [251:351]")
 
 
 def test_the_limit_spreads_over_all_test_scenes() -> None:
     data = FakeData(
-        [random_clip(n, 400, split="test") for n in "ab"], test_limit=4, context_frames=20, horizon_frames=30
+        [random_clip(n, 400, split="test") for n in "ab"],
+        test=HeldOutScenes(limit=4, context_frames=20, horizon_frames=30),
     )
     assert concatenate(list(data.test_dataloader())).names == ("a [0:50]", "a [200:250]", "b [0:50]", "b [200:250]")
 
@@ -222,10 +229,10 @@ def test_training_scenes_are_all_clean_stretches() -> None:
 def test_mixed_trains_on_all_and_tests_on_the_chosen_one() -> None:
     one = FakeData([random_clip("a"), random_clip("at", split="test", source="x")])
     two = FakeData([random_clip("b", source="solo", agents=1), random_clip("bt", split="test")])
-    mixed = Mixed([one, two], test_on=1, batch_size=64, epoch_size=256, horizon_frames=32)
+    mixed = Mixed([one, two], test_on=1, batch_size=64, epoch_size=256, test=HeldOutScenes(horizon_frames=32))
     assert {name[0] for name in one_epoch(mixed).names} == {"a", "b"}  # type: ignore[arg-type]
     assert {name.split()[0] for batch in mixed.test_dataloader() for name in batch.names} == {"bt"}
-    both = Mixed([one, two], horizon_frames=32)
+    both = Mixed([one, two], test=HeldOutScenes(horizon_frames=32))
     assert {name.split()[0] for batch in both.test_dataloader() for name in batch.names} == {"at", "bt"}
 
 
@@ -275,10 +282,17 @@ def test_bad_clips_are_refused(generator: torch.Generator) -> None:
         Clip(scene, "x", "s", "tset")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("bad", [{"batch_size": 0}, {"drop_agent": 1.5}, {"test_stride": 0}])
-def test_numbers_out_of_range_are_refused(bad: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        FakeData([], **bad)
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: FakeData([], batch_size=0), "batch_size"),
+        (lambda: Augmentation(drop=1.5), r"augment\.drop"),
+        (lambda: HeldOutScenes(stride=0), "stride"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(make: Callable[[], object], name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        make()
 
 
 def test_a_weight_for_no_source_is_refused() -> None:

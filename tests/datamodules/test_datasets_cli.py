@@ -20,7 +20,7 @@ CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
 SMALL = {
     "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
-    "context_frames": "8", "horizon_frames": "8", "test_limit": "2",
+    "test.context_frames": "8", "test.horizon_frames": "8", "test.limit": "2",
 }  # fmt: skip
 FRAMES = {"remocap": 40, "bvh": 40, "cmu": 40}
 """Of a fake's takes, where fitting 150 takes too long."""

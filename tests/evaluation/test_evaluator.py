@@ -1,9 +1,11 @@
 import math
+from dataclasses import replace
 
 import lightning as L
 import pytest
 import torch
 
+from magnet.datamodules.options import HeldOutScenes
 from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluator, aligned
 from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.scene import Scene, concatenate
@@ -14,12 +16,12 @@ from magnet.testing import random_scene, tiny_denoiser
 from tests.datamodules.fakes import FakeData, random_clip
 
 FAST = SamplerOptions(steps=2, stride=2)
+TESTED = HeldOutScenes(context_frames=16, horizon_frames=20, batch_size=3)
 
 
-def data(clips: list | None = None, **options) -> FakeData:
+def data(clips: list | None = None, max_agents: int = 3, **options) -> FakeData:
     clips = clips or [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(3)]
-    sizes = {"max_agents": 3, "context_frames": 16, "horizon_frames": 20, "test_batch_size": 3}
-    return FakeData(clips, **{**sizes, **options})
+    return FakeData(clips, max_agents=max_agents, test=replace(TESTED, **options))
 
 
 def prepared(**options) -> tuple[Evaluator, L.Trainer]:
@@ -83,7 +85,7 @@ class NoisyData(FakeData):
 def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
     """From the data loader on: the samples that are measured are bit-identical when the rest is noise."""
     seen: list[Scene] = []
-    options = {"max_agents": 3, "context_frames": 16, "horizon_frames": 20, "test_batch_size": 3}
+    options = {"max_agents": 3, "test": TESTED}
     clips = [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(3)]
     noisy = NoisyData(clips, **options)
     task = registry.get(name)()
@@ -120,13 +122,13 @@ def test_scores_follow_the_seed():
 
 def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in():
     """Random retrieval draws, too: a scene's noise is its own."""
-    by_size = [run(data(test_batch_size=size)).results for size in (1, 3)]
+    by_size = [run(data(batch_size=size)).results for size in (1, 3)]
     for method in (MODEL, "RS"):
         alone, together = (results.rows[method] for results in by_size)
         assert alone.keys() == together.keys()
         for metric in alone:
             assert alone[metric] == pytest.approx(together[metric], rel=1e-3, abs=1e-4, nan_ok=True), (method, metric)
-    (alone, _), (together, _) = (predicted(data(test_batch_size=size)) for size in (1, 3))
+    (alone, _), (together, _) = (predicted(data(batch_size=size)) for size in (1, 3))
     torch.testing.assert_close(alone.body_rot, together.body_rot, rtol=0, atol=1e-4)
     torch.testing.assert_close(alone.T_world_root, together.T_world_root, rtol=0, atol=1e-4)
 
@@ -152,16 +154,14 @@ def test_prediction_counts_what_it_costs():
 
 @pytest.mark.parametrize("name", ["generation", "partner_inpainting", "inbetweening"])
 def test_no_past_is_no_past_that_baselines_could_continue(name: str):
-    datamodule = data()
-    datamodule.context_frames = 0
+    datamodule = data(context_frames=0)
     results = run(datamodule, task=registry.get(name)()).results
     assert set(results.rows) == {MODEL, TRUTH, TRAINING}
     assert math.isfinite(results.rows[MODEL]["fd"])
 
 
 def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
-    datamodule = data()
-    datamodule.context_frames = 0
+    datamodule = data(context_frames=0)
     seen = run(datamodule, task=registry.get("generation")())
     assert (seen.now, seen.past_is_given) == (0, False)
     batch = next(iter(datamodule.test_dataloader()))
@@ -176,7 +176,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
 def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
     monkeypatch.setattr("magnet.evaluation.evaluator.BASELINE_COMPOSED", 30)
     clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]
-    results = run(data(clips, composed_test=2)).results
+    results = run(data(clips, composed=2)).results
     assert math.isfinite(results.rows["NN"]["mpjpe"])
     assert math.isfinite(results.rows["ridge"]["mpjpe"])
     assert math.isfinite(results.rows[MODEL]["nearest_training"])
@@ -190,8 +190,7 @@ def test_aligned_scenes_share_one_world(scene):
 
 
 def test_a_context_of_broken_tokens_is_refused():
-    datamodule = data()
-    datamodule.context_frames = 15
+    datamodule = data(context_frames=15)
     with pytest.raises(ValueError, match="context_frames is 15"):
         run(datamodule)
 

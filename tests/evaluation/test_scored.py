@@ -55,7 +55,7 @@ EACH = pytest.mark.parametrize(("task", "scored"), CASES.values(), ids=CASES.key
 
 def sampled(task: object) -> tuple[Evaluator, Scene, Scene]:
     """A run's evaluator, its only batch of two people in three slots, and the samples that it draws."""
-    datamodule = data(test_batch_size=9)
+    datamodule = data(batch_size=9)
     model = tiny_denoiser(max_agents=3)
     evaluation = Evaluator(model, task, samples=2, sampler=FAST, baselines=False)
     evaluation.start(datamodule)
@@ -100,7 +100,7 @@ def test_what_was_given_comes_back_as_it_was_given(task: object, scored: Tensor)
 
 @EACH
 def test_baselines_are_scored_over_the_same_frames(task: object, scored: Tensor) -> None:
-    datamodule = data(test_batch_size=9)
+    datamodule = data(batch_size=9)
     batch = next(iter(datamodule.test_dataloader()))
     ran = run(datamodule, task=task)
     still = batch.frames_at(torch.full((HORIZON,), CONTEXT - 1))
@@ -174,7 +174,7 @@ def test_training_windows_that_are_the_test_scenes_are_at_no_distance_from_them(
 def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
     """Three recordings of 120 frames hold three scenes of 36 frames each side by side, however densely they begin."""
     for stride in (None, 12, 5):
-        datamodule = data(test_stride=stride)
+        datamodule = data(stride=stride)
         evaluation = Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, baselines=False, interval=interval)
         evaluation.start(datamodule)
         assert len(set(evaluation.unit_of.values())) == units

@@ -84,7 +84,7 @@ def test_without_a_truth_there_are_no_ghosts_and_the_panel_says_so(page, panel, 
 def test_every_format_is_downloaded(page, panel, handshake, body, tmp_path) -> None:
     takes = [take("dance", handshake.slice(40, 64), 8)]
     begins = {"npz": b"PK", "bvh": b"PK", "glb": b"glTF", "csv": b"scene,frame", "gif": b"GIF8", "png": b"\x89PNG"}
-    begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00"}
+    begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00", "webp": b"RIFF"}
     files = {}
     with watched(page, takes, body, style="skeleton") as viewer:
         viewer.clock.playing = False

@@ -21,6 +21,7 @@ from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.motion.frames import rigid
 from magnet.motion.resample import FPS, resample_points, resample_rotations, resample_valid
+from magnet.motion.runs import true_runs
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 CANONICALIZE_VERSION = 3
@@ -321,7 +322,7 @@ def _cut(
     pieces: list[tuple[int, int]] = []
     edges = [0, *cuts, frames]
     for first, end in pairwise(edges):
-        pieces += [(first + a, first + b) for a, b in check_people.true_runs(together[first:end], least)]
+        pieces += [(first + a, first + b) for a, b in true_runs(together[first:end], least)]
     if not pieces:
         raise DataError(
             f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magnet.body.joints import ANKLES, HEAD, JOINT_NAMES
 from magnet.datamodules.reading.recording import DataError, Recording
+from magnet.motion.runs import true_runs
 
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -63,12 +64,6 @@ class Flag:
 def who(person: int, names: Sequence[str]) -> str:
     """How a person is called in messages."""
     return f"person {person} ({names[person]})" if person < len(names) else f"person {person}"
-
-
-def true_runs(mask: Bools, least: int = 1) -> list[tuple[int, int]]:
-    """Runs of True of at least so many frames, as (start, stop). mask: (T,)"""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 
 
 # -- bodies ------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magnet.datamodules.reading.asf_amc import AmcRecording, Bools, Floats
+from magnet.motion.runs import true_runs
 
 JUMP = 0.15
 """Metres between two frames: 9 m/s at 60 fps, which no body joint of the recordings reaches by itself."""
@@ -33,12 +34,6 @@ class Glitches:
     masked: Bools  # (T,) those of them that stand in too long a stretch to be trusted
 
 
-def runs(mask: Bools) -> list[tuple[int, int]]:
-    """Stretches of True as (first, one past the last)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _turned(recording: AmcRecording, end: Floats) -> Bools:
     """Frames whose pelvis does not go with the trunk. (T,)"""
     names = recording.skeleton.names
@@ -58,7 +53,7 @@ def repaired(recording: AmcRecording) -> tuple[AmcRecording, Glitches]:
     body = [k for k, name in enumerate(recording.skeleton.names) if not name.endswith(UNMODELLED)]
     jumps = np.flatnonzero(far[:, body].any(axis=1))
     bad = _turned(recording, end)
-    for a, b in runs(bad):
+    for a, b in true_runs(bad):
         bad[max(0, a - MARGIN) : b + MARGIN] = True
     reach = round(REACH * recording.fps)
     for i, jump in enumerate(jumps):
@@ -66,7 +61,7 @@ def repaired(recording: AmcRecording) -> tuple[AmcRecording, Glitches]:
         if i and jump - jumps[i - 1] <= reach:
             bad[jumps[i - 1] + 1 : jump + 1] = True
     masked = np.zeros_like(bad)
-    for a, b in runs(bad):
+    for a, b in true_runs(bad):
         # Without a good frame on both sides there is nothing to interpolate between.
         masked[a:b] = (b - a) / recording.fps > SHORT + 1e-9 or a == 0 or b == recording.frames
     found = Glitches(int(far.any(axis=1).sum()), len(jumps), bad, masked)
@@ -75,7 +70,7 @@ def repaired(recording: AmcRecording) -> tuple[AmcRecording, Glitches]:
 
 def _bridged(recording: AmcRecording, bad: Bools) -> AmcRecording:
     root, local = recording.root.copy(), recording.local.copy()
-    for a, b in runs(bad):
+    for a, b in true_runs(bad):
         before, after = max(a - 1, 0), min(b, recording.frames - 1)
         if a == 0:
             before = after

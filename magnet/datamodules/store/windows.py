@@ -4,36 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.checks import require_whole
 from magnet.datamodules.clip import Ints
+from magnet.datamodules.options import Augmentation
 from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.window_index import WindowIndex, all_starts, spaced_starts
 from magnet.seeding import derive
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """How often each thing happens to a training window; 0 is never."""
-
-    mirror: float = 0.5
-    shuffle: bool = True
-    drop: float = 0.0
-    drop_at_most: int = 1
-    compose: float = 0.0
-    apart: tuple[float, float] = (1.6, 3.5)
-
-    def __post_init__(self) -> None:
-        for name, share in {"mirror": self.mirror, "drop_agent": self.drop, "compose": self.compose}.items():
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name}: got {share}, expected a probability from 0 to 1")
-        require_whole("drop_at_most", self.drop_at_most, 1)
 
 
 def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Floats:
@@ -57,7 +38,7 @@ class RandomWindows:
         store: the training clips.
         frames: window length.
         weights: share of each source; None: every valid window is equally likely.
-        augmentation: what happens to the windows.
+        augment: what happens to the windows.
         seed: of all randomness.
         rank: of this process.
         world: number of processes.
@@ -73,12 +54,12 @@ class RandomWindows:
         store: MemoryStore,
         frames: int,
         weights: Mapping[str, float] | None,
-        augmentation: Augmentation,
+        augment: Augmentation,
         seed: int,
         rank: int = 0,
         world: int = 1,
     ) -> None:
-        self.store, self.augmentation, self.seed = store, augmentation, seed
+        self.store, self.augment, self.seed = store, augment, seed
         self.count = np.maximum(store.length - frames + 1, 1)
         self.starts, self.first = self._listed(frames)
         share = self.count * self._weigh(weights)
@@ -119,7 +100,7 @@ class RandomWindows:
         """Samples `first` to `first + count` of an epoch; of this process's share, if there are shares."""
         slots = self.store.max_agents
         u = uniforms(self.seed, epoch, first, count, self.COLUMNS + slots)
-        augment = self.augmentation
+        augment = self.augment
         a, start_a = self._window(u[:, 0], u[:, 1])
         b, start_b = self._window(u[:, 2], u[:, 3])
         people = self.store.people
@@ -136,10 +117,15 @@ class RandomWindows:
             members, groups = np.take_along_axis(members, order, 1), np.take_along_axis(groups, order, 1)
 
         clips = np.stack([a, np.where(joining > 0, b, -1)], axis=1)
-        low, high = augment.apart
+        low, high = augment.compose_apart
         relative_pose = np.stack([u[:, 8] * 2 * np.pi, u[:, 9] * 2 * np.pi, low + u[:, 10] * (high - low)], axis=1)
         windows = WindowIndex(
-            clips, np.stack([start_a, start_b], axis=1), members, groups, u[:, 11] < augment.mirror, relative_pose
+            clips,
+            np.stack([start_a, start_b], axis=1),
+            members,
+            groups,
+            u[:, 11] < (0.5 if augment.mirror else 0.0),
+            relative_pose,
         )
         return without_empty_groups(windows)
 
@@ -238,7 +224,7 @@ def composed_windows(
     sizes = [size for size in sizes if pairs[size]]
     if not sizes:
         raise ValueError(
-            f"composed_test={count}: needs max_agents of 3 or more (got {store.max_agents}) and test windows of two"
+            f"test.composed={count}: needs max_agents of 3 or more (got {store.max_agents}) and test windows of two"
             f" clips that make up three people (got {len(plain)} windows of {len(set(plain.clips[:, 0]))} clips)"
         )
     u = uniforms(seed, 0, 0, count, 5)

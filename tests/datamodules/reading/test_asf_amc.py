@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.reading.asf_amc import AmcRecording, parse_any, parse_regular, read_amc, read_asf, together
-from magnet.datamodules.reading.cmu_glitches import repaired, runs
+from magnet.datamodules.reading.cmu_glitches import repaired
+from magnet.motion.runs import true_runs
 from tests.datamodules.slow_cmu import slow_ends
 
 
@@ -190,7 +191,7 @@ def test_a_long_glitch_is_masked(files: tuple[Path, Path]) -> None:
     local = recording.local.copy()
     local[30:45, 0] = local[30:45, 0] @ np.diag([-1.0, 1.0, -1.0])  # turned round for a quarter of a second
     _, found = repaired(replace(recording, local=local))
-    ((start, stop),) = runs(found.masked)
+    ((start, stop),) = true_runs(found.masked)
     assert 25 <= start <= 30 and 45 <= stop <= 50
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from magnet.datamodules.options import Augmentation, HeldOutScenes
 from magnet.datamodules.store.compose import place_apart
 from magnet.motion.frames import inverse
 from magnet.motion.scene import Scene, concatenate
@@ -71,7 +72,9 @@ def test_absent_agents_neither_push_nor_move(groups: tuple[Scene, Tensor, Tensor
 
 @pytest.mark.parametrize(("slots", "sizes"), [(2, {1, 2}), (3, {1, 2, 3}), (4, {1, 2, 3, 4})])
 def test_training_composes_where_there_is_room(slots: int, sizes: set[int]) -> None:
-    data = FakeData(couples_and_singles(), max_agents=slots, compose=0.5, drop_agent=0.0, epoch_size=512)
+    data = FakeData(
+        couples_and_singles(), max_agents=slots, augment=Augmentation(compose=0.5, drop=0.0), epoch_size=512
+    )
     batch = concatenate(list(data.train_dataloader()))
     people = batch.present.sum(dim=1)
     assert set(people.tolist()) == sizes
@@ -85,7 +88,7 @@ def test_training_composes_where_there_is_room(slots: int, sizes: set[int]) -> N
 def test_composed_training_scenes_show_two_clips_apart(drop: float) -> None:
     clips = couples_and_singles()
     people = {clip.name: clip.scene.betas[0] for clip in clips}
-    data = FakeData(clips, max_agents=4, compose=1.0, drop_agent=drop, epoch_size=256)
+    data = FakeData(clips, max_agents=4, augment=Augmentation(compose=1.0, drop=drop), epoch_size=256)
     batch = concatenate(list(data.train_dataloader()))
     seen = 0
     for b, name in enumerate(batch.names):
@@ -102,7 +105,9 @@ def test_composed_training_scenes_show_two_clips_apart(drop: float) -> None:
 
 def test_composed_test_scenes_come_last_and_say_so() -> None:
     data = FakeData(
-        couples_and_singles("test"), max_agents=4, context_frames=16, horizon_frames=64, composed_test=6, test_limit=3
+        couples_and_singles("test"),
+        max_agents=4,
+        test=HeldOutScenes(context_frames=16, horizon_frames=64, composed=6, limit=3),
     )
     batch = concatenate(list(data.test_dataloader()))
     assert [name.startswith("composed: ") for name in batch.names] == [False] * 3 + [True] * 6
@@ -113,11 +118,11 @@ def test_composed_test_scenes_come_last_and_say_so() -> None:
 
 def test_couples_alone_still_make_three() -> None:
     clips = [random_clip(n, 100, split="test") for n in "ab"]
-    data = FakeData(clips, max_agents=4, context_frames=16, horizon_frames=64, composed_test=2)
+    data = FakeData(clips, max_agents=4, test=HeldOutScenes(context_frames=16, horizon_frames=64, composed=2))
     assert concatenate(list(data.test_dataloader())).present.sum(dim=1).tolist() == [2, 2, 3, 4]
 
 
 def test_composing_one_clip_with_itself_is_refused() -> None:
-    data = FakeData([random_clip("a", 400, split="test")], max_agents=4, composed_test=2)
-    with pytest.raises(ValueError, match="composed_test=2: needs max_agents of 3 or more"):
+    data = FakeData([random_clip("a", 400, split="test")], max_agents=4, test=HeldOutScenes(composed=2))
+    with pytest.raises(ValueError, match=r"test\.composed=2: needs max_agents of 3 or more"):
         data.test_dataloader()

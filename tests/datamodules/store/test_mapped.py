@@ -11,6 +11,7 @@ import roma
 import torch
 
 from magnet.datamodules.fakes.motion import made_up_body
+from magnet.datamodules.options import Augmentation
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.store.mapped import MappedStore, RawBatch
 from magnet.datamodules.store.memory import MemoryStore
@@ -24,7 +25,7 @@ BODY = made_up_body()
 
 
 def test_mapped_training_windows_are_those_from_memory(store):
-    options = {"compose": 0.5, "drop_agent": 0.3, "max_agents": 4, "weights": {made.NAME: 1.0}}
+    options = {"augment": Augmentation(compose=0.5, drop=0.3), "max_agents": 4, "weights": {made.NAME: 1.0}}
     mapped, resident = data(store, **options), data(store, device_resident=True, **options)
     assert isinstance(mapped.store("train"), MappedStore) and type(resident.store("train")) is MemoryStore
     for ours, theirs in zip(mapped.train_dataloader(), resident.train_dataloader(), strict=True):
@@ -69,8 +70,8 @@ def test_what_goes_to_another_device_is_rows_as_they_lie_on_disk(store):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_decodes_what_a_cpu_decodes(store):
-    mapped = data(store, compose=0.5, max_agents=4).store("train")
-    draw = data(store, compose=0.5, max_agents=4).train_dataloader().draw(0, 0, 32)
+    mapped = data(store, augment=Augmentation(compose=0.5), max_agents=4).store("train")
+    draw = data(store, augment=Augmentation(compose=0.5), max_agents=4).train_dataloader().draw(0, 0, 32)
     on_gpu = mapped.to("cuda")
     fetched = on_gpu.fetch(draw, 64, 0.9)
     assert fetched.raw.is_pinned()

@@ -11,12 +11,13 @@ import torch
 
 from magnet.datamodules import Clip, Mixed
 from magnet.datamodules.fakes.motion import made_up_body
+from magnet.datamodules.options import Augmentation
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.store.mapped import MappedStore, SplitData
 from magnet.datamodules.store.reader import ROW, StoreReader
-from magnet.datamodules.store.windows import Augmentation, RandomWindows
+from magnet.datamodules.store.windows import RandomWindows
 from tests.datamodules import made
 from tests.datamodules.fakes import PLAIN, FakeData, FakeTrainer, random_clip
 from tests.datamodules.made import data
@@ -69,7 +70,13 @@ def test_mixed_reads_stores_by_memory_map_and_no_clip_whole(store, with_roles, m
     kinds = ({"path": store}, {"path": with_roles, "roles": ("leader",)})
     parts = [made.Made(body_model=path, **kind) for kind in kinds]
     loaded = [made.Made(body_model=path, device_resident=True, **kind) for kind in kinds]
-    options = {"batch_size": 16, "epoch_size": 64, "body_model": path, "compose": 0.5, "max_agents": 4}
+    options = {
+        "batch_size": 16,
+        "epoch_size": 64,
+        "body_model": path,
+        "augment": Augmentation(compose=0.5),
+        "max_agents": 4,
+    }
     monkeypatch.setattr(StoreReader, "clips", None)  # would load them all
     copied = []
     read = MappedStore.read
@@ -152,7 +159,11 @@ def test_mixed_gives_each_process_a_length_of_every_source(store, spread):
 
 def test_shares_are_a_function_of_seed_epoch_sample_rank_and_world(store):
     mapped = data(store).store("train")
-    make = lambda rank, world, seed=1: RandomWindows(mapped, 64, None, Augmentation(), seed, rank, world)  # noqa: E731
+    alone = Augmentation(drop=0.0, compose=0.0)
+
+    def make(rank: int, world: int, seed: int = 1) -> RandomWindows:
+        return RandomWindows(mapped, 64, None, alone, seed, rank, world)
+
     first, again = make(1, 4), make(1, 4)
     assert first.shared and not make(0, 1).shared
     whole, parts = first(2, 0, 12), [again(2, 0, 5), again(2, 5, 7)]

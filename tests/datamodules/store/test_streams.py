@@ -9,6 +9,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from magnet.datamodules.options import Augmentation, HeldOutScenes
 from magnet.datamodules.store.windows import uniforms
 from magnet.motion.scene import concatenate
 from tests.datamodules.fakes import FakeData, FakeTrainer, Recorder, couples_and_singles, one_epoch, quiet, same
@@ -24,7 +25,7 @@ def test_uniforms_of_a_sample_do_not_depend_on_its_neighbours() -> None:
 
 def test_a_sample_depends_only_on_seed_epoch_and_number() -> None:
     clips = couples_and_singles()
-    options: dict[str, Any] = {"max_agents": 4, "compose": 0.5, "drop_agent": 0.3, "epoch_size": 96}
+    options: dict[str, Any] = {"max_agents": 4, "augment": Augmentation(compose=0.5, drop=0.3), "epoch_size": 96}
     small, large = (FakeData(clips, batch_size=size, **options).train_dataloader() for size in (8, 32))
     for _ in range(2):
         assert same(concatenate(list(small)), concatenate(list(large)))
@@ -113,7 +114,7 @@ def _step(path: Path) -> int:
 @pytest.mark.filterwarnings("ignore:Lightning couldn't infer the indices")
 def test_a_trainer_is_given_what_plain_iteration_gives(tmp_path: Path) -> None:
     clips = couples_and_singles("test") + couples_and_singles("val")
-    options: dict[str, Any] = {"context_frames": 16, "horizon_frames": 32, "test_batch_size": 3}
+    options: dict[str, Any] = {"test": HeldOutScenes(context_frames=16, horizon_frames=32, batch_size=3)}
     expected = [batch.names for batch in FakeData(clips, **options).test_dataloader()]
     model = Recorder()
     trainer = quiet(tmp_path)
@@ -145,7 +146,7 @@ def test_training_shards_together_are_the_single_process(world: int) -> None:
 @pytest.mark.parametrize("batch_size", [1, 2, 5, 100])
 @pytest.mark.parametrize("world", [1, 2, 4, 11])
 def test_test_shards_are_disjoint_complete_and_equally_many_batches(world: int, batch_size: int) -> None:
-    options: dict[str, Any] = {"context_frames": 8, "horizon_frames": 32, "test_batch_size": batch_size}
+    options: dict[str, Any] = {"test": HeldOutScenes(context_frames=8, horizon_frames=32, batch_size=batch_size)}
     alone = [name for batch in rank_of(0, 1, **options).test_dataloader() for name in batch.names]
     loaders = [rank_of(rank, world, **options).test_dataloader() for rank in range(world)]
     shards = [[batch.names for batch in loader] for loader in loaders]
@@ -157,4 +158,4 @@ def test_test_shards_are_disjoint_complete_and_equally_many_batches(world: int, 
 
 def test_more_processes_than_test_scenes_are_refused() -> None:
     with pytest.raises(ValueError, match="windows for 50 processes"):
-        rank_of(0, 50, context_frames=8, horizon_frames=32).test_dataloader()
+        rank_of(0, 50, test=HeldOutScenes(context_frames=8, horizon_frames=32)).test_dataloader()
