@@ -28,3 +28,27 @@ def test_no_function_is_longer_than_a_screen() -> None:
         if isinstance(node, functions) and (lines := node.end_lineno - node.lineno + 1) > MOST_FUNCTION_LINES
     }
     assert not long
+
+
+def test_the_frame_rate_of_models_is_written_once() -> None:
+    """As a default; a data set's own rate is its reader's."""
+    written = [
+        f"{path}:{default.lineno}"
+        for path, _, tree in parsed("magnet")
+        for node in ast.walk(tree)
+        for name, default in defaults(node)
+        if name in ("fps", "FPS") and isinstance(default, ast.Constant) and default.value == 30
+    ]
+    assert [place.partition(":")[0] for place in written] == ["magnet/datamodules/dd100.py", "magnet/motion/scene.py"]
+
+
+def defaults(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Names with the values that a function, a class or a module gives them."""
+    if isinstance(node, ast.arguments):
+        named = [*node.posonlyargs, *node.args]
+        yield from ((arg.arg, value) for arg, value in zip(named[::-1], node.defaults[::-1], strict=False))
+        yield from ((arg.arg, value) for arg, value in zip(node.kwonlyargs, node.kw_defaults, strict=True) if value)
+    elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
+        yield node.target.id, node.value
+    elif isinstance(node, ast.Assign):
+        yield from ((target.id, node.value) for target in node.targets if isinstance(target, ast.Name))

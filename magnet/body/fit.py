@@ -21,7 +21,7 @@ from magnet.body.joints import (  # isort: skip
 )  # fmt: skip
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_6d, to_6d
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, FPS, Scene
 
 CENTIMETRE = 0.01
 NEARLY_RIGID = (HIPS, SHOULDERS, (L_HIP, L_SHOULDER), (R_HIP, R_SHOULDER))
@@ -100,7 +100,7 @@ def fit_body(
     valid: Tensor | None = None,
     betas: Tensor | None = None,
     grounded: bool = False,
-    fps: float = 30.0,
+    fps: float = FPS,
     refuse_above: float = 0.04,
     settings: FitSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -145,7 +145,7 @@ def fit_body(
         if grounded:
             found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
             floor = float(floor_height(found, body, betas).median())
-    smooth = settings.smooth * (fps / 30.0) ** 4
+    smooth = settings.smooth * (fps / FPS) ** 4
     problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor)
     R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(total - settings.steps + done, total))
     scene = Scene(

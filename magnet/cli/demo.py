@@ -25,7 +25,7 @@ from magnet.evaluation.results import Results
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
 from magnet.generation.rollout import generate
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS, preset_name
 from magnet.tasks.agentic import AgenticAsync
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     console.print(
         f"{options.ckpt_path or 'The model that comes with this package'} ({size:.1f} million weights) sees "
         f"{CONTEXT} frames of synthetic scenes that are not among its training scenes, and says how the next "
-        f"{HORIZON / 30:.0f} seconds go for everybody in them. All numbers below are computed now."
+        f"{HORIZON / FPS:.0f} seconds go for everybody in them. All numbers below are computed now."
     )
     data = Synthetic(
         test_clips=options.scenes,
@@ -167,7 +167,7 @@ def picture(show: Show, rows: dict[str, Scene], body: Body, out: Path) -> list[P
     frames = next(iter(rows.values())).frames
     moments = [round(i * (frames - 1) / (COLUMNS - 1)) for i in range(COLUMNS)]
     sheet = contact_sheet(rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, body=body)
-    first = max(0, frames - round(30 * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
+    first = max(0, frames - round(FPS * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
     end = {words: scene.slice(first) for words, scene in rows.items()}
     paint: Callable[..., Path] = render_video
     moving = paint(

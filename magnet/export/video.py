@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.figures import add_ghosts, add_shadows
 from magnet.export.stage import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 
 Report = Callable[[int, int], None]
 """Told after each frame: frames done, frames in all."""
@@ -33,7 +33,7 @@ def render_video(
     context_frames: int,
     body: Posable | None = None,
     style: Style = "skeleton",
-    fps: float = 30.0,
+    fps: float = FPS,
     size: Size = (640, 480),
     title: str | None = None,
     ghosts: Scene | None = None,

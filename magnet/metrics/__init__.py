@@ -27,6 +27,7 @@ from magnet.metrics.skating import FootSkating, toe_steps
 from magnet.metrics.standing import StandingToes
 from magnet.metrics.token_borders import TokenBorders
 from magnet.metrics.velocity_error import VelocityError, velocity_error
+from magnet.motion.scene import FPS
 
 __all__ = [
     "Better",
@@ -77,7 +78,7 @@ __all__ = [
 ]
 
 
-def all_metrics(fps: float = 30.0, scored: Tensor | None = None, confidence: float | None = None) -> MetricCollection:
+def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> MetricCollection:
     """Every metric of the paper's tables and a few more, fed together: `update(generated, truth, present)`.
 
     Args:
@@ -102,7 +103,7 @@ def all_metrics(fps: float = 30.0, scored: Tensor | None = None, confidence: flo
 
 
 def ground_truth_metrics(
-    fps: float = 30.0, scored: Tensor | None = None, confidence: float | None = None
+    fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None
 ) -> MetricCollection:
     """What recorded motion itself has, under the names of `all_metrics`: the ground truth's row of a table.
 

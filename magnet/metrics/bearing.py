@@ -14,6 +14,7 @@ from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.frames import to_planar
+from magnet.motion.scene import FPS
 
 
 def bearing(joints: Tensor, partner: Tensor) -> Tensor:
@@ -25,7 +26,7 @@ def bearing(joints: Tensor, partner: Tensor) -> Tensor:
     return torch.atan2(pelvis[..., 0], pelvis[..., 2])
 
 
-def turn_rate(joints: Tensor, fps: float = 30.0) -> Tensor:
+def turn_rate(joints: Tensor, fps: float = FPS) -> Tensor:
     """How fast the hips turn about the vertical, either way. (..., T, P, 22, 3) -> (..., T - 1, P) degrees/s"""
     yaw, _ = to_planar(joint_canonical_frame(joints))
     step = yaw.diff(dim=-2)
@@ -76,7 +77,7 @@ class TurnRate(MotionMetric):
 
     turned: list[Tensor]  # of (P, 2) by slot: total and count
 
-    def __init__(self, fps: float = 30.0, of: Of = "generated", agents: Tensor | None = None) -> None:
+    def __init__(self, fps: float = FPS, of: Of = "generated", agents: Tensor | None = None) -> None:
         super().__init__(of, agents)
         self.fps = fps
         self.add_keyed("turned", 2)

@@ -13,6 +13,7 @@ from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.frames import partners
+from magnet.motion.scene import FPS
 
 Features = Literal["world_joints", "canonical_joints", "velocity", "own_velocity", "pair"]
 
@@ -46,7 +47,7 @@ def moments(count: Tensor, total: Tensor, outer: Tensor) -> tuple[Tensor, Tensor
     return mean, (outer - count * torch.outer(mean, mean)) / (count - 1)
 
 
-def pose_features(joints: Tensor, features: Features, fps: float = 30.0) -> Tensor:
+def pose_features(joints: Tensor, features: Features, fps: float = FPS) -> Tensor:
     """What is compared, 63 numbers each. (..., T, P, 22, 3) -> (..., T, P, 63); see `FrechetDistance`.
 
     `velocity` and `own_velocity` have T - 1 frames; `pair` has (..., T, P, P - 1, 63).
@@ -100,7 +101,7 @@ class FrechetDistance(MotionMetric):
     def __init__(
         self,
         features: Features = "world_joints",
-        fps: float = 30.0,
+        fps: float = FPS,
         jitter: float = JITTER,
         of: Of = "generated",
         agents: Tensor | None = None,
@@ -154,7 +155,7 @@ class FrechetBySecond(FrechetDistance):
     def __init__(
         self,
         features: Features = "pair",
-        fps: float = 30.0,
+        fps: float = FPS,
         jitter: float = JITTER,
         of: Of = "generated",
         agents: Tensor | None = None,

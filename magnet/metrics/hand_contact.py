@@ -12,6 +12,7 @@ from magnet.body.joints import ELBOWS, WRISTS
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
+from magnet.motion.scene import FPS
 
 BEYOND = 0.08
 """Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""
@@ -76,7 +77,7 @@ class HandContact(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         within: float = WITHIN,
         beyond: float = BEYOND,
         of: Of = "generated",

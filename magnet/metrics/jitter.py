@@ -10,9 +10,10 @@ from torch import Tensor
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
+from magnet.motion.scene import FPS
 
 
-def jitter(joints: Tensor, fps: float = 30.0) -> Tensor:
+def jitter(joints: Tensor, fps: float = FPS) -> Tensor:
     """Mean length of the third difference over 21 joints. (..., T, P, 22, 3) -> (..., T - 3, P) in 10 m/s^3
 
     >>> import torch
@@ -31,7 +32,7 @@ class Jitter(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,

@@ -11,6 +11,7 @@ from torch import Tensor
 from magnet.metrics.base import ClipMeans, Of
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
+from magnet.motion.scene import FPS
 
 MEANING = "distance to the recorded joints, mean over samples"
 OF_MEAN = "distance of the samples' mean to the recorded joints"
@@ -45,7 +46,7 @@ class PositionError(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0),
         of: Of = "generated",
         agents: Tensor | None = None,

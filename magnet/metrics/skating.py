@@ -12,12 +12,13 @@ from magnet.body.joints import TOES
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
+from magnet.motion.scene import FPS
 
 PRESETS = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
 """Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""
 
 
-def toe_steps(joints: Tensor, fps: float = 30.0, height: float = 0.05) -> tuple[Tensor, Tensor]:
+def toe_steps(joints: Tensor, fps: float = FPS, height: float = 0.05) -> tuple[Tensor, Tensor]:
     """Horizontal speed of each toe and whether it stands, being under `height` metres in both frames.
 
     The floor is y = 0 and is not estimated again, which would hide floating.
@@ -51,7 +52,7 @@ class FootSkating(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         preset: Literal["default", "reference"] = "default",
         height: float | None = None,
         speed: float | None = None,

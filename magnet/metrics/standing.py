@@ -12,6 +12,7 @@ from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.histogram import histogram_of, quantile
 from magnet.metrics.skating import toe_steps
+from magnet.motion.scene import FPS
 
 
 class StandingToes(ClipMeans):
@@ -33,7 +34,7 @@ class StandingToes(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         height: float = 0.05,
         still: float = 0.05,
         of: Of = "generated",

@@ -11,6 +11,7 @@ from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.position_error import joint_error
+from magnet.motion.scene import FPS
 
 
 def velocity_error(generated: Tensor, truth: Tensor) -> Tensor:
@@ -39,7 +40,7 @@ class VelocityError(ClipMeans):
 
     def __init__(
         self,
-        fps: float = 30.0,
+        fps: float = FPS,
         per_second: bool = False,
         of: Of = "generated",
         agents: Tensor | None = None,

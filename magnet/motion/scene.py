@@ -49,7 +49,7 @@ class Scene:
     T_world_root: Tensor  # (B, T, P, 4, 4) pose of the pelvis *joint* (not SMPL-X's transl) in the world
     betas: Tensor  # (B, P, 10) shape numbers of `body`
     present: Tensor  # (B, P) bool
-    fps: float = 30.0
+    fps: float = FPS
     body: str = "open-1"  # id of the body model that `betas` belong to
     valid: Tensor | None = None  # (B, T) bool, False where a frame is padding or was masked; None: all good
     names: tuple[str, ...] = ()  # one label a scene, for reports

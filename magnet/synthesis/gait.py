@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.synthesis.people import FPS, People
+from magnet.motion.scene import FPS
+from magnet.synthesis.people import People
 
 STEP_OVER = 0.07
 """Metres a foot may be off its place before it takes a step."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 
 from magnet.motion.frames import from_planar
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 from magnet.synthesis.couplings import COUPLINGS
-from magnet.synthesis.people import FPS, RestBody, gather, uniform
+from magnet.synthesis.people import RestBody, gather, uniform
 from magnet.synthesis.planning import PAD, Truth
 from magnet.synthesis.pose import embody
 from magnet.threads import one_thread

@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from magnet.motion.scene import FPS
 from magnet.synthesis.ik import ease
-from magnet.synthesis.people import FPS, PALM, People, noise, number, uniform
+from magnet.synthesis.people import PALM, People, noise, number, uniform
 from magnet.synthesis.planning import Truth, seconds, upright, walked
 from magnet.synthesis.pose import Plan
 

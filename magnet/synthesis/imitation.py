@@ -8,9 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from magnet.motion.scene import FPS
 from magnet.synthesis.gait import plan_feet, stack
 from magnet.synthesis.ik import smooth
-from magnet.synthesis.people import FPS, People, noise, number, uniform
+from magnet.synthesis.people import People, noise, number, uniform
 from magnet.synthesis.planning import PAD, Truth, facing, keyed, upright, walked
 from magnet.synthesis.pose import Plan, still
 

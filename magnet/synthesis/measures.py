@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.joints import ANKLES, ELBOWS, KNEES, L_HIP, MIRROR, PELVIS, R_HIP, WRISTS
-from magnet.synthesis.people import FPS
+from magnet.motion.scene import FPS
 from magnet.synthesis.planning import Truth
 from magnet.synthesis.ring import BOTH, LEFT, RIGHT
 

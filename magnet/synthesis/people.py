@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from magnet.body.joints import HEAD, L_ELBOW, L_SHOULDER, L_WRIST, R_ELBOW, R_SHOULDER, R_WRIST, SHOULDERS, TOES
+from magnet.motion.scene import FPS
 
-FPS = 30.0
 PALM = 0.08
 """Metres from the wrist to the middle of the palm."""
 SOLE = 0.028

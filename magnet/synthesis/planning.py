@@ -9,9 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from magnet.motion.scene import FPS
 from magnet.synthesis.gait import plan_feet, stack
 from magnet.synthesis.ik import ease
-from magnet.synthesis.people import FPS, People
+from magnet.synthesis.people import People
 from magnet.synthesis.pose import Plan, still
 
 PAD = 30

@@ -8,7 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from magnet.synthesis.people import FPS, PALM, People, noise, number
+from magnet.motion.scene import FPS
+from magnet.synthesis.people import PALM, People, noise, number
 from magnet.synthesis.planning import Truth, facing, keyed, palm_facing, seconds, upright, walked
 from magnet.synthesis.pose import Plan
 

@@ -17,10 +17,9 @@ from magnet.body import Body, load_body
 from magnet.datamodules.fakes.body import Kind, write_body
 from magnet.datamodules.reading.recording import Axis
 from magnet.motion.resample import slerp_quat
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 from magnet.synthesis import synthesize
 from magnet.synthesis.generate import FEWEST_FRAMES
-from magnet.synthesis.people import FPS
 
 Array = NDArray[np.float64]
 
@@ -69,7 +68,7 @@ def rest_joints(betas: Array, kind: Kind = "smplx") -> Array:
     return made_up_body(kind).rest_joints(torch.from_numpy(betas)).numpy()
 
 
-def people(frames: int, persons: int, fps: float = 30.0, seed: int = 0, kind: Kind = "smplx") -> FakeMotion:
+def people(frames: int, persons: int, fps: float = FPS, seed: int = 0, kind: Kind = "smplx") -> FakeMotion:
     """People walking one behind the other or round in a circle, feet on the floor at height 0.
 
     Args:

@@ -21,7 +21,7 @@ from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.recording import DataError, Reader
 from magnet.datamodules.store.reader import SCALE, StoreError, StoreReader, StoreSplit, body_hash, decode, file_hash
 from magnet.export.picture import contact_sheet
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 
 UNIT = 2.0
 """By how much a stored quaternion's length may differ from the scale: rounding to whole numbers moves it by one."""
@@ -160,7 +160,7 @@ def _wrong_people(part: StoreSplit, clip: int, own: bool) -> list[str]:
     names, rows = part.persons_of()[clip], part.rows(clip)
     quat, pelvis = (rows[key].swapaxes(0, 1).astype(np.float32) for key in ("rotations", "pelvis"))
     flags = check_people.seen(quat, pelvis, np.ones(pelvis.shape[:2], dtype=bool))
-    said = check_people.described(flags, names, 30.0, met=False)
+    said = check_people.described(flags, names, FPS, met=False)
     try:
         check_people.check_shapes(part.betas_of(clip) if own else part.betas_of(clip)[:0], names)
     except DataError as error:
@@ -305,5 +305,5 @@ def lines(found: CheckReport) -> Iterator[tuple[str, ...]]:
     for split in SPLITS:
         count = found.counts.get(split, Counter())
         people = ", ".join(f"{n} {what}" for what, n in sorted(count.items()) if what.startswith("of "))
-        minutes = count["frames"] / 30 / 60
+        minutes = count["frames"] / FPS / 60
         yield split, f"{count['takes']}", f"{count['clips']} ({people})", f"{count['frames']:,}", f"{minutes:.1f}"

@@ -18,8 +18,8 @@ from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler,
 from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.rotations import geodesic
+from magnet.motion.scene import FPS
 
-FPS = 30.0
 ENDS = {
     1: "lhipjoint", 2: "rhipjoint", 4: "lfemur", 5: "rfemur", 7: "ltibia", 8: "rtibia", 10: "lfoot", 11: "rfoot",
     16: "lclavicle", 17: "rclavicle", 18: "lhumerus", 19: "rhumerus", 20: "lwrist", 21: "rwrist",
