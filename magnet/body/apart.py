@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from magnet.body.capsules import CAPSULES, capsule_segments
 from magnet.body.joints import PELVIS
+from magnet.motion.scene import FPS
 
 ARMS = [capsule.name.endswith("arm") for capsule in CAPSULES]
 """Capsules of arms: people hold, link arms and lay them around each other."""
@@ -157,7 +158,7 @@ def kept_apart(
     fixed: Tensor | None = None,
     keep: Apart | None = None,
     begun: bool = False,
-    fps: float = 30.0,
+    fps: float = FPS,
 ) -> Tensor:
     """Ground offsets that keep people out of each other; where nobody is in anybody's way, exactly 0.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from magnet.checks import require_choice, require_number, require_whole
-from magnet.motion.frames import Placement
+from magnet.motion.placement import Placement
 
 Rope = Literal["hidden", "heads", "none"]
 Distribution = Literal["per_token", "per_timestep", "per_sequence", "mixture"]

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.options import SelfForcing
-from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, place, project_se2
+from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, project_se2
+from magnet.motion.placement import place
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted

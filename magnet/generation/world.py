@@ -14,7 +14,6 @@ from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.generation.separation import separated
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
-    Placement,
     align_planar,
     canonical_deltas,
     canonical_frame,
@@ -22,11 +21,11 @@ from magnet.motion.frames import (
     inverse,
     pairwise,
     partners,
-    place,
     posed,
     project_se2,
     to_9d,
 )
+from magnet.motion.placement import Placement, place
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.schedule import MaskSchedule

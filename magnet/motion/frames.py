@@ -1,4 +1,4 @@
-"""Frames of reference: root, canonical and partner frames, and the way back into the world (paper 3.1).
+"""Frames of reference: root, canonical and partner frames (paper 3.1); `placement` leads back into the world.
 
 A transform carries the names of its two frames and the names cancel:
 `T_self_partner = inverse(T_world_self) @ T_world_partner`. Transforms are (..., 4, 4), metres, y up.
@@ -8,19 +8,12 @@ is fully described by a yaw and a ground position: its *planar* form.
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from magnet.motion.planar import rotate_ground
 from magnet.motion.rotations import about_y, about_y_of, from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
-
-Placement = Literal["integrate", "anchor", "fuse"]
-
-FIXED = 1e9
-"""Weight of a delta that is known: `fuse` moves such an agent by less than rounding does."""
 
 UPRIGHT = 1e-3
 """Below this horizontal length of the left axis the person lies on the side, and the axis tells no yaw."""
@@ -191,105 +184,6 @@ def align_planar(path: Tensor, target: Tensor) -> Tensor:
     return from_planar(turned, (ground_target - rotate_ground(turned[..., None], ground)).mean(dim=-2))
 
 
-# -- from predicted tokens back into the world -------------------------------------------------
-
-
 def project_se2(T: Tensor) -> Tensor:
     """Nearest transform that only turns about the vertical and moves on the ground. (..., 4, 4) -> same"""
     return from_planar(*to_planar(T))
-
-
-def place(
-    deltas: Tensor,
-    T_self_partner: Tensor | None,
-    T_world_start: Tensor,
-    placement: Placement = "integrate",
-    pairwise_weight: float = 0.003,
-    present: Tensor | None = None,
-    fixed: Tensor | None = None,
-    anchor: Tensor | None = None,
-) -> Tensor:
-    """World canonical frames of a predicted stretch of motion.
-
-    Args:
-        deltas: (B, T, P, 4, 4), delta from the frame before; the first leads away from `T_world_start`.
-        T_self_partner: (B, T, P, P - 1, 4, 4); `integrate` does not read it and takes None.
-        T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
-        placement: `integrate`: every agent integrates its own deltas (the reference's way; agents may
-            drift apart slowly). `anchor`: one agent integrates, the others hang off it by its pairwise
-            transforms (no drift apart, but their own deltas are ignored). `fuse` (ours): at each frame
-            the least-squares compromise of all deltas and all pairwise transforms, equal for all agents.
-        pairwise_weight: `fuse` only: weight of one pairwise transform against one delta. 0 is `integrate`.
-        present: (B, P) bool; pairs to absent agents are not read. None: all are there.
-        fixed: (P,) bool, `fuse` only: agents whose deltas are known and must not be compromised. None: nobody.
-        anchor: (B,) int, `anchor` only: the agent that each scene's others hang off. None: agent 0.
-
-    Returns:
-        T_world_can (B, T, P, 4, 4), in the dtype of `deltas`; computed in float64 so that thousands of
-        frames add up exactly.
-    """
-    delta_yaw, delta_ground = to_planar(deltas.double())
-    start_yaw, start_ground = to_planar(T_world_start.double())
-    if placement == "fuse" and T_self_partner is not None and deltas.shape[2] > 1:
-        if present is None:
-            present = torch.ones(deltas.shape[0], deltas.shape[2], dtype=torch.bool, device=deltas.device)
-        weight = torch.ones_like(start_yaw[0]) if fixed is None else torch.where(fixed.to(deltas.device), FIXED, 1.0)
-        pairs = to_planar(T_self_partner.double())
-        deltas_planar = (delta_yaw, delta_ground)
-        return from_planar(
-            *_fuse(*deltas_planar, *pairs, start_yaw, start_ground, pairwise_weight, present, weight)
-        ).to(deltas)
-    yaw = start_yaw[:, None] + delta_yaw.cumsum(dim=1)
-    before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
-    ground = start_ground[:, None] + rotate_ground(before, delta_ground).cumsum(dim=1)
-    T_world_can = from_planar(yaw, ground)
-    if placement == "anchor" and T_self_partner is not None:
-        scene = torch.arange(len(deltas), device=deltas.device)
-        anchor = torch.zeros_like(scene) if anchor is None else anchor.to(deltas.device)
-        T_anchor_others = project_se2(T_self_partner[scene, :, anchor].double())
-        T_world_others = T_world_can[scene, :, anchor][:, :, None] @ T_anchor_others  # (B, T, P - 1, 4, 4)
-        others = partners(deltas.shape[2], deltas.device)[anchor]
-        T_world_can[scene[:, None], :, others] = T_world_others.transpose(1, 2)
-    return T_world_can.to(deltas)
-
-
-def _fuse(
-    delta_yaw: Tensor,
-    delta_ground: Tensor,
-    pair_yaw: Tensor,
-    pair_ground: Tensor,
-    yaw: Tensor,
-    ground: Tensor,
-    pairwise_weight: float,
-    present: Tensor,
-    own: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
-
-    Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
-    """
-    partner = partners(present.shape[1], present.device)
-    together = pairwise_weight * (present[:, :, None] & present[:, None]).to(delta_yaw)
-    together.diagonal(dim1=1, dim2=2).zero_()
-    system = torch.diag(own.to(delta_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
-    solve = torch.linalg.inv(system)
-    weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
-
-    def pull(residual: Tensor) -> Tensor:
-        """Pair residuals (B, P, P - 1, C) as a pull on each agent: those that point at it, less its own."""
-        weighted = weight[..., None] * residual
-        return (-weighted.sum(dim=2)).index_add(1, partner.flatten(), weighted.flatten(1, 2))
-
-    yaws, grounds = [], []
-    for t in range(delta_yaw.shape[1]):
-        ground = ground + rotate_ground(yaw, delta_ground[:, t])
-        yaw = yaw + delta_yaw[:, t]
-        off = pair_yaw[:, t] - (yaw[:, partner] - yaw[:, :, None])
-        off = torch.atan2(off.sin(), off.cos())
-        yaw = yaw + (solve @ pull(off[..., None]))[..., 0]
-        away = rotate_ground(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
-        ground = ground + solve @ pull(away)
-        yaws.append(yaw)
-        grounds.append(ground)
-    return torch.stack(yaws, dim=1), torch.stack(grounds, dim=1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from magnet.checks import require_choice, require_number, require_whole
-from magnet.motion.frames import Placement
+from magnet.motion.placement import Placement
 from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS

@@ -15,7 +15,7 @@ from magnet.synthesis.ik import ease
 from magnet.synthesis.people import People
 from magnet.synthesis.pose import Plan, still
 
-PAD = 30
+PAD = round(FPS)
 """Frames planned before and after those that are kept."""
 
 Truth = dict[str, Tensor]

@@ -14,7 +14,7 @@ from magnet.body.joints import (  # isort: skip
 )  # fmt: skip
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import about_y
-from magnet.motion.scene import BODY_JOINTS
+from magnet.motion.scene import BODY_JOINTS, FPS
 from magnet.synthesis.gait import Feet
 from magnet.synthesis.ik import about, about_x, about_z, basis, ease, fraction, rotate, smooth, two_bones, under
 from magnet.synthesis.people import PALM, SOLE, People, noise
@@ -113,7 +113,7 @@ def _strides(plan: Plan) -> tuple[Tensor, Tensor]:
 def _trunk(plan: Plan, people: People, drift: Tensor, fore: Tensor, load: Tensor) -> _Bodies:
     """Pelvis, spine and collars about a pelvis at the origin."""
     scissor = smooth(fore[..., 0] - fore[..., 1], 1.5).clamp(-0.8, 0.8)
-    travel = torch.diff(plan.ground, dim=0, append=plan.ground[-1:]) * 30
+    travel = torch.diff(plan.ground, dim=0, append=plan.ground[-1:]) * FPS
     forward = torch.stack([plan.yaw.sin(), plan.yaw.cos()], dim=-1)
     pace = smooth((travel * forward).sum(-1), 5.0)
     pitch, yaw, roll = plan.torso.unbind(-1)

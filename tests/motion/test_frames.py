@@ -12,7 +12,6 @@ from magnet.motion.frames import (
     inverse,
     pairwise,
     partners,
-    place,
     pose_features,
     posed,
     propagate_pairwise,
@@ -20,6 +19,7 @@ from magnet.motion.frames import (
     to_9d,
     to_planar,
 )
+from magnet.motion.placement import place
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, pairwise_by_frame, scene_transforms
 from magnet.testing import random_scene

@@ -1,0 +1,151 @@
+"""From predicted deltas and pairwise transforms back into the world: one function a placement (paper 3.1).
+
+To add a placement, write its function, name it in `Placement`, and list it in `PLACEMENTS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import from_planar, partners, project_se2, to_planar
+from magnet.motion.planar import rotate_ground
+
+Placement = Literal["integrate", "anchor", "fuse"]
+
+FIXED = 1e9
+"""Weight of a delta that is known: `fuse` moves such an agent by less than rounding does."""
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What a placement works from, in float64; B scenes, T frames, P agents.
+
+    Attributes:
+        delta_yaw, delta_ground: (B, T, P) radians and (B, T, P, 2) metres, from the frame before.
+        start_yaw, start_ground: (B, P), (B, P, 2) where everybody was before the first frame.
+        T_self_partner: (B, T, P, P - 1, 4, 4).
+        present: (B, P) bool.
+        fixed: (P,) bool, agents whose deltas are known.
+        anchor: (B,) int, an agent of each scene whom others may be placed by.
+        pairwise_weight: weight of a pairwise transform against a delta.
+    """
+
+    delta_yaw: Tensor
+    delta_ground: Tensor
+    start_yaw: Tensor
+    start_ground: Tensor
+    T_self_partner: Tensor | None
+    present: Tensor
+    fixed: Tensor
+    anchor: Tensor
+    pairwise_weight: float
+
+
+def place(
+    deltas: Tensor,
+    T_self_partner: Tensor | None,
+    T_world_start: Tensor,
+    placement: Placement = "integrate",
+    pairwise_weight: float = 0.003,
+    present: Tensor | None = None,
+    fixed: Tensor | None = None,
+    anchor: Tensor | None = None,
+) -> Tensor:
+    """World canonical frames of a predicted stretch of motion.
+
+    Args:
+        deltas: (B, T, P, 4, 4), delta from the frame before; the first leads away from `T_world_start`.
+        T_self_partner: (B, T, P, P - 1, 4, 4). None, or one agent alone: every agent integrates its own deltas.
+        T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
+        placement: `integrate`: every agent integrates its own deltas (the reference's way; agents may
+            drift apart slowly). `anchor`: one agent integrates, the others are placed by its pairwise
+            transforms (no drift apart, but their own deltas are ignored). `fuse` (ours): at each frame
+            the least-squares compromise of all deltas and all pairwise transforms, equal for all agents.
+        pairwise_weight: `fuse` only: weight of one pairwise transform against one delta. 0 is `integrate`.
+        present: (B, P) bool; pairs with absent agents are not read. None: all are there.
+        fixed: (P,) bool, `fuse` only: agents whose deltas are known and must not be compromised. None: nobody.
+        anchor: (B,) int, `anchor` only: the agent of each scene that the others are placed by. None: agent 0.
+
+    Returns:
+        T_world_can (B, T, P, 4, 4), in the dtype of `deltas`; computed in float64 so that thousands of
+        frames add up exactly.
+    """
+    B, _, P = deltas.shape[:3]
+    device = deltas.device
+    predicted = Predicted(
+        *to_planar(deltas.double()),
+        *to_planar(T_world_start.double()),
+        None if T_self_partner is None else T_self_partner.double(),
+        torch.ones(B, P, dtype=torch.bool, device=device) if present is None else present,
+        torch.zeros(P, dtype=torch.bool, device=device) if fixed is None else fixed.to(device),
+        torch.zeros(B, dtype=torch.long, device=device) if anchor is None else anchor.to(device),
+        pairwise_weight,
+    )
+    alone = T_self_partner is None or P == 1
+    return PLACEMENTS["integrate" if alone else placement](predicted).to(deltas)
+
+
+def integrate(predicted: Predicted) -> Tensor:
+    """Every agent adds up its own deltas. -> T_world_can (B, T, P, 4, 4)"""
+    start_yaw, start_ground = predicted.start_yaw[:, None], predicted.start_ground[:, None]
+    yaw = start_yaw + predicted.delta_yaw.cumsum(dim=1)
+    before = torch.cat([start_yaw, yaw[:, :-1]], dim=1)
+    return from_planar(yaw, start_ground + rotate_ground(before, predicted.delta_ground).cumsum(dim=1))
+
+
+def anchored(predicted: Predicted) -> Tensor:
+    """One agent of each scene integrates; the others stand where its pairwise transforms put them."""
+    assert predicted.T_self_partner is not None
+    T_world_can, anchor = integrate(predicted), predicted.anchor
+    scene = torch.arange(len(anchor), device=anchor.device)
+    T_anchor_others = project_se2(predicted.T_self_partner[scene, :, anchor])
+    T_world_others = T_world_can[scene, :, anchor][:, :, None] @ T_anchor_others  # (B, T, P - 1, 4, 4)
+    others = partners(T_world_can.shape[2], anchor.device)[anchor]
+    T_world_can[scene[:, None], :, others] = T_world_others.transpose(1, 2)
+    return T_world_can
+
+
+def fuse(predicted: Predicted) -> Tensor:
+    """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
+
+    Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
+    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
+    """
+    assert predicted.T_self_partner is not None
+    delta_yaw, delta_ground = predicted.delta_yaw, predicted.delta_ground
+    pair_yaw, pair_ground = to_planar(predicted.T_self_partner)
+    present, yaw, ground = predicted.present, predicted.start_yaw, predicted.start_ground
+    own = torch.where(predicted.fixed, FIXED, torch.ones_like(yaw[0]))
+    partner = partners(present.shape[1], present.device)
+    together = predicted.pairwise_weight * (present[:, :, None] & present[:, None]).to(delta_yaw)
+    together.diagonal(dim1=1, dim2=2).zero_()
+    system = torch.diag(own.to(delta_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
+    solve = torch.linalg.inv(system)
+    weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
+
+    def pull(residual: Tensor) -> Tensor:
+        """Pair residuals (B, P, P - 1, C) as a pull on each agent: those that point at it, less its own."""
+        weighted = weight[..., None] * residual
+        return (-weighted.sum(dim=2)).index_add(1, partner.flatten(), weighted.flatten(1, 2))
+
+    yaws, grounds = [], []
+    for t in range(delta_yaw.shape[1]):
+        ground = ground + rotate_ground(yaw, delta_ground[:, t])
+        yaw = yaw + delta_yaw[:, t]
+        off = pair_yaw[:, t] - (yaw[:, partner] - yaw[:, :, None])
+        off = torch.atan2(off.sin(), off.cos())
+        yaw = yaw + (solve @ pull(off[..., None]))[..., 0]
+        away = rotate_ground(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
+        ground = ground + solve @ pull(away)
+        yaws.append(yaw)
+        grounds.append(ground)
+    return from_planar(torch.stack(yaws, dim=1), torch.stack(grounds, dim=1))
+
+
+PLACEMENTS: dict[Placement, Callable[[Predicted], Tensor]] = {"integrate": integrate, "anchor": anchored, "fuse": fuse}
+"""What each placement does, by name."""
