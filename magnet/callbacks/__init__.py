@@ -1,0 +1,5 @@
+"""Lightning callbacks for training, named in a configuration under `trainer.callbacks`."""
+
+from magnet.callbacks.pictures import SamplePictures
+
+__all__ = ["SamplePictures"]
