@@ -1,4 +1,4 @@
-"""How the code is laid out: sizes of files and functions."""
+"""How the code is laid out: sizes of files and functions, what is written once, what tests may reach for."""
 
 import ast
 from collections.abc import Iterator
@@ -52,3 +52,42 @@ def defaults(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
         yield node.target.id, node.value
     elif isinstance(node, ast.Assign):
         yield from ((target.id, node.value) for target in node.targets if isinstance(target, ast.Name))
+
+
+def private(name: str) -> bool:
+    return name.startswith("_") and not name.endswith("_")
+
+
+def defined(tree: ast.Module) -> set[str]:
+    """Names that a file gives to functions, classes, variables and attributes."""
+    made = {node.name for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    made |= {
+        node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+    }
+    return made | {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+
+
+def reached_for(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Private names that a file imports, reads of something, or names to `monkeypatch.setattr`, with the line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            words = [*(node.module or "").split("."), *(name.name for name in node.names)]
+        elif isinstance(node, ast.Attribute):
+            words = [node.attr]
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("setattr", "delattr"):
+            texts = [word.value for word in node.args if isinstance(word, ast.Constant) and isinstance(word.value, str)]
+            words = [part for text in texts for part in text.split(".")]
+        else:
+            continue
+        yield from ((node.lineno, word) for word in words if private(word))
+
+
+def test_no_test_reaches_for_a_private_name_of_the_package() -> None:
+    ours = {name for _, _, tree in parsed("magnet") for name in defined(tree) if private(name)}
+    found = [
+        f"{path}:{line} {name}"
+        for path, _, tree in parsed("tests")
+        for line, name in reached_for(tree)
+        if name in ours - defined(tree)
+    ]
+    assert not found

@@ -88,3 +88,15 @@ def test_no_file_knows_the_machine_that_it_was_written_on() -> None:
     found = {str(path.relative_to(ROOT)): places.findall(path.read_text(encoding="utf-8")) for path in SOURCES}
     assert len(found) > 200
     assert not {path: names for path, names in found.items() if names}
+
+
+def test_each_change_goes_to_one_room_of_three_files_at_most() -> None:
+    """CONTRIBUTING's table: every place is there, and what is made is made where it says."""
+    table = (ROOT / "CONTRIBUTING.md").read_text().partition("| change |")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    assert len(rows) == 15 and sum(bool(made) for _, _, made in rows) >= 5
+    for change, where, made in rows:
+        places = re.findall(r"`((?:magnet|configs|examples|tests)/[\w/.-]*)`", where)
+        assert all((ROOT / place).exists() for place in [*places, *re.findall(r"`(.+?)`", made)]), change
+        rooms = {place.split("/")[1] for place in places}
+        assert len(places) <= 3 and len(rooms) <= 1 + (change == "SMPL-X's hands"), change

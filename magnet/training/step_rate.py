@@ -24,9 +24,9 @@ def matmul_rate(device: torch.device, dtype: torch.dtype = torch.bfloat16, repea
     a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
     best = float("inf")
     for _ in range(repeats + 1):
-        begun = _now(device)
+        begun = now(device)
         a @ b
-        best = min(best, _now(device) - begun)
+        best = min(best, now(device) - begun)
     return 2 * size**3 / best
 
 
@@ -58,14 +58,14 @@ class StepRate(Callback):
         rank_zero_info(f"matrix products in bfloat16: {self.rate / 1e12:.2f} TFLOP/s on {_name(pl_module.device)}")
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        self._begun = _now(pl_module.device) if self._timed(trainer) else None
+        self._begun = now(pl_module.device) if self._timed(trainer) else None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if self._begun is None:
             return
-        self.times.append(_now(pl_module.device) - self._begun)
+        self.times.append(now(pl_module.device) - self._begun)
         if trainer.global_step % self.every and trainer.global_step != trainer.max_steps:
             return
         seconds = statistics.median(self.times)
@@ -87,7 +87,7 @@ def tokens_of(batch: Any) -> int:
     return batch.scenes * batch.agents * (batch.frames // TOKEN_FRAMES) if isinstance(batch, Scene) else 0
 
 
-def _now(device: torch.device) -> float:
+def now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

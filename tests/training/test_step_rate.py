@@ -33,7 +33,7 @@ def test_the_rate_of_matrix_products_is_some_number() -> None:
 
 def test_it_prints_and_logs_the_median_step(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     clock = itertools.count(step=0.5)  # every look at the clock is half a second later
-    monkeypatch.setattr(step_rate, "_now", lambda device: float(next(clock)))
+    monkeypatch.setattr(step_rate, "now", lambda device: float(next(clock)))
     monkeypatch.setattr(step_rate, "matmul_rate", lambda device: 1e9)
     model = tiny_denoiser()
     data = Synthetic(train_clips=2, clip_frames=150, people=[2], max_agents=2, batch_size=2, epoch_size=64)
