@@ -1,4 +1,4 @@
-"""Where given frames meet generated ones: paths that arrive, and poses that fade into each other."""
+"""Blending of given and generated motion: paths that end at a keyframe, and poses without jumps at seams."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def next_known(keep: Tensor) -> Tensor:
 
 
 def seam_weights(keep: Tensor, blend: int) -> Tensor:
-    """How much of a seam's difference is still added behind it: 1 at the last known frame, 0 `blend` frames on.
+    """Weight of a seam's difference in the frames after it: 1 at the last known frame, 0 after `blend` frames.
 
-    In a gap shorter than that, 0 at the next known frame. (T, P) bool -> (T, P)
+    In a shorter gap it is 0 at the next known frame. (T, P) bool -> (T, P)
     """
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
     after = keep.int().cummax(dim=0).values.bool()
@@ -80,13 +80,13 @@ def seam_weights(keep: Tensor, blend: int) -> Tensor:
 
 
 def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tensor) -> Tensor:
-    """Add the turn that leads from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
+    """Apply the rotation from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
     difference = roma.rotmat_to_rotvec(given @ decoded.transpose(-1, -2))
     return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation
 
 
 def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
-    """Put given frames back; what they differ by at a seam fades out over the frames on its other side.
+    """Restore given frames; the difference at each seam fades out over the generated frames beside it.
 
     Args:
         decoded: (B, T, P) the lossy reconstruction.
@@ -117,10 +117,10 @@ def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Ten
 
 
 def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
-    """How much of a seam's difference, and of its growth by a frame, is still added behind it.
+    """Weights of a seam's difference, and of its change by frame, in the frames after it.
 
-    A critically damped spring: from where and as fast as the difference was, (1 + r t) exp(-r t) and t exp(-r t) with
-    r = `SPRING` / blend. Its growth is known where the frame before the last known one is known too.
+    A critically damped spring with the position and velocity of the difference: (1 + r t) exp(-r t) and t exp(-r t)
+    with r = `SPRING` / blend. The velocity is known where the last two known frames are consecutive.
     (T, P) bool -> (T, P) twice
     """
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
@@ -135,10 +135,9 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
 
 
 def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
-    """Put given frames back, and go on from them smoothly into what is decoded; nothing in front of a seam changes.
+    """Restore given frames and continue from them with their velocity; frames before a seam do not change.
 
-    Unlike with `crossfade_given`, poses go on as fast as they were moving: each block of a causal plan has a seam, and
-    faded differences alone would jerk.
+    `crossfade_given` keeps no velocity, which would show at the seams of a causal plan: each block has one.
 
     Args:
         decoded: (B, T, P) bodies.
@@ -173,9 +172,9 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
 
 
 def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:
-    """Agents that are neither given nor generated from some time on stand still from there.
+    """Agents stand still after the last frame in which they are given or generated.
 
-    there (T, P) bool; `before` is the frame in front of the scene's first, if there is one.
+    there (T, P) bool; `before` is the frame before the scene's first, if there is one.
     """
     if bool(there.all()):
         return scene

@@ -1,4 +1,4 @@
-"""Bodies of causal plans: shown as soon as their tokens are finished, and never changed by what comes after."""
+"""Bodies of causal plans: final as soon as their tokens are finished, whatever is generated or given later."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class World(Protocol):
 
 
 class Expected:
-    """What the model expects to come after a block, in the place of what it will generate there.
+    """The tokens that the model predicts after a block, for the decoder to look ahead at.
 
-    A decoder that looks ahead makes poses that fit what follows; shown nothing behind the newest token, it makes some
-    that slide and jerk. What is expected is known in time: each agent's own view of the last denoising step tells it,
-    at no cost, of the token steps that lie `ahead` of the window.
+    A decoder that looks ahead gives poses that slide and jerk where nothing follows the newest token. The prediction
+    costs nothing: the last denoising step makes it, in each agent's own view, for the token steps `ahead` of the
+    window.
 
     Args:
         most: tokens that the decoder looks ahead.
@@ -52,9 +52,9 @@ class Expected:
         self._told = torch.zeros(0, dtype=torch.bool)
 
     def keep(self, stage: Stage, clean: Tensor) -> None:
-        """Take what a stage expected behind its block. clean (B, W + ahead, P, D)
+        """Keep what a stage predicts after its block. clean (B, W + ahead, P, D)
 
-        Each agent's first word counts: stages that finish others of the same block know more than it may.
+        Of each agent the first prediction is kept: later stages of the same block see more than it may.
         """
         row = stage.active[1]
         behind = clean[:, row - stage.start :][:, : self.most]
@@ -67,14 +67,14 @@ class Expected:
             self._told |= new
 
     def behind(self, row: int) -> tuple[Tensor, Tensor] | None:
-        """Tokens (B, n, P, D) expected from a row on, and of whom (P,) bool; None: nothing is known of that."""
+        """Tokens (B, n, P, D) predicted from a token step on, and for whom (P,) bool; None: there are none."""
         if row != self.row or self._tokens is None or not self._tokens.shape[1] or not bool(self._told.any()):
             return None
         return self._tokens, self._told
 
 
 def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
-    """What each agent's own view expects of its tokens, guidance left out. (rows, W, P, D) -> (B, W, P, D)
+    """Each agent's prediction in its own view, without guidance. (rows, W, P, D) -> (B, W, P, D)
 
     A step's views and the branches of guidance run as one batch, scenes first, then views; the first branch is the
     unguided one.
@@ -88,14 +88,14 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
 
 
 def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
-    """Settle the bodies of rows up to `stop` for good: they are given from then on.
+    """Decode the bodies of the token steps up to `stop`; they are given from then on.
 
     Args:
-        world: where all rows before are shown.
-        tokens: (B, N, P, D), of which rows up to `near` are looked at.
-        stop: one past the last row to show.
-        near: one past the last finished row, at least `stop`.
-        expected: see `Expected.behind`, from row `near` on.
+        world: of which all earlier token steps are finalized.
+        tokens: (B, N, P, D), of which those up to `near` are read.
+        stop: one past the last token step to finalize.
+        near: one past the last finished token step, at least `stop`.
+        expected: see `Expected.behind`, from `near` on.
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
@@ -105,7 +105,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
-    """Rows [first, stop) as they have been shown, and from there on as they would be."""
+    """Token steps [first, stop) as finalized; those that are not yet, as they would be now."""
     known = world.given.slice(first * TOKEN_FRAMES, max(min(world.finalized, stop), first) * TOKEN_FRAMES)
     if world.finalized >= stop:
         return known
@@ -121,7 +121,7 @@ def decode_bodies(
     near: int,
     expected: tuple[Tensor, Tensor] | None = None,
 ) -> Scene:
-    """Rows [first, stop) decoded from the tokens before `near` alone, as they go on from what was shown."""
+    """Token steps [first, stop) decoded from the tokens before `near` alone, continuing from finalized bodies."""
     model, options = world.model, world.options
     lead = LEAD if first else 0
     low = max(first - bool(first) - receptive_field(model)[0], 0)

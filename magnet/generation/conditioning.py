@@ -1,4 +1,4 @@
-"""What a sample starts from: the options of the sampler, and the tokens of what is given."""
+"""What a sample is conditioned on: the known part of a scene, and its tokens."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def occupied(scene: Scene) -> int:
-    """Slots up to the last that anybody is in, in any of the scenes: plans are made for people, not for free slots.
+    """Number of slots up to the last one that is occupied in any of the scenes: plans need no free slots after it.
 
     Raises:
         ValueError: a scene has nobody in it.
@@ -33,7 +33,7 @@ def occupied(scene: Scene) -> int:
 
 
 def require_people(schedule: MaskSchedule, scene: Scene) -> None:
-    """Raises ValueError where a scene has nobody to be generated, or nobody to be given if somebody is."""
+    """Raises ValueError if some scene has nobody in the slots that a task generates, or in those that it gives."""
     generated = (schedule.finished & ~schedule.known).any(dim=0)
     given = schedule.known.any(dim=0) & ~generated
     for agents, what in ((generated, "generated"), (given, "given")):
@@ -52,20 +52,20 @@ def label(scene: Scene, number: int) -> str:
 
 
 def receptive_field(model: Denoiser) -> tuple[int, int]:
-    """Tokens before and after that a code or a decoded frame can depend on: encoder and decoder look equally far."""
+    """Tokens before and after that a code or a decoded frame depends on, the same for encoder and decoder."""
     return model.tokenizer.receptive_field
 
 
 def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
-    """The scene as far as it is known: everything else is gone, so that nothing can leak. known (N, P) bool
+    """The scene without everything that is unknown, so that nothing can leak. known (N, P) bool
 
-    Unknown frames hold a body at rest at the origin; missing frames are added, surplus ones cut.
+    Unknown frames hold a body at rest at the origin. Frames are added or removed so that their number is right.
 
     Args:
         scene: the recordings.
         known: (N, P) bool, of the whole scene.
         first: token step at which to begin.
-        stop: token step at which to end, which may lie beyond what `known` tells of; None: at the end of `known`.
+        stop: token step at which to end; beyond the end of `known` nothing is known. None: at the end of `known`.
 
     Raises:
         ValueError: something is known that was not recorded.
@@ -86,11 +86,11 @@ def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None =
 
 
 def lookahead_limit(schedule: MaskSchedule) -> Tensor:
-    """How far a known token's code may look ahead: up to which row, exclusive. -> (N, P) int
+    """How far the code of each known token may look ahead: to which token step, exclusive. -> (N, P) int
 
-    Without lookahead codes look to the end of the block that they are in, and those before the first block to where it
-    begins: so each is what it would be live, and is never encoded anew. In other plans the first stage that hides
-    what comes after a token settles it. N where no stage hides anything from everybody.
+    Without lookahead a code looks to the end of its block, and before the first block to where that begins. So it is
+    the code that a live run would have, and is never computed again. In other plans the first stage that hides what
+    comes after a token decides. N where no stage hides anything from everybody.
     """
     limits = torch.full_like(schedule.known, schedule.tokens, dtype=torch.long)
     if not schedule.lookahead:
@@ -114,9 +114,9 @@ def lookahead_limit(schedule: MaskSchedule) -> Tensor:
 
 
 def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
-    """`lookahead_limit` by what a task hides, whether or not a window on this grid would show it. -> (N, P) int
+    """`lookahead_limit` of a task, also for what lies beyond the windows of this grid. -> (N, P) int
 
-    A window that ends where a block does has nothing to hide, so the task is asked where the window goes on.
+    A window that ends with its block hides nothing after it. So the task also plans on a grid with a wider window.
     """
     wider = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, pyramid_offset=0)
     return torch.minimum(lookahead_limit(task.schedule(grid)), lookahead_limit(task.schedule(wider)))
@@ -125,7 +125,7 @@ def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
 def known_tokens(
     model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, limits: Tensor | None = None
 ) -> Tensor:
-    """Normalised tokens of what is known; other tokens hold nothing of use. known (N, P) -> (B, N, P, D)
+    """Normalized tokens of what is known; the others hold no information. known (N, P) -> (B, N, P, D)
 
     Each agent's known segments are encoded one by one: an encoder that looks ahead must not see beyond a segment, nor
     beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are

@@ -1,4 +1,4 @@
-"""A scene without end of which some is given as it happens: what a partner in real time runs on."""
+"""Endless rollouts that are given the motion of some agents as it happens: what a live partner runs on."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 class OnlineRollout(Rollout):
-    """A sample that goes on as far as it has been fed, bit for bit as if all had been given at once.
+    """A rollout that advances as far as it has been fed, bit-identical to one that was given everything at once.
 
-    Memory does not grow: what neither the model nor the decoder looks at any more is let go.
+    Memory does not grow: rows that neither the model nor the decoder needs are released.
 
     Args:
         model: the trained denoiser.
         past: B scenes of everybody, whole tokens.
-        task: is given some agents throughout, and reads nothing of them ahead.
+        task: is given some agents throughout, and does not look ahead at them.
         options: how to sample.
         generator: source of randomness, on the model's device.
 
@@ -74,13 +74,13 @@ class OnlineRollout(Rollout):
         begins, ends = self.made, self.made + frames.frames // TOKEN_FRAMES
         fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
         fed = fed.pad_agents(self.model.layout.agents)
-        # Where the floor is was seen in the past: an answer must not fail because somebody jumps or is carried.
+        # The floor was checked in the past; later frames may leave it, because somebody jumps or is carried.
         check_given(fed, self._known(begins, ends), any_floor=True)
         self.scene, self.there = cat_time([self.scene.replace(valid=None, names=()), fed]), ends
         return self._advance(begins)
 
     def _advance(self, begins: int = 0) -> Scene:
-        """Run the stages of what has been fed; the bodies of rows from `begins` on."""
+        """Run the stages of what has been fed. Returns the bodies of rows from `begins` on."""
         while self.made < self.there:
             stage, final, needed = next(self.plan)
             if stage is not None:

@@ -1,4 +1,4 @@
-"""The order in which a scene is made: a task's stages, and from when on which rows (token steps) are final."""
+"""The order in which a scene is generated: a task's stages, and which token steps (rows) are final after each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class PlannedStage(NamedTuple):
-    """A stage, and what holds once it has run."""
+    """A stage, and what is true after it."""
 
     stage: Stage | None  # None before the first
     final: int  # rows before this one are never generated or moved again
@@ -38,15 +38,15 @@ def planned(schedule: MaskSchedule) -> Plan:
 
 
 def least(rows: Sequence[int], end: int) -> list[int]:
-    """The least of all rows from each on, and `end` behind them. (S) -> (S + 1)"""
+    """Minimum of the rows from each one on, then `end`. (S) -> (S + 1)"""
     return list(itertools.accumulate(reversed([*rows, end]), min))[::-1]
 
 
 def first_changed(schedule: MaskSchedule) -> list[int]:
-    """For each stage the first row that it may change: its window's, or the first of a gap that it closes.
+    """The first row that each stage may change: the first of its window, or of a gap that it closes.
 
-    An agent that arrives at a keyframe is moved since its last known row (see `WorldState`); where nobody was known
-    before, everybody moves along.
+    Where an agent reaches a keyframe its path is warped from its last known row on (see `WorldState`); where nobody
+    was known before, everybody is moved.
     """
     known = schedule.known
     row = torch.arange(schedule.tokens)[:, None]
@@ -62,12 +62,12 @@ def first_changed(schedule: MaskSchedule) -> list[int]:
 
 
 def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> tuple[MaskSchedule, Plan]:
-    """The beginning of a scene without end, and its plan: that of a long scene, the end of which is repeated.
+    """The schedule of the beginning of an endless scene, and its plan: that of a long scene, its last stages repeated.
 
-    `slots` are the model's, free ones included. `online`: what the task is given after the context comes as it happens.
+    `slots` are the model's, free ones included. `online`: what is given after the context comes as it happens.
 
     Raises:
-        ValueError: the plan depends on the scene's end, or does not repeat itself; or what would be fed is read ahead.
+        ValueError: the plan depends on the scene's end or is not periodic, or the task looks ahead at what is fed.
     """
     long, longer = (
         task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
@@ -91,7 +91,7 @@ def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> t
 
 
 def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Plan:
-    """Some stages, of which the last `period` then follow again and again, `shift` rows further on each time."""
+    """Some stages, and then the last `period` of them forever, each time `shift` rows later."""
     begun = [(stage, stage.active[0]) for stage in stages]
     rounds = (
         (dataclasses.replace(stage, start=stage.start + number * shift), first + number * shift)
@@ -113,7 +113,7 @@ def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Pla
 
 
 def _moved(a: Stage, b: Stage) -> int | None:
-    """By how many rows b is a, further on; None if it is something else."""
+    """By how many rows `b` is later than `a`, if it is the same stage otherwise; else None."""
     alike = a.ahead == b.ahead and a.levels.shape == b.levels.shape and torch.equal(a.levels, b.levels)
     if a.hidden is None or b.hidden is None:
         alike = alike and a.hidden is b.hidden

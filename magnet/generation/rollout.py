@@ -67,7 +67,7 @@ def generate(
         generator: source of randomness, on the model's device; or one for each of the B * samples scenes, which
             are then the same whatever else is in the batch.
         progress: told 1 after each denoising step.
-        stats: filled with how well the sampled tokens hang together, and how often the network ran.
+        stats: filled with how consistent the sampled tokens are, and how often the network ran.
         cond: what the model is conditioned on, (B, C), or (B, N, C) for each token step of context and frames; see
             `Denoiser.condition`. None, and steps behind the N: nothing.
 
@@ -96,13 +96,13 @@ def stream(
     chunk: int = CHUNK,
     cond: Tensor | None = None,
 ) -> Iterator[Scene]:
-    """Sample a task in consecutive chunks of frames, which make up what `generate` returns.
+    """Sample a task in consecutive chunks of frames, which together are what `generate` returns.
 
-    Memory holds a chunk and its neighbourhood, however long the scene; it grows only where a keyframe far ahead
-    decides where everything before it stands. Arguments as for `generate`, and:
+    Memory does not grow with the scene's length, unless a keyframe far ahead decides where everything before it is
+    placed. Arguments as for `generate`, and:
 
     Args:
-        frames: None: without end, for tasks that then are given no more than the context.
+        frames: None: endless, for tasks that are given nothing after the context.
         chunk: token steps decoded and handed out at a time. Smaller chunks come sooner and cost more; poses
             differ by rounding.
 
@@ -116,10 +116,10 @@ def stream(
 
 
 class Rollout:
-    """A sample in the making: rows (token steps) that may still change or are needed to decode those that do.
+    """A scene while it is sampled: the token steps (rows) that may still change, or are needed to decode those that do.
 
-    The rows held are [first, stop): `tokens` and `mask_noise` (B, n, P, D), the `history` of a multistep solver, and
-    the world in `world`. `there` is how many rows there are so far of what is given.
+    Rows [first, stop) are held: `tokens` and `mask_noise` (B, n, P, D), the `history` of a multistep solver, and
+    `world`. `there` is the number of rows that are given so far.
     """
 
     online = False
@@ -202,9 +202,9 @@ class Rollout:
                     start, before = stop, made.slice(made.frames - 1)
 
     def _ready(self, final: int) -> Iterator[float]:
-        """Rows before which bodies can be handed out, given those before which nothing is generated or moved again.
+        """Rows before which bodies are ready, given those (`final`) before which nothing changes any more.
 
-        Bodies of causal plans are made here, block by block, as they are live.
+        Bodies of causal plans are decoded here, block by block, as they are in a live run.
         """
         if not self.world.causal:
             yield self.rows if final >= self.rows else final - self._margins[1]
@@ -215,7 +215,7 @@ class Rollout:
 
     @torch.no_grad()
     def _finalize(self, stop: int, end: int) -> int:
-        """Settle the bodies up to row `stop`, of which those before `end` are finished. Returns `stop`."""
+        """Finalize the bodies of rows up to `stop`; the tokens before `end` are finished. Returns `stop`."""
         near = min(stop + receptive_field(self.model)[1], end)
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(near)
@@ -225,20 +225,20 @@ class Rollout:
 
     @property
     def _margins(self) -> tuple[int, int]:
-        """Rows before and after a chunk that its poses depend on: by its seams, which depend on their neighbours."""
+        """Rows before and after a chunk that its poses depend on, through the decoder and the blending of seams."""
         before, after = receptive_field(self.model)
         if self.world.causal:
             return before + 2, 0
         seam = -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
         return before + seam + 1, after + seam
 
-    # Contexts are entered anew in each call: while a chunk is being looked at they would hold outside too.
+    # Each call enters its contexts itself: held across a yield they would apply to the caller too.
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
         self._ahead, self._begins = stage.ahead, stage.start
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
-            self._bring_in(stage.stop + 1)  # the step into the token behind the window is written too
+            self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
                 self._denoise,
                 [dataclasses.replace(stage, start=stage.start - self.first)],
@@ -280,7 +280,7 @@ class Rollout:
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
-        """Bodies of rows [start, stop), which are final; rows that no later chunk or stage needs are let go."""
+        """Bodies of the final rows [start, stop); rows that no later chunk or stage needs are released."""
         behind, ahead = self._margins
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(stop + ahead)
@@ -295,7 +295,7 @@ class Rollout:
         return made.replace(given=given[None] & made.present[:, None])
 
     def _bring_in(self, stop: int) -> None:
-        """Bring in rows, whole chunks at a time, until those before `stop` are held."""
+        """Add rows, whole chunks at a time, until those before `stop` are held."""
         behind, ahead = receptive_field(self.model)
         while self.stop < min(stop, self.there):
             last = int(min(self.stop + self.chunk, self.there))
@@ -320,7 +320,7 @@ class Rollout:
         return mask_unknown(self.scene, self.known, low, high)
 
     def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
-        """How far the codes of some of the rows [low, high) look ahead, counted from `low`; 0 for the others."""
+        """Lookahead limits of some of the rows [low, high), counted from `low`; 0 for the others."""
         if self.limits is None:
             return None
         limits = torch.zeros_like(self.limits[low:high])
@@ -328,13 +328,13 @@ class Rollout:
         return limits
 
     def _known(self, first: int, stop: int) -> Tensor:
-        """Rows [first, stop) of what is known; nothing is, beyond the plan of a scene without end."""
+        """Which tokens of the rows [first, stop) are known; none beyond the plan of an endless scene."""
         rows = self.known[first:stop]
         return torch.nn.functional.pad(rows, (0, 0, 0, stop - first - len(rows)))
 
 
 def whole_tokens(scene: Scene, frames: int) -> Scene:
-    """So many frames of a scene and, up to the end of their last token, its last pose held if there are no more."""
+    """The first frames of a scene, filled up to a whole token; its last pose is repeated if it has no more frames."""
     wanted = -(-frames // TOKEN_FRAMES) * TOKEN_FRAMES
     if scene.frames >= wanted:
         return scene

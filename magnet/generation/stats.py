@@ -1,4 +1,4 @@
-"""How well sampled tokens hang together, and what they cost."""
+"""How consistent sampled tokens are, and what they cost."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SamplingStats:
         return self.rows / max(self.scenes, 1)
 
     def means(self) -> dict[str, float]:
-        """Means of what was seen; `calls` is that of a run of the sampler."""
+        """Means over all that was added; `calls` is the mean of a run of the sampler."""
         return {
             "quantization_error": self.quantization_error_sum / max(self.quantization_errors, 1),
             "pairwise_drift": self.pairwise_drift_sum / max(self.pairwise_drifts, 1),

@@ -1,4 +1,4 @@
-"""World poses of a scene while it is being generated, and its bodies in the end."""
+"""World poses of a scene while it is generated, and its bodies in the end."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
 
 
 class WorldState:
-    """World poses of the scene while it is being generated.
+    """World poses of the scene while it is generated.
 
-    After each stage the new tokens are made self-consistent before the model sees them again: codes
-    snapped, transforms projected to turns about the vertical and ground shifts, agents placed in the
-    world, and both kinds of transforms recomputed from there.
+    After each stage the new tokens are made consistent before the model sees them again: latents are moved to
+    their nearest codes, transforms projected to planar ones, agents placed in the world, and deltas and pairwise
+    transforms computed again from there.
 
     Args:
         model: whose tokens these are.
-        given: (B, T) what is known of the scene, the rest masked; or of its first rows, see `extend`.
+        given: (B, T) the scene (or its first rows, see `extend`) with everything unknown masked.
         schedule: the plan of the whole scene; only what it knows is read.
         options: how to sample.
         samples: scenes drawn for each of B.
@@ -74,15 +74,14 @@ class WorldState:
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
 
     def extend(self, given: Scene, known: Tensor) -> None:
-        """Take in more rows at the end. given (B, 4 n), known (n, P)"""
+        """Add rows at the end. given (B, 4 n), known (n, P)"""
         given = given.repeat(self.samples)
         self.given = cat_time([self.given, given])
         self.known, self.placed = torch.cat([self.known, known]), torch.cat([self.placed, known])
         self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
 
     def release(self, rows: int) -> None:
-        """Let the first rows go; nothing that follows may depend on them, so one row before what may still
-        change must stay."""
+        """Release the first rows, on which nothing that may still change depends: one row before it must stay."""
         frames = rows * TOKEN_FRAMES
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
@@ -114,7 +113,7 @@ class WorldState:
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
-        if begin < first:  # a gap longer than the window has been closed: its earlier frames have moved too
+        if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
         true_deltas = self._deltas(begin, stop)
@@ -156,7 +155,7 @@ class WorldState:
         )
 
     def _deltas(self, first: int, stop: int) -> Tensor:
-        """Steps of some tokens as the world has them; from where nobody stands yet, the identity. -> (B, n, P, 4, 9)"""
+        """Deltas of some tokens as placed in the world; the identity after unplaced rows. -> (B, n, P, 4, 9)"""
         # One frame more in front, so that the first delta leads in from where each agent stood.
         lead = min(1, first)
         deltas = canonical_deltas(self.T_world_can[:, first * TOKEN_FRAMES - lead : stop * TOKEN_FRAMES])[:, lead:]
@@ -166,7 +165,7 @@ class WorldState:
         return deltas
 
     def _enter(self, tokens: Tensor, first: int, stop: int) -> Tensor:
-        """Write the true delta into known tokens that a gap has just been closed in front of."""
+        """Write the delta into known tokens whose gap before them has just been closed."""
         until = min(stop + 1, len(self.known))
         before = torch.nn.functional.pad(self.known, (0, 0, 1, 0))[first:until]
         entered = (self.known[first:until] & ~before).to(tokens.device)
@@ -182,7 +181,7 @@ class WorldState:
         return tokens
 
     def _ready(self, first: int, stop: int) -> Tensor:
-        """Which groups of tokens speak only of agents that are placed. -> (n, P, 1 + slots) bool"""
+        """Which groups of tokens concern placed agents only. -> (n, P, 1 + slots) bool"""
         own = self.placed[first:stop, :, None]
         if not self.model.layout.slots:
             return own.clone()
@@ -190,7 +189,7 @@ class WorldState:
         return torch.cat([own, own & self.placed[first:stop][:, partner]], dim=-1)
 
     def _touched(self, moved: Tensor) -> Tensor:
-        """Which groups of tokens speak of somebody who moved. moved (n, P) -> (n, P, 1 + slots) bool"""
+        """Which groups of tokens concern somebody who moved. moved (n, P) -> (n, P, 1 + slots) bool"""
         own = moved[..., None]
         if not self.model.layout.slots:
             return own
@@ -205,7 +204,7 @@ class WorldState:
         stop: int,
         placement: Placement,
     ) -> Tensor:
-        """Put the new tokens of a stage into the world, from known token to known token. -> (N, P) bool, who moved"""
+        """Place the new tokens of a stage in the world, gap by gap. -> (N, P) bool, who moved"""
         moved = finished.clone()
         for start, end in spans(finished, self.placed, first, stop):
             part = slice(start - first, end - first)
@@ -219,7 +218,7 @@ class WorldState:
     def _place(
         self, deltas: Tensor, pairs: Tensor | None, first: int, stop: int, new: Tensor, placement: Placement
     ) -> None:
-        """Put newly generated agents into the world from their predicted deltas and pairs. new (P,) bool"""
+        """Place newly generated agents by their predicted deltas and pairwise transforms. new (P,) bool"""
         new = new.to(deltas.device)
         known = self.placed[first].to(deltas.device)
         true_deltas = from_9d(by_frame(self._deltas(first, stop)))
@@ -244,9 +243,9 @@ class WorldState:
     def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`, such that the first delta leads to the right place.
 
-        Whoever was there before goes on from there. A newcomer's whole way hangs by the pairwise transforms, as
-        nearly as can be, off somebody known at the first frame, or off somebody who was there before, or off the first
-        newcomer, who then starts at the origin; in each scene off somebody who is present.
+        Agents that were placed before continue from there. A new agent is placed so that its pairwise transforms to an
+        anchor fit best over the window. The anchor is somebody who is known at the first frame, else somebody who was
+        placed before, else the first new agent, who starts at the origin; in each scene somebody who is present.
         """
         starts = self.T_world_can[:, max(first * TOKEN_FRAMES - 1, 0)].clone()
         there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
@@ -275,10 +274,10 @@ class WorldState:
         return starts
 
     def _warp_to_keyframe(self, row: int, new: Tensor) -> Tensor:
-        """Make those who have just been placed up to a known token arrive there. new (P,) -> (N, P) bool, who moved
+        """Warp the paths of agents that have been placed up to a known token. new (P,) -> (N, P) bool, who moved
 
-        Each agent's misfit is spread over its whole gap, or as much of it as has not been shown. Where nothing was
-        known before, the world's origin was arbitrary, and all who are there move along with the first who arrives.
+        Each agent's error is spread over its gap, or over the part of it that is not finalized. If nothing was known
+        before, the world's origin was arbitrary, and everybody is moved along with the first agent that arrives.
         """
         moved = torch.zeros_like(self.placed)
         arriving = self.known[row] & new & ~self._late(row) if row < len(self.known) else torch.zeros_like(new)
@@ -304,14 +303,14 @@ class WorldState:
         return moved
 
     def _late(self, row: int) -> Tensor:
-        """Who is told of a known token only when the one before has been shown. -> (P,) bool"""
+        """Whose known token becomes known only when the one before is finalized. -> (P,) bool"""
         row += self.released
         if not self.causal or not 0 < row < len(self._lookahead_limit):
             return torch.zeros_like(self.known[0])
         return self._lookahead_limit[row - 1] <= row
 
     def _root(self, key: int, arriving: Tensor) -> None:
-        """Move the world before frame `key` so that in each scene the first who arrives there fits. arriving (P,)"""
+        """Move the world before frame `key` so that in each scene the first arriving agent fits. arriving (P,)"""
         there = self.given.present & arriving.to(self.given.device)
         scene, lead = torch.arange(len(there), device=there.device), first_of(there)
         T_world_key = self.T_world_can[scene, key, lead]
@@ -324,10 +323,10 @@ class WorldState:
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)
 
     def scene(self, tokens: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
-        """Rows [first, stop) of the finished tokens as bodies in the world; by default all rows.
+        """Bodies in the world of rows [first, stop) of the finished tokens; by default of all rows.
 
-        `before` is the frame in front of them, where there is one: agents who have ended stand as they stood there.
-        Poses depend on as many neighbouring rows as the decoder and the seams reach; those of causal plans on earlier
+        `before` is the frame before them, where there is one, which agents that have ended stand still in. Poses
+        depend on neighbouring rows, through the decoder and the blending of seams; those of causal plans on earlier
         rows alone (`magnet.generation.causal_bodies`).
         """
         if self.causal:

@@ -33,7 +33,7 @@ class Grid:
     window: int = 16  # token steps W that the model sees at once
     stride: int = 4  # token steps finished before the window moves on
     pyramid_offset: int | None = (
-        0  # steps between a token and the next; 0: a stride's go together; None: see `token_offset`
+        0  # denoising steps from a token to the next; 0: a stride together; None: see `token_offset`
     )
     shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
     noise_sampling: NoiseSampling = "joint"  # see `magnet.sampling.plans.token_levels`
@@ -53,9 +53,9 @@ class Grid:
 
     @property
     def token_offset(self) -> int:
-        """Denoising steps between a token and the next in plans that can roll; 0: they go in strides.
+        """`pyramid_offset`, or its default: the offset at which half of the window is in flight and half is finished.
 
-        By default (`pyramid_offset` None) what keeps half of the window in the making, and half in sight behind it.
+        0: the tokens of a stride are denoised together.
         """
         if self.pyramid_offset is not None:
             return self.pyramid_offset
@@ -63,20 +63,20 @@ class Grid:
 
     @property
     def tokens_in_flight(self) -> int:
-        """Token steps that are half denoised at a time when rolling."""
+        """Token steps that are partly denoised at the same time in a pyramid."""
         return -(-self.steps // self.token_offset)
 
     @property
     def slides(self) -> bool:
-        """Whether the window moves on token by token: there is a slope, and it holds all that is half denoised."""
+        """Whether the window moves on token by token: all tokens in flight fit into it."""
         return self.token_offset > 0 and self.tokens_in_flight < self.window
 
     @property
     def offset_in_window(self) -> int:
-        """Denoising steps between a token and the next inside a window that moves in strides; 0: they go together.
+        """Offset between the new tokens of a window that moves in strides; 0: they share one level.
 
-        A slope too gentle for the window to roll along it. Each place of the window then has a whole pyramid to
-        itself: it begins with all of its new tokens at K and ends with all of them clean.
+        Used where the tokens in flight do not fit into the window. Each position of the window then is a pyramid of
+        its own: all of its new tokens begin at K and end clean.
         """
         return 0 if self.slides else self.token_offset
 

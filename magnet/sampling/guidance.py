@@ -52,7 +52,7 @@ class Guidance:
         require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
 
     def branches(self, there: Tensor) -> Tensor:
-        """Whose history each branch sees, the unguided one first; slots that are free everywhere see and tell nothing.
+        """Whose history each branch sees, the unguided one first. Slots that are free in all scenes are left out.
 
         there (P,) bool, slots that somebody is in -> (K, P) bool, no two alike
         """
@@ -68,7 +68,7 @@ class Guidance:
 
     @staticmethod
     def alone(there: Tensor) -> Tensor:
-        """Each slot by itself. (P,) bool -> (P, P) bool"""
+        """Each slot alone: the identity. (P,) bool -> (P, P) bool"""
         return torch.eye(len(there), dtype=torch.bool, device=there.device)
 
     def apply(
@@ -81,7 +81,7 @@ class Guidance:
         layout: TokenLayout,
         moves: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """The noisy tokens that the next step starts from, which smoothing moves, and the guided prediction.
+        """The noisy tokens that the next step starts from (smoothing changes them), and the guided prediction.
 
         tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P), moves bool, the numbers that the step
         denoises -> (B, W, P, D) twice
@@ -149,7 +149,7 @@ class Guidance:
 
 
 def noisier(tokens: Tensor, noise: Tensor, now: Tensor, wanted: Tensor) -> Tensor:
-    """Noise added to numbers (..., D) of levels `now` wherever a higher level is wanted."""
+    """Tokens of levels `now` brought to the levels `wanted` where these are higher. (..., D) each"""
     share = alpha_bar(wanted) / alpha_bar(now).clamp_min(1e-12)
     return torch.where(wanted > now, share.sqrt() * tokens + (1 - share).clamp_min(0).sqrt() * noise, tokens)
 

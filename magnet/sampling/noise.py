@@ -85,11 +85,11 @@ def ddim_step(
 
 
 def shifted(levels: Tensor, shift: float, K: int = LEVELS) -> Tensor:
-    """Levels moved toward noise, `shift` u / (1 + (shift - 1) u) of u = level / K; 0 and K stay. (...) int -> same
+    """Levels moved toward noise: `shift` u / (1 + (shift - 1) u) of u = level / K; 0 and K stay. (...) int -> same
 
-    A token tells the same pose with hundreds of numbers, so it can be made out until almost nothing of it is
-    left: what has yet to be decided is decided at high levels. (The form: Esser et al. 2024, Scaling rectified
-    flow transformers, for images of high resolution.)
+    A token describes a pose with hundreds of redundant numbers, so the pose can be recognised at all but the highest
+    levels. More denoising steps are therefore spent there. (The form: Esser et al. 2024, Scaling rectified flow
+    transformers, for images of high resolution.)
     """
     if shift == 1.0:
         return levels
@@ -127,8 +127,8 @@ def _levels(steps: int, shift: float, K: int) -> Tensor | None:
 
 
 HIGHEST_NOISE, LOWEST_NOISE, LONGEST_STEP = -3.0, 4.67, 2.6
-"""Of levels evenly spaced in `half_log_snr`: pure noise counts as -3, the last level before 0 is at 4.67 (level 2), and
-steps are no longer than 2.6, which makes fewer than four steps end at a noisier level."""
+"""For levels evenly spaced in `half_log_snr`: the value that pure noise counts as, that of the last level before 0
+(level 2), and the longest step; with fewer than four steps the last level before 0 is noisier."""
 
 
 def half_log_snr(levels: Tensor, K: int = LEVELS) -> Tensor:
@@ -169,7 +169,7 @@ def nearest_levels(wanted: Tensor, K: int = LEVELS) -> Tensor:
 
 @dataclass
 class NoiseStream:
-    """Noise of tokens in the order of time: row i is the same however many rows are drawn at a time.
+    """Noise of tokens in the order of time: that of token step i does not depend on how many are drawn at once.
 
     Args:
         shape: (B, P, D) of a row.
@@ -193,11 +193,11 @@ class NoiseStream:
         if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
         require_number("eta", self.eta, 0, 1)
-        # Drawn once: the noise of a step then hangs on its place alone, in whatever order places are asked for.
+        # Drawn once, so that the noise of a step depends on its place alone, not on the order of the calls.
         self._seeds = self._draw_seeds() if self.eta else []
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """The noise of the next `count` token steps, and their mask_noise, which stands in where a view hides them.
+        """Initial noise of the next `count` token steps, and their mask noise, shown where a view hides them.
 
         -> (B, count, P, D) each
         """
@@ -216,7 +216,7 @@ class NoiseStream:
         return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)
 
     def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
-        """New noise of the denoising steps that leave these levels, on token steps `first` and on.
+        """Step noise of the denoising steps that leave these levels, for the token steps from `first` on.
 
         levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)
         """

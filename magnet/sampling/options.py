@@ -1,4 +1,4 @@
-"""How scenes are sampled: the options of the sampler, and the grid that tasks plan on with them."""
+"""Options of the sampler, and the grid that tasks plan on with them."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ class SamplerOptions:
     `preset` gives sets of these options by name; `paper` is the paper's sampler.
 
     Args:
-        steps: denoising steps S; the paper takes 30 (A.3). No more than pass levels that differ, which is a matter of
-            `spacing` and `shift`.
+        steps: denoising steps S; the paper takes 30 (A.3). At most as many as there are different levels, which depends
+            on `spacing` and `shift`.
         stride: token steps finished before the window moves on; the reference keeps 12 of 16.
-        pyramid_offset: denoising steps between a token and the next, which makes the plan lower-triangular: 4 keeps
-            8 tokens half denoised. 0: the tokens of a stride are denoised together, as in the paper. None: tasks
-            that can roll do, with half of the window half denoised; those whose agents take turns or that look
-            ahead to keyframes go in strides.
+        pyramid_offset: denoising steps from a token to the next, which makes the plan lower-triangular: 4 of 30 steps
+            keep 8 tokens in flight. 0: the tokens of a stride are denoised together, as in the paper. None: half of
+            the window is in flight; tasks whose agents take turns or that look ahead to keyframes go in strides.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
             (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
-        requantize: snap generated latents to the nearest code before they are decoded and built on, as the reference
-            does. None: if codes are what the model was trained to generate (`target` of the denoiser).
-        keep_given: put the given frames back in place of their lossy reconstruction, with the seams blended.
-        blend: frames over which a seam fades out behind given frames, and in before them.
+        requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
+            does. None: if the model was trained to generate codes (`target` of the denoiser).
+        keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
+        blend: frames over which a seam is blended, after given frames and before them.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
-        shift: over 1, more of even denoising steps at high noise levels; 1 leaves them even, as in the paper.
-        any_floor: take people who all stand far from y = 0, where models have their floor, as they are.
+        shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
+        any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.
-        noise_sampling: `joint`: agents at a time step are at one level; `independent`: each token of each agent
-            passes levels of its own (paper A.6.2, read as a choice when sampling; it finds this the worse).
-        solver: `ddim`, as in the paper, or `dpmpp_2m`, DPM-Solver++(2M), of second order: few steps keep the variance.
-        spacing: of the levels that are passed: `even`, as in the paper, which `shift` moves; or evenly in `log_snr`,
-            with a last level near 0.
+        noise_sampling: `joint`: agents at a time step share one level; `independent`: each token of each agent has
+            levels of its own, which is worse (paper A.6.2, read as a choice when sampling).
+        solver: `ddim`, as in the paper, or `dpmpp_2m`, the second-order DPM-Solver++(2M), which keeps the variance
+            with few steps.
+        spacing: of the levels: `even`, as in the paper, changed by `shift`; or evenly in `log_snr`, with a last level
+            near 0.
     """
 
     steps: int = 16
@@ -99,6 +99,6 @@ class SamplerOptions:
 
 
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
-    """The grid that a task plans on: sizes in token steps, and how these options sample."""
+    """The grid that a task plans on: sizes in token steps, and these options of the sampler."""
     o = options
     return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)

@@ -22,17 +22,16 @@ from magnet.seeding import derive
 
 
 def token_levels(grid: Grid) -> Tensor:
-    """The levels that each token passes, before and after its s-th own denoising step. -> (S + 1, W, P) int
+    """The levels that each token passes: before its first denoising step and after each. -> (S + 1, W, P) int
 
-    Row n % W is that of token step n. Paper A.6.2 compares two ways and can be read in two: as a choice when training
-    (`noise_levels` of the denoiser), or, as here, when sampling, which fits that both of its rows are of one trained
-    model and that it is used "for all joint prediction experiments":
+    Column n % W is that of token step n.
 
-    `joint`: the same levels for all, of `ddim_levels` or `log_snr_levels`; agents at a time step share their level
-    throughout.
-    `independent`: each token of each agent passes levels of its own between K and 0, drawn evenly from 1..K-1 (and then
-    `shifted`), or evenly in log-SNR. They are drawn once and for all, the same for every scene: a plan draws no random
-    numbers.
+    `joint`: the levels of `ddim_levels` or `log_snr_levels` for all tokens; agents at a time step share their level.
+    `independent`: each token of each agent has levels of its own between K and 0, drawn evenly from 1..K-1 (and then
+    `shifted`), or evenly in log-SNR. They are drawn from a fixed seed, the same for every scene.
+
+    Paper A.6.2 compares the two. It can be read as a choice when training (`noise_levels` of the denoiser) or when
+    sampling. It is a choice when sampling here, because both of the paper's rows are of one trained model.
     """
     in_log_snr = grid.spacing == "log_snr"
     plan = log_snr_levels(grid.steps) if in_log_snr else ddim_levels(grid.steps, grid.shift)
@@ -53,7 +52,7 @@ def token_levels(grid: Grid) -> Tensor:
 
 
 def levels_at(levels: Tensor, turn: Tensor, start: int, stop: int) -> Tensor:
-    """Levels of the token steps [start, stop), each after so many of its own denoising steps.
+    """Levels of the token steps [start, stop) after so many of their own denoising steps.
 
     levels (S + 1, W, P) as of `token_levels`; turn (R, stop - start or 1, P or 1) int, clamped to 0..S
     -> (R, stop - start, P)
@@ -63,7 +62,7 @@ def levels_at(levels: Tensor, turn: Tensor, start: int, stop: int) -> Tensor:
 
 
 def changing(rows: Tensor) -> Tensor:
-    """Levels without the denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
+    """The rows of a plan without denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
     changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
     return torch.cat([rows[:1], rows[1:][changes]])
 
@@ -81,7 +80,7 @@ def initial_levels(known: Tensor) -> Tensor:
 
 
 def window_positions(target: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
-    """Where the window stands: (start, first token step to denoise, one past the last), until all is done.
+    """Positions of the window: (start, first token step to denoise, one past the last), until all targets are done.
 
     The first window is filled to its end; each later one keeps window - stride finished steps in view.
     """

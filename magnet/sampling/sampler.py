@@ -1,4 +1,4 @@
-"""The one sampling loop. It never asks which task it runs."""
+"""The sampling loop of all tasks."""
 
 from __future__ import annotations
 
@@ -174,10 +174,10 @@ def _predict_in_views(
     layout: TokenLayout,
     guidance: Guidance,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Each agent's tokens are predicted in its own view, in which hidden tokens are unknown. hidden (P, W, P)
+    """Predict each agent's tokens in its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
-    Agents that see the same share a view. One to somebody hidden is unknown too; it is predicted in that
-    agent's view if that one sees both, or else stays noise.
+    Agents that see the same share a view. A pairwise transform to somebody hidden is unknown too. It is read from the
+    other agent's view if that one sees both, and stays noise otherwise.
 
     Returns:
         The noisy tokens that the next step starts from and their clean prediction (B, W, P, D), and the levels of their
@@ -190,7 +190,7 @@ def _predict_in_views(
     seen_after = torch.where(views_hidden, LEVELS, after)
     group = layout.spread(layout.group_levels(seen_now))  # (V, W, P, D)
     group_after = layout.spread(layout.group_levels(seen_after))
-    # What speaks of somebody hidden is shown as noise of its own: its own noise would tell where it is going.
+    # Numbers about somebody hidden are shown as mask noise: their own noise would reveal what they become.
     masked_levels = torch.where(views_hidden, LEVELS, 0)
     unknown = layout.spread(layout.group_levels(masked_levels)) == LEVELS
     views = torch.where(unknown, mask_noise[:, None], tokens[:, None])  # (B, V, W, P, D)
@@ -215,7 +215,7 @@ def _predict_in_views(
 
 
 def _views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tensor:
-    """From which view each group of each token is read. hidden (P, W, P), view_of (P,) -> (W, P, 1 + slots) int"""
+    """The view that each group of each token is read from. hidden (P, W, P), view_of (P,) -> (W, P, 1 + slots) int"""
     P, W = hidden.shape[:2]
     own = view_of.expand(W, P)[..., None]
     if not layout.slots:

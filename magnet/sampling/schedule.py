@@ -18,7 +18,7 @@ from magnet.sampling.plans import blocks, changing, initial_levels, levels_at, t
 __all__ = ["Grid", "MaskSchedule", "Stage", "initial_levels", "window_positions"]
 
 AHEAD = 3
-"""Token steps of pure noise behind a block, where there is room: with none, motion is a fifth slower."""
+"""Token steps of pure noise shown after a block, where there is room: without them motion is a fifth slower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +27,14 @@ class Stage:
 
     Attributes:
         start: token step at which the window begins.
-        levels: (S + 1, W, P) int in 0..K. Row s holds the levels before denoising step s, the last row
-            those after the last step. 0 is clean. Two bytes each do: a plan is as long as its scene.
+        levels: (S + 1, W, P) int16 in 0..K. Row s holds the levels before denoising step s, the last row those after
+            the last step. 0 is clean.
         hidden: (P, W, P) bool or None. hidden[p, i, q]: while agent p's tokens are updated, the model must
-            not see agent q's token i. None: everybody sees everything. Where agents see different
-            things each is updated from a view of its own; views run as one batch.
-        ahead: token steps behind the window that the model is shown as pure noise, nobody's: trained on windows that
-            go on, it slows people down where a window ends. They need not be there, so a plan can be the same
-            wherever its scene ends. What the model expects there closes the poses of causal plans.
+            not see agent q's token i. None: everybody sees everything. Agents that see different things are updated
+            from views of their own, which run as one batch.
+        ahead: token steps of pure noise that the model is shown after the window, beyond the scene's end if need be.
+            The model was trained on full windows and slows people down where a shorter window ends. What it predicts
+            for these steps is decoded with the last block of a causal plan.
     """
 
     start: int
@@ -59,7 +59,7 @@ class Stage:
         return self.hidden is not None and bool((self.hidden & generated).any())
 
     def padded(self, agents: int) -> Stage:
-        """The same with free slots behind, of which nothing is known and nothing generated."""
+        """The same with free slots added, of which nothing is known and nothing is generated."""
         extra = agents - self.levels.shape[2]
         levels = torch.nn.functional.pad(self.levels, (0, extra), value=LEVELS)
         hidden = self.hidden
@@ -79,10 +79,10 @@ class MaskSchedule:
 
     Attributes:
         known: (N, P) bool, given by the task; everything else starts as pure noise.
-        lookahead: False: what is given after the token steps that a stage generates has not happened yet by then, so
-            that no code of what came before looks there either.
-        causal: poses are shown as soon as their tokens are finished, and nothing that is generated or given later
-            changes them. Always so where a stage hides something, or without `lookahead`.
+        lookahead: False: what is given after the token steps that a stage generates counts as not having happened yet,
+            so that codes of earlier tokens must not depend on it.
+        causal: poses are final as soon as their tokens are finished; nothing generated or given later changes them.
+            Always true where a stage hides something, or without `lookahead`.
 
     Raises:
         ValueError: a law is broken; names the stage, step, token and agent.
@@ -139,7 +139,7 @@ class MaskSchedule:
             level[stage.start : stage.stop] = rows[-1]
 
     def padded(self, agents: int) -> MaskSchedule:
-        """The same plan with free slots behind, of which nothing is known and nothing generated."""
+        """The same plan with free slots added, of which nothing is known and nothing is generated."""
         known = torch.nn.functional.pad(self.known, (0, agents - self.agents))
         stages = tuple(stage.padded(agents) for stage in self.stages)
         return dataclasses.replace(self, agents=agents, stages=stages, known=known)
@@ -162,7 +162,7 @@ class MaskSchedule:
         return level
 
     def rows(self) -> Iterator[Tensor]:
-        """The whole grid before each denoising step and after the last, for pictures. (N, P) int each"""
+        """Levels of the whole grid before each denoising step and after the last, for pictures. (N, P) int each"""
         level = initial_levels(self.known)
         yield level.clone()
         for stage in self.stages:
@@ -182,7 +182,7 @@ class MaskSchedule:
             grid: sizes; the first window is filled whole, then it moves on by `grid.stride`. Where it `slides`, the
                 window moves on token by token; with a `grid.offset_in_window` the new tokens of each place
                 follow one another.
-            positions: other places for the window, as `window_positions` gives them; these cannot roll.
+            positions: positions of the window, instead of those of `window_positions`; no pyramid is possible then.
 
         Raises:
             ValueError: a pyramid was asked for where the window's places are given.
@@ -201,7 +201,7 @@ class MaskSchedule:
             active = target[start:stop].clone()
             active[: first - start] = False
             active[last - start :] = False
-            if not active.any():  # a stride in the middle that is known already
+            if not active.any():  # everything in this stride is known
                 continue
             turn = torch.arange(grid.steps + slope * (last - first - 1) + 1)[:, None]
             turn = turn - slope * (torch.arange(start, stop) - first)
@@ -212,13 +212,11 @@ class MaskSchedule:
 
     @staticmethod
     def pyramid(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
-        """Denoise along a slope: each token `grid.token_offset` denoising steps behind the one before it in time.
+        """Denoise each token `grid.token_offset` denoising steps later than the one before it in time.
 
-        The window has to hold all that is half denoised at a time (`Grid.slides`), and one token more.
-
-        A lower-triangular plan (paper 3.3; rolling and pyramid schedules of diffusion forcing). A stage is what
-        finishes one more token step. As long as less than half of a window lies behind, there is too little to go on
-        from: the first window is then filled whole.
+        The plan is lower-triangular (paper 3.3; the pyramid schedule of diffusion forcing). Each stage finishes one
+        more token step. All tokens in flight and one more must fit into the window (`Grid.slides`). Where less than
+        half a window is given, the first window is denoised as a full sequence: there is too little to continue from.
 
         Args:
             known: (N, P) bool, given clean.
@@ -259,16 +257,16 @@ class MaskSchedule:
         delay: Tensor | None = None,
         lookahead: bool = True,
     ) -> MaskSchedule:
-        """Denoise the targets a few time steps at a time, agents as they are told.
+        """Finish the targets block by block; agents may be hidden from each other or start later than others.
 
-        A block is one stage, or, where agents are delayed, as many as there are starts: a token that has not been
-        begun is pure noise and hidden from everybody, so that not even its noise can tell; once begun it is seen by
-        whoever is denoised beside it, however noisy. With nobody `unseen` this samples the joint distribution of the
-        block, whatever the delays: by the chain rule where an agent waits until the one before is done.
+        A block is one stage. With delays it is one stage for each start: a token that has not started is pure noise
+        and hidden from everybody; once started it is seen by all that are denoised beside it. With nobody `unseen` the
+        joint distribution of the block is sampled, whatever the delays (by the chain rule where an agent waits until
+        the one before is done).
 
-        A plan in which somebody is unseen, delayed or without lookahead is `causal`. Windows end with the block, or
-        with what is given within sight of it, and pure noise lies ahead: so the plan of what comes first is the same
-        however long the scene.
+        A plan with somebody unseen or delayed, or without lookahead, is `causal`. Its windows end with the block, or
+        with what is given after it inside the window, and pure noise follows. So the plan of the first blocks does not
+        depend on the length of the scene.
 
         Args:
             known: (N, P) bool, given clean.
@@ -304,7 +302,7 @@ class MaskSchedule:
             for begins, ends in pairwise(starts):
                 turns = torch.arange(begins, ends + 1)[:, None] - delay  # (rows, P)
                 rows = changing(torch.where(active, levels_at(plan, turns[:, None], start, stop), level[start:stop]))
-                if len(rows) == 1:  # whoever starts here has nothing to generate in this block
+                if len(rows) == 1:  # the agents that start here have no targets in this block
                     continue
                 hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
                 if unseen is not None:

@@ -15,9 +15,9 @@ Solver = Literal["ddim", "dpmpp_2m"]
 
 @dataclass
 class History:
-    """What a multistep solver remembers of each number: its last clean prediction, and at which level it was made.
+    """The last clean prediction of each number and the level it was made at, for a multistep solver.
 
-    Levels differ from token to token, and so does what came before: a number that waits keeps its memory.
+    Tokens are at different levels, so each has a history of its own; a token that waits keeps it.
 
     Attributes:
         clean: (B, N, P, D); means nothing where nothing has been predicted yet.
@@ -29,15 +29,15 @@ class History:
 
     @classmethod
     def empty(cls, tokens: Tensor) -> History:
-        """Nothing remembered of any number yet. tokens (B, N, P, D)"""
+        """A history without predictions. tokens (B, N, P, D)"""
         return cls(torch.zeros_like(tokens), torch.full(tokens.shape[1:], -1, device=tokens.device))
 
     def copy(self) -> History:
-        """The same, to be brought up to date by itself."""
+        """A copy that can be updated independently."""
         return History(self.clean.clone(), self.levels.clone())
 
     def extend(self, tokens: Tensor) -> History:
-        """With more token steps at the end, of which nothing is remembered. tokens (B, n, P, D)"""
+        """With more token steps at the end, without predictions. tokens (B, n, P, D)"""
         more = History.empty(tokens)
         return History(torch.cat([self.clean, more.clean], dim=1), torch.cat([self.levels, more.levels]))
 
@@ -46,11 +46,11 @@ class History:
         return History(self.clean[:, rows:].clone(), self.levels[rows:].clone())
 
     def window(self, rows: slice) -> History:
-        """Some token steps; what is written there is written here."""
+        """Some token steps, as a view: writing to it writes to this history."""
         return History(self.clean[:, rows], self.levels[rows])
 
     def keep(self, clean: Tensor, now: Tensor, moves: Tensor) -> None:
-        """Remember the predictions of a step where it moves something. clean (B, N, P, D), now, moves (N, P, D)"""
+        """Store the predictions of a step where it changes something. clean (B, N, P, D), now, moves (N, P, D)"""
         self.clean.copy_(torch.where(moves, clean, self.clean))
         self.levels.copy_(torch.where(moves, now, self.levels))
 
@@ -67,9 +67,8 @@ def solver_step(
     """One step of every number from its level `now` down to its level `after`, given the predicted clean values.
 
     Without a history this is DDIM. With one it is DPM-Solver++(2M) (Lu et al. 2022, arXiv 2211.01095, algorithm 2, data
-    prediction): a DDIM step with the prediction carried on to the middle of the step, as it has changed since the last
-    one. The first step of a number, which nothing came before, and the one to level 0, which is the clean prediction
-    itself, are those of DDIM.
+    prediction): a DDIM step with the prediction extrapolated to the middle of the step. The first step of a number and
+    the step to level 0 are those of DDIM.
 
     Args:
         noisy, clean: (B, N, P, D).
@@ -87,10 +86,10 @@ def solver_step(
 
 
 def carried_on(clean: Tensor, now: Tensor, after: Tensor, history: History) -> Tensor:
-    """The clean prediction as it would be half a step on, from its change since the level of the last one.
+    """The clean prediction extrapolated by half a step, from its change since the last one.
 
-    Level K, whose log-SNR is infinitely far, counts as one more step of the same length. No change counts more than
-    whole, lest noise grow where levels of a token's own happen to lie close together.
+    Level K has an infinite log-SNR and counts as one step of the same length. The extrapolation is at most the whole
+    change, so that noise does not grow where levels of a token lie close together.
     """
     length = half_log_snr(after) - half_log_snr(now)
     since = torch.where(history.levels == LEVELS, length, half_log_snr(now) - half_log_snr(history.levels.clamp_min(0)))
