@@ -204,7 +204,7 @@ def run_info(given: argparse.Namespace) -> int:
                 str(split["takes"]),
                 f"{split['clips']} ({', '.join(f'{k} of {n}' for n, k in split['clips by people'].items())})",
                 f"{split['frames']:,}",
-                f"{split['frames'] / 30 / 60:.1f}",
+                f"{split['frames'] / m['fps'] / 60:.1f}",
                 str(len(split["shards"])),
             )
             for name, split in sorted(m["splits"].items(), key=lambda item: ("train", "val", "test").index(item[0]))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
+from magnet.datamodules.reading.arrays import AGAIN
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
@@ -136,7 +137,7 @@ class BVHReader(OwnReader[BvhTrack]):
         try:
             file = read_bvh(person_file.file)
         except (ValueError, OSError) as error:
-            raise DataError(str(error)) from error
+            raise DataError(f"{error}; {AGAIN}") from error
         return [BvhTrack(file, self.unit, self.joints, self.worst_fit, file.fps)], []
 
     def recording(

@@ -25,7 +25,7 @@ from magnet.datamodules.reading.recording import DataError, Reader, Recording, T
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy
 
-FPS = 30.0
+RATE = 30.0
 ROLES = ("follower", "leader")
 """By the last number of a file's name: 00, 01."""
 PLACES = ("", "data/motion/smplx/all", "motion/smplx/all", "smplx/all", "all")
@@ -71,7 +71,7 @@ class DD100Reader(Reader):
     ) -> None:
         super().__init__(root)
         if orient not in ("same", "global_orient", "poses"):
-            raise DataError(f"orient: got {orient!r}, expected 'same', 'global_orient' or 'poses'")
+            raise DataError(f"orient: got {orient!r}, expected 'same', 'global_orient' or 'poses': give one of them")
         folder = first_folder(self.root, PLACES, "*_0[01].npy")
         if folder is None:
             raise DataError(
@@ -106,7 +106,7 @@ class DD100Reader(Reader):
     def read(self, take: Take) -> Recording:
         """Follower and leader at 30 fps, z up; lengths are cut to the shorter with a note."""
         people = [self._person(path, role) for path, role in zip(take.files, ROLES, strict=True)]
-        return side_by_side(self.folder / take.name, people, FPS, "+z", cut=True)
+        return side_by_side(self.folder / take.name, people, RATE, "+z", cut=True)
 
     def _person(self, path: Path, role: str) -> PersonMotion:
         held = mapping(path, load_object_npy(path))

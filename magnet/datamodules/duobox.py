@@ -15,7 +15,7 @@ from magnet.datamodules.reading.recording import DataError, Reader, Recording, T
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy, load_pickle
 
-FPS = 120.0
+RATE = 120.0
 THINNING, UNIT, SKIPPED = 4, 4, 4
 """120 to 30 fps; frames that the authors' parts are multiples of; frames before their first, whose speed is unknown."""
 TRAIN, VALIDATION = 0.8, 0.1
@@ -77,9 +77,9 @@ class DuoBoxReader(Reader):
     ) -> None:
         super().__init__(root)
         if form not in ("auto", "fit", "skeleton"):
-            raise DataError(f"form: got {form!r}, expected 'auto', 'fit' or 'skeleton'")
+            raise DataError(f"form: got {form!r}, expected 'auto', 'fit' or 'skeleton': give one of them")
         if not 1 <= phases <= THINNING:
-            raise DataError(f"phases: got {phases}, expected 1 to {THINNING}")
+            raise DataError(f"phases: got {phases}, expected 1 to {THINNING}: give one of them")
         self.form, self.phases, self.validation = form, phases, validation
         wanted = {"auto": (FITS, SKELETONS), "fit": (FITS,), "skeleton": (SKELETONS,)}[form]
         folder = next((found for one in wanted if (found := first_folder(self.root, PLACES, f"{one}/*"))), None)
@@ -116,11 +116,11 @@ class DuoBoxReader(Reader):
         if len(held) != 2:
             raise DataError(f"{path}: holds {', '.join(held) or 'nobody'}, expected two people by name")
         people = [person(f"{path}, {name}", mapping(f"{path}, {name}", one), name) for name, one in held.items()]
-        whole = side_by_side(path, people, FPS, "+z")
+        whole = side_by_side(path, people, RATE, "+z")
         assert whole.poses is not None and whole.transl is not None
         shown = self.frames(path, whole.frames, part)
         return Recording(
-            fps=FPS,
+            fps=RATE,
             up="+z",
             poses=whole.poses[shown],
             transl=whole.transl[shown],
@@ -132,7 +132,10 @@ class DuoBoxReader(Reader):
     def _skeleton(self, path: Path, held: dict[str, Any], part: str) -> Recording:
         names = tuple(key.removesuffix("_position") for key in held if key.endswith("_position"))
         if len(names) != 2:
-            raise DataError(f"{path}: has {', '.join(held) or 'nothing'}, expected NAME_position of two people")
+            raise DataError(
+                f"{path}: has {', '.join(held) or 'nothing'}, expected NAME_position of two people; take the file "
+                "as it was published"
+            )
         joints, columns = tuple(MAP), [MOTIVE.index(name) for name in MAP.values()]
         people = []
         for name in names:
@@ -140,7 +143,7 @@ class DuoBoxReader(Reader):
             people.append(places.reshape(-1, len(MOTIVE), 3)[:, columns])
         total = one_length(path, {name: len(places) for name, places in zip(names, people, strict=True)})
         positions = np.stack(people, axis=1)[self.frames(path, total, part)]
-        return Recording(fps=FPS, up="+z", positions=positions, joints=joints, persons=names)
+        return Recording(fps=RATE, up="+z", positions=positions, joints=joints, persons=names)
 
     def frames(self, where: object, total: int, part: str) -> slice:
         """Frames of a file that a part such as "tr2" shows.
@@ -150,7 +153,7 @@ class DuoBoxReader(Reader):
         """
         kind, phase = part[:2], int(part[2:]) if part[2:].isdigit() else -1
         if kind not in PARTS or not 0 <= phase < THINNING:
-            raise DataError(f"{where}: no part {part!r}, expected tr0 to tr3, va0 or te0")
+            raise DataError(f"{where}: no part {part!r}, expected tr0 to tr3, va0 or te0: give one of them")
 
         def whole(phase: int) -> int:
             return len(range(phase, total - SKIPPED, THINNING)) // UNIT * UNIT

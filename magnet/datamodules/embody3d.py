@@ -174,7 +174,10 @@ class Embody3DReader(Reader):
                     alone.append(_Scene(section, capture, (subject,), frames[capture]))
                     continue
                 if not isinstance(others, list) or not all(isinstance(other, str) for other in others):
-                    raise DataError(f"{where}: multiperson is {others!r:.80}, expected subjects' ids or null")
+                    raise DataError(
+                        f"{where}: multiperson is {others!r:.80}, expected subjects' ids or null; download the "
+                        "list again"
+                    )
                 # Whoever is named was there: a partner without files must be missed when the scene is read.
                 together.setdefault(capture, set()).update((subject, *others))
         scenes = [

@@ -16,7 +16,7 @@ from magnet.datamodules.reading.recording import DataError, Reader, Recording, T
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_pickle
 
-FPS = 59.94
+RATE = 59.94
 PEOPLE = ("person1", "person2")
 LISTS: tuple[Split, ...] = ("train", "val", "test")
 
@@ -48,7 +48,7 @@ class InterHumanReader(Reader):
     shapes_of: ClassVar[tuple[str, ...]] = ("smplh", "smpl")
     version: ClassVar[int] = 2  # genders are read
 
-    def __init__(self, root: str | Path, fps: float = FPS) -> None:
+    def __init__(self, root: str | Path, fps: float = RATE) -> None:
         super().__init__(root)
         self.fps = float(fps)
         if not (self.root / "motions").is_dir():

@@ -15,7 +15,7 @@ from magnet.datamodules.reading.recording import DataError, Reader, Recording, T
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_pickle
 
-FPS = 120.0
+RATE = 120.0
 FILES = ("P1.npz", "P2.npz")
 PLACES = ("motions", "Inter-X_Dataset/motions", "Inter-X/motions", "")
 LISTS = ("splits", "../splits", "../datasets", "datasets")
@@ -59,7 +59,7 @@ class InterXReader(Reader):
     ) -> None:
         super().__init__(root)
         if split not in ("official", "paper"):
-            raise DataError(f"split: got {split!r}, expected 'official' or 'paper'")
+            raise DataError(f"split: got {split!r}, expected 'official' or 'paper': give one of them")
         folder = first_folder(self.root, PLACES, "G[0-9]*T[0-9]*A[0-9]*R[0-9]*")
         if folder is None:
             processed = any(self.root.rglob("*.h5"))
@@ -152,7 +152,7 @@ class InterXReader(Reader):
             person(path, one, name, gender=one.get("gender"), orient="root_orient", body="pose_body", transl="trans")
             for path, one, name in zip(take.files, held, names, strict=True)
         ]
-        return side_by_side(take.files[0].parent, people, FPS, "+y", notes=notes)
+        return side_by_side(take.files[0].parent, people, RATE, "+y", notes=notes)
 
 
 @register_data()

@@ -13,7 +13,7 @@ from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, open_npz, require
 from magnet.datamodules.reading.fields import first_folder, listing, mapping, person, shortest, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
-from magnet.datamodules.reading.remocap_track import FPS, MAP, file_like, track
+from magnet.datamodules.reading.remocap_track import MAP, RATE, file_like, track
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy, load_pickle
 
@@ -70,7 +70,7 @@ class ReMoCapReader(Reader):
     ) -> None:
         super().__init__(root)
         if split not in ("official", "paper"):
-            raise DataError(f"split: got {split!r}, expected 'official' or 'paper'")
+            raise DataError(f"split: got {split!r}, expected 'official' or 'paper': give one of them")
         self.scale, self.paper = scale, split == "paper"
         self.halves = first_folder(self.root, PLACES, "train/*") or first_folder(self.root, PLACES, "test/*")
         self.fits = None if fits is None else Path(fits)
@@ -164,7 +164,7 @@ class ReMoCapReader(Reader):
             if mine["body_pose"].ndim == 2:
                 mine["body_pose"] = mine["body_pose"][:, :63]  # hands may follow
             people.append(person(f"{path}, person {p}", mine, PEOPLE[p], orient="orient", transl="trans"))
-        return side_by_side(path, people, FPS, "+y")
+        return side_by_side(path, people, RATE, "+y")
 
 
 @register_data()

@@ -188,7 +188,8 @@ class ScenesReader(OwnReader[PosedTrack]):
         if len(kinds) > 1:
             bodies = {track.body for track in tracks}
             raise DataError(
-                f"{self.root / where}: people of different bodies: {', '.join(sorted(b or 'SMPL' for b in bodies))}"
+                f"{self.root / where}: people of different bodies: "
+                f"{', '.join(sorted(b or 'SMPL' for b in bodies))}; export them for one body"
             )
         ((body, at_pelvis),) = kinds
         poses = np.stack([track.poses for track in tracks], axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +19,23 @@ from magnet.body.joints import PARENTS
 from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import rest_joints
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+
+DO = re.compile(
+    r"\b(ask|check|choose|confirm|convert|copy|cut|do not use|download|export|fetch|give|is it|leave|lower|make|mend|"
+    r"move|name|prepare|put|rename|run|save|take|unpack|wait|write)\b"
+)
+"""What somebody is told to do, in the words of our messages."""
+
+
+def told_what_to_do(error: Exception) -> str:
+    """The error's text, which must say what to do."""
+    assert DO.search(str(error)), f"does not say what to do: {error}"
+    return str(error)
+
+
+def named_and_told(error: Exception, root: Path) -> None:
+    """The error names a file or folder of the download, and says what to do."""
+    assert str(root) in told_what_to_do(error), f"names no file: {error}"
 
 
 def fake_of(name: str) -> ModuleType:

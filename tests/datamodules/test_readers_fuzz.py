@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from magnet import datamodules
 from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.reading.recording import DataError, Reader, Recording
+from tests.datamodules.readers import DO, named_and_told, told_what_to_do
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 TAKES, FRAMES, ROUNDS, FILES = 3, 4, 2, 7
@@ -91,14 +97,14 @@ def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
         opened = reader(root)
         takes = opened.takes()
     except DataError as error:
-        assert len(str(error)) > 20
+        named_and_told(error, root)
         return 0
     using = [take for take in takes if touched in take.files]
     for take in (using or takes)[:3]:
         try:
             recording = opened.read(take)
         except DataError as error:
-            assert len(str(error)) > 20
+            named_and_told(error, root)
             continue
         assert isinstance(recording, Recording)
         valid = np.True_ if recording.valid is None else recording.valid[..., None, None]
@@ -110,7 +116,7 @@ def read(reader: type[Reader], root: Path, touched: Path | None = None) -> int:
         try:
             clips = canonicalize(recording, made_up_body(), take.name, reader.name, "train", reader.family, SHORT).clips
         except DataError as error:
-            assert len(str(error)) > 20
+            told_what_to_do(error)
         else:
             assert all(clip.scene.T_world_root.isfinite().all() for clip in clips)
     return done
@@ -202,3 +208,30 @@ def test_a_folder_of_something_else_is_refused_with_where_to_ask(name: str, tmp_
         reader(tmp_path).takes()
     with pytest.raises(DataError, match="give the one that holds them" if registry.reader(name).own else "http"):
         reader(tmp_path / "nowhere")
+
+
+# -- the law of messages -----------------------------------------------------------------------
+
+
+def sentence(node: ast.AST, names: Mapping[str, Any]) -> str:
+    """A message as it stands in the code; constants of the module are put in."""
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(sentence(part, names) for part in node.values)
+    if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Name):
+        return str(names.get(node.value.id, node.value.id))
+    return ast.unparse(node)
+
+
+@pytest.mark.parametrize("path", sorted(Path(datamodules.__file__).parent.rglob("*.py")), ids=lambda path: path.stem)
+def test_every_data_error_says_what_to_do(path: Path) -> None:
+    """Also those that no damage has brought about yet. What hands another's message on is held there."""
+    module = ".".join(path.relative_to(Path(datamodules.__file__).parents[2]).with_suffix("").parts)
+    names = vars(importlib.import_module(module.removesuffix(".__init__")))
+    for node in ast.walk(ast.parse(path.read_text())):
+        call = node.exc if isinstance(node, ast.Raise) else None
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("DataError", "StoreError"):
+            text = sentence(call.args[0], names)
+            handed_on = re.search(r"\berror\b|\bhint\b|_advice", text) and "expected" not in text
+            assert handed_on or DO.search(text), f"{path.name}:{node.lineno}: {text}"

@@ -14,8 +14,9 @@ from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
 from magnet.datamodules.reading.recording import Axis
+from magnet.motion.scene import FPS
 
-FPS = 120.0
+RATE = 120.0
 AXIS: Axis = "+z"
 CENTIMETRES = 100.0
 BONES = {
@@ -33,8 +34,8 @@ def named(joint: str) -> str:
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     """What is written, by take."""
-    long = round(frames * FPS / 30)
-    return {f"walk{number + 1}": turned(people(long, 2, FPS, seed + number), AXIS) for number in range(takes)}
+    long = round(frames * RATE / FPS)
+    return {f"walk{number + 1}": turned(people(long, 2, RATE, seed + number), AXIS) for number in range(takes)}
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:

@@ -14,8 +14,9 @@ import torch
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
 from magnet.datamodules.reading.arrays import hashed_split
+from magnet.motion.scene import FPS
 
-FPS = 50.0
+RATE = 50.0
 ACTIONS = ("Grab", "Handshake", "Hit", "HoldingHands", "Hug", "Kick", "Posing", "Push")
 HANDS = {"left_hand_pose": 15, "right_hand_pose": 15, "jaw_pose": 1, "leye_pose": 1, "reye_pose": 1}
 
@@ -44,7 +45,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
         names = (f"{pair}_{action} {number}" for number in range(1, 100 + takes) for action in ACTIONS)
         split = "val" if index % 4 == 1 else "train"
         name = next(name for name in names if name not in written and hashed_split(name, test=0.0) == split)
-        written[name] = turned(people(round(frames * FPS / 30), 2, FPS, seed + index), "+z")
+        written[name] = turned(people(round(frames * RATE / FPS), 2, RATE, seed + index), "+z")
     return written
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from magnet.motion.scene import FPS
+
 TEST, VAL = 5, 3
 """Takes that `CMU` holds out."""
 # Axes of the left side's bones; {s} and {m} become the signs of the side and of the other.
@@ -52,7 +54,7 @@ def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
             write_asf(out / folder / f"{subject:02}.asf")
             for take in numbers if len(subjects) > 1 else [1]:
                 amc, rate = out / folder / f"{subject:02}_{take:02}.amc", 60.0 if len(subjects) > 1 else 120.0
-                write_amc(amc, round(frames * rate / 30), x, 1000 * seed + 10 * subject + take, rate=rate)
+                write_amc(amc, round(frames * rate / FPS), x, 1000 * seed + 10 * subject + take, rate=rate)
 
 
 def bones() -> list[tuple[str, str, tuple[float, float, float], float, str, str]]:

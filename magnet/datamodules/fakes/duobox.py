@@ -10,9 +10,10 @@ import roma
 import torch
 
 from magnet.body import PARENTS as OURS
-from magnet.datamodules.duobox import FITS, FPS, PARENTS, SKELETONS, SKIPPED
+from magnet.datamodules.duobox import FITS, PARENTS, RATE, SKELETONS, SKIPPED
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+from magnet.motion.scene import FPS
 
 NAMES = (
     "000_ma_jab_liu_defense", "001_liu_hook_ma_defense", "002_tian_jab_ma_defense", "003_liu_free_tian_free",
@@ -37,12 +38,12 @@ def subjects(name: str) -> tuple[str, str]:
 
 def length(frames: int) -> int:
     """Frames at 120 fps of a file whose test part has `frames` at 30 fps."""
-    return SKIPPED + SHARE * frames * round(FPS / 30.0)
+    return SKIPPED + SHARE * frames * round(RATE / FPS)
 
 
 def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     """What take `number` shows, z up at 120 fps."""
-    return turned(people(length(frames), 2, FPS, seed + number), "+z")
+    return turned(people(length(frames), 2, RATE, seed + number), "+z")
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

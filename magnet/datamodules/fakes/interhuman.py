@@ -11,8 +11,9 @@ import numpy as np
 
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+from magnet.motion.scene import FPS
 
-FPS = 59.94
+RATE = 59.94
 SPLITS = ("train", "val", "test", "train")
 
 
@@ -28,7 +29,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
         (out / folder).mkdir(parents=True, exist_ok=True)
     lists: dict[str, list[str]] = {split: [] for split in SPLITS}
     for index, (name, motion) in enumerate(scenes.items()):
-        held: dict[str, Any] = {"mocap_framerate": FPS, "frames": motion.frames}
+        held: dict[str, Any] = {"mocap_framerate": RATE, "frames": motion.frames}
         held |= {f"person{p + 1}": _person(motion, p) for p in range(2)}
         (out / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(held))
         (out / "annots" / f"{name}.txt").write_text("one person walks behind the other\n")
@@ -40,8 +41,8 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     """What is written, by take."""
-    long = round(frames * FPS / 30)
-    return {str(index + 1): turned(people(long, 2, FPS, seed + index, kind="smpl"), "+z") for index in range(takes)}
+    long = round(frames * RATE / FPS)
+    return {str(index + 1): turned(people(long, 2, RATE, seed + index, kind="smpl"), "+z") for index in range(takes)}
 
 
 def _person(motion: FakeMotion, p: int) -> dict[str, np.ndarray | str]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people
-from magnet.datamodules.interx import FPS
+from magnet.datamodules.interx import RATE
+from magnet.motion.scene import FPS
 
 SPLITS = ("train", "val", "test")
 GENDERS = ("female", "male")
@@ -23,12 +24,12 @@ def name(number: int) -> str:
 
 def length(frames: int) -> int:
     """Frames of a file at 120 fps."""
-    return frames * round(FPS / 30.0)
+    return frames * round(RATE / FPS)
 
 
 def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     """What clip `number` shows, y up at 120 fps."""
-    return people(length(frames), 2, FPS, seed + number)
+    return people(length(frames), 2, RATE, seed + number)
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

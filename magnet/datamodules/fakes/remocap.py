@@ -18,7 +18,8 @@ import torch
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
-from magnet.datamodules.reading.remocap_track import FPS
+from magnet.datamodules.reading.remocap_track import RATE
+from magnet.motion.scene import FPS
 
 SEQUENCES = (3, 8, 6, 5, 7, 9, 10, 16)
 TESTED = (6,)
@@ -94,12 +95,12 @@ def skeleton(rest: np.ndarray) -> Joint:
 
 def length(frames: int) -> int:
     """Frames of a file at 50 fps."""
-    return round(frames * FPS / 30.0)
+    return round(frames * RATE / FPS)
 
 
 def motion(number: int, frames: int, seed: int = 0) -> FakeMotion:
     """What the take `number` shows, y up at 50 fps."""
-    return people(length(frames), 2, FPS, seed + number)
+    return people(length(frames), 2, RATE, seed + number)
 
 
 def sequence(number: int) -> int:
@@ -185,7 +186,7 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
         *_hierarchy(root, offsets, 0),
         "MOTION",
         f"Frames: {len(rows)}",
-        f"Frame Time: {1 / FPS:.6f}",
+        f"Frame Time: {1 / RATE:.6f}",
     ]
     (folder / "motion.bvh").write_text("\n".join([*header, *rows]) + "\n")
 
@@ -193,7 +194,7 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
 def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> None:
     values = np.stack([columns[name] for name in names], axis=1).reshape(len(columns[names[0]]), -1)
     lines = [",".join(["Time", *(f"{name}.{axis}" for name in names for axis in "XYZ")])]
-    lines += [",".join([f"{t / FPS:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values)]
+    lines += [",".join([f"{t / RATE:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values)]
     path.write_text("\n".join(lines) + "\n")
 
 

@@ -14,7 +14,7 @@ from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, made_up_body, people, turned
 from magnet.datamodules.reading.recording import Axis
 from magnet.motion.frames import rigid
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 
 FORMS: tuple[tuple[str, float, Axis], ...] = (("amass", 60.0, "+z"), ("pickle", 25.0, "+y"), ("magnet", 30.0, "+y"))
 """In turn: what is written, its frame rate and its up axis."""
@@ -25,7 +25,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     found = {}
     for number in range(takes):
         form, fps, up = FORMS[number % len(FORMS)]
-        long = int(np.ceil((frames - 1) * fps / 30 - 1e-9)) + 1
+        long = int(np.ceil((frames - 1) * fps / FPS - 1e-9)) + 1
         found[f"{form}{number + 1}"] = turned(people(long, 2, fps, seed + number), up)
     return found
 

@@ -20,9 +20,9 @@ from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.motion.frames import rigid
-from magnet.motion.resample import FPS, resample_points, resample_rotations, resample_valid
+from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.runs import true_runs
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, FPS, Scene
 
 CANONICALIZE_VERSION = 3
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""

@@ -53,7 +53,7 @@ def usable(recording: Recording) -> Bools:
     """
     fps = recording.fps
     if not (math.isfinite(fps) and 1.0 <= fps <= 1000.0):
-        raise DataError(f"frame rate: got {fps}, expected 1 to 1000 frames a second")
+        raise DataError(f"frame rate: got {fps}, expected 1 to 1000 frames a second; mend that number")
     T = recording.frames
     motion = [a for a in (recording.poses, recording.transl, recording.positions) if a is not None]
     P = motion[0].shape[1]
@@ -116,7 +116,10 @@ def up_vector(joints: Array, valid: Bools) -> Array:
         up = people[:, list(high)].mean(axis=1) - people[:, list(low)].mean(axis=1)
         if np.isfinite(up).all():
             return up.mean(axis=0)
-    raise DataError("neither head and ankles nor shoulders and hips are among the joints: no up axis can be found")
+    raise DataError(
+        "neither head and ankles nor shoulders and hips are among the joints: no up axis can be found; give the "
+        "axis with --up"
+    )
 
 
 def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) -> None:
@@ -195,7 +198,10 @@ def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
     """
     place = {joint: i for i, joint in enumerate(joints)}
     if not {*HIPS, *SHOULDERS} <= set(place):
-        raise DataError(f"positions are of joints {list(joints)}; both hips (1, 2) and shoulders (16, 17) are needed")
+        raise DataError(
+            f"positions are of joints {list(joints)}; both hips (1, 2) and shoulders (16, 17) are needed: give "
+            "their places, too"
+        )
     people = points[valid]
     trunk = people[:, [place[j] for j in SHOULDERS]].mean(axis=1) - people[:, [place[j] for j in HIPS]].mean(axis=1)
     length = float(np.median(np.linalg.norm(trunk, axis=-1)))
@@ -259,9 +265,13 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
     if fall > FALL:
         seen += f" and drop with {fall:.0f} m/s2, faster than falling"
     if speed > RUNNING or push95 > PUSH or fall > FALL or (median is not None and median < STEP[0]):
-        raise DataError(f"{seen}: too fast for people; perhaps 30 frames a second are called 120 {KEEP}")
+        raise DataError(
+            f"{seen}: too fast for people; perhaps 30 frames a second are called 120: check the rate {KEEP}"
+        )
     if median is not None and median > STEP[1] and float(np.median(pace)) < STROLL and speed < SLOWLY:
-        raise DataError(f"{seen}: too slow for people; perhaps 120 frames a second are called 30 {KEEP}")
+        raise DataError(
+            f"{seen}: too slow for people; perhaps 120 frames a second are called 30: check the rate {KEEP}"
+        )
 
 
 def steps(joints: Array, together: Bools, fps: float) -> tuple[Array, Array]:

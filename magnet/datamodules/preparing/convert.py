@@ -223,9 +223,9 @@ def convert(
         recording = one_body(recording, bodies or {}, body)
         made = canonicalize(recording, body, take.name, reader.name, take.split or "train", reader.family, options)
     except (ValueError, OSError) as error:
-        return ConvertedTake.failed(relative(str(error) or type(error).__name__, reader.root))
+        return ConvertedTake.failed(about(take, str(error) or type(error).__name__, reader.root))
     except Exception as error:  # a reader that does not know what to say: the others go on
-        return ConvertedTake.failed(relative(f"{type(error).__name__}: {error}", reader.root))
+        return ConvertedTake.failed(about(take, f"{type(error).__name__}: {error}", reader.root))
     clips = made.clips
     return ConvertedTake(
         error=None,
@@ -237,6 +237,14 @@ def convert(
         rows=np.concatenate([encode(clip.scene) for clip in clips]),
         persons=recording.persons,
     )
+
+
+def about(take: Take, text: str, root: Path) -> str:
+    """A message that names a file of the take, or its folder; the first file where it did not."""
+    said = relative(text, root)
+    places = {os.path.relpath(place, root) for file in take.files for place in (file, file.parent)}
+    named = any(place in said for place in places if place != ".") or not take.files
+    return said if named else f"{os.path.relpath(take.files[0], root)}: {said}"
 
 
 def shortened(text: str, most: int = 600) -> str:

@@ -97,14 +97,16 @@ def one_body(recording: Recording, bodies: Mapping[Gender, Body], body: Body) ->
         who = recording.persons[p] if recording.persons else f"person {p}"
         if gender not in own_bodies:
             has = ", ".join(sorted(own_bodies))
-            raise DataError(f"{who} is {gender}, but the bodies are {has} alone; add the {gender} one to --bodies")
+            raise DataError(
+                f"{who} is {gender}, but the bodies are {has} alone; give the {gender} one with --bodies, too"
+            )
         own, shape = own_bodies[gender], torch.from_numpy(betas[p : p + 1])
         found, off = reshaped(shape, own, body)
         worst = float(off.max())
         if not worst <= MOST:
             raise DataError(
                 f"{who}: {gender} joints at rest are up to {100 * worst:.1f} cm off when expressed in body {body.id}, "
-                f"expected at most {100 * MOST:g} cm; are --bodies of the same model as the data?"
+                f"expected at most {100 * MOST:g} cm; check that --bodies are of the same model as the data"
             )
         transl[:, p] += (own.rest_joints(shape)[0, 0] - body.rest_joints(found)[0, 0]).numpy()
         betas[p] = found[0].numpy()

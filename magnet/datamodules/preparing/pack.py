@@ -16,7 +16,7 @@ from magnet.datamodules.preparing.convert import ConvertedTake
 from magnet.datamodules.reading.recording import Take
 from magnet.datamodules.store.reader import FORMAT, MANIFEST, StoreReader, as_json, write_whole
 from magnet.datamodules.store.rows import ROW
-from magnet.motion.resample import FPS
+from magnet.motion.scene import FPS
 
 
 @dataclass(frozen=True)

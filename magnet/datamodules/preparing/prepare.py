@@ -95,7 +95,9 @@ def prepare(
         packed = pack(sources, old, out, facts, shard_rows)
         if packed is None:
             listed = "".join(f"\n  {s.take.name}: {s.head(None).error}" for s in sources[:20])
-            raise DataError(f"{reader.title}: none of {len(takes)} takes could be used:{listed}")
+            raise DataError(
+                f"{reader.title}: none of {len(takes)} takes could be used; check --root and these files:{listed}"
+            )
         folder = StoreReader(out)
         done = {keys[name]: place for name, place in packed.items()}
         remember(state, folder, done)
@@ -126,7 +128,7 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
     names = {take.name for take in takes}
     if len(names) < len(takes):
         twice = sorted({take.name for take in takes if sum(t.name == take.name for t in takes) > 1})
-        raise DataError(f"{reader.title}: takes are named twice: {', '.join(twice[:5])}")
+        raise DataError(f"{reader.title}: takes are named twice: {', '.join(twice[:5])}; rename one of each")
     if splits is not None:
         if len(absent) == len(splits):
             raise ValueError(
@@ -151,7 +153,9 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
             used.append(take)
             count[take.split] += 1
     if not used:
-        raise DataError(f"{reader.title}: none of {len(takes)} takes belongs to a split")
+        raise DataError(
+            f"{reader.title}: none of {len(takes)} takes belongs to a split; give a list of splits with --splits FILE"
+        )
     return TakeSelection(used, left_out, absent)
 
 

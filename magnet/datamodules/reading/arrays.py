@@ -114,7 +114,7 @@ def require(where: object, there: Collection[Any], keys: Sequence[str]) -> None:
     """
     if lacking := [key for key in keys if key not in there]:
         has = ", ".join(sorted(map(str, there))[:20]) or "nothing"
-        raise DataError(f"{where}: lacks {', '.join(lacking)}; it has {has}; expected {', '.join(keys)}")
+        raise DataError(f"{where}: lacks {', '.join(lacking)}; it has {has}; expected {', '.join(keys)}; {AGAIN}")
 
 
 def floats(where: object, value: Any, shape: Sequence[int | str], finite: bool = True) -> Doubles:

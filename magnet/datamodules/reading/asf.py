@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.datamodules.reading.arrays import AGAIN
 from magnet.errors import DataError
 
 Floats = NDArray[np.float64]
@@ -73,11 +74,11 @@ def said_lines(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 def numbers(where: str, words: Sequence[str], count: int) -> list[float]:
     if len(words) != count:
-        raise DataError(f"{where}: got {len(words)} numbers, expected {count}")
+        raise DataError(f"{where}: got {len(words)} numbers, expected {count}; {AGAIN}")
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise DataError(f"{where}: {error}; expected {count} numbers") from error
+        raise DataError(f"{where}: {error}, expected {count} numbers; {AGAIN}") from error
     if not all(map(math.isfinite, numbers)):
         raise DataError(f"{where}: holds NaN or infinity; download the file again or leave it out")
     return numbers
@@ -98,13 +99,13 @@ def _dofs(where: str, words: Sequence[str]) -> tuple[str, ...]:
     dofs = tuple(word.lower() for word in words)
     unknown = sorted(set(dofs) - {*TRANSLATIONS, *ROTATIONS})
     if unknown:
-        raise DataError(f"{where}: unknown degree of freedom {unknown}, expected some of tx ty tz rx ry rz")
+        raise DataError(f"{where}: unknown degree of freedom {unknown}, expected some of tx ty tz rx ry rz; {AGAIN}")
     return dofs
 
 
 def _order(where: str, word: str) -> str:
     if sorted(word.lower()) != ["x", "y", "z"]:
-        raise DataError(f"{where}: axis order {word!r}, expected XYZ in some order")
+        raise DataError(f"{where}: axis order {word!r}, expected XYZ in some order; {AGAIN}")
     return word.lower()
 
 
@@ -140,14 +141,14 @@ def read_asf(path: str | Path) -> AsfSkeleton:
         elif section == "hierarchy" and key not in ("begin", "end"):
             for name in words:
                 if name not in bones:
-                    raise DataError(f"{where}: unknown bone {name!r}; the skeleton has {', '.join(bones)}")
+                    raise DataError(f"{where}: unknown bone {name!r}; the skeleton has {', '.join(bones)}; {AGAIN}")
             for name in rest:
                 bones[name].parent = words[0]
                 children += 1
     if not children or not root.dofs:
-        raise DataError(f"{path}: not an ASF skeleton: lacks :root order or :hierarchy; the file may be truncated")
+        raise DataError(f"{path}: not an ASF skeleton: lacks :root order or :hierarchy, may be truncated; {AGAIN}")
     if not unit > 0:
-        raise DataError(f"{path}: :units length is {unit}, expected a positive number")
+        raise DataError(f"{path}: :units length is {unit}, expected a positive number; {AGAIN}")
     return _assembled(path, bones, unit, degrees)
 
 
@@ -157,7 +158,7 @@ def _root_line(where: str, key: str, rest: list[str], root: _Bone) -> None:
     elif key == "axis":
         root.order = _order(where, rest[0] if rest else "")
     elif key in ("position", "orientation") and any(numbers(where, rest, 3)):
-        raise DataError(f"{where}: a root {key} other than 0 0 0 is not supported")
+        raise DataError(f"{where}: a root {key} other than 0 0 0 is not supported: leave the subject out")
 
 
 def _bone_line(where: str, key: str, rest: list[str], bone: _Bone) -> None:
@@ -182,7 +183,7 @@ def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) 
         order += [child for child, bone in bones.items() if bone.parent == name and child not in order]
     lost = sorted(set(bones) - set(order))
     if lost:
-        raise DataError(f"{path}: bones {lost} hang on nothing; the :hierarchy is incomplete")
+        raise DataError(f"{path}: bones {lost} hang on nothing; the :hierarchy is incomplete; {AGAIN}")
     chosen = [bones[name] for name in order]
     angles = np.array([bone.angles for bone in chosen], dtype=np.float64)
     angles = np.radians(angles) if degrees else angles

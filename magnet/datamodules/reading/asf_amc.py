@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magnet.datamodules.reading.arrays import AGAIN
 from magnet.datamodules.reading.asf import (
     ROTATIONS,
     TRANSLATIONS,
@@ -159,32 +160,34 @@ def parse_any(path: Path, skeleton: AsfSkeleton) -> Floats:
     def close(where: str) -> None:
         missing = [name for name in moving if name not in seen]
         if rows and missing:
-            raise DataError(f"{where}: frame {len(rows)} ends without {', '.join(missing)}; the file may be truncated")
+            raise DataError(f"{where}: frame {len(rows)} ends without {', '.join(missing)}, may be truncated; {AGAIN}")
 
     for where, words in said_lines(path):
         if words[0].startswith(":"):
             if words[0].upper() == ":RADIANS" and skeleton.degrees:
-                raise DataError(f"{where}: angles in radians, but {skeleton.path.name} says degrees")
+                raise DataError(f"{where}: angles in radians, but {skeleton.path.name} says degrees; {AGAIN}")
             continue
         if len(words) == 1 and words[0].isdigit():
             close(where)
             if int(words[0]) != len(rows) + 1:
-                raise DataError(f"{where}: frame {words[0]} follows frame {len(rows)}; frames are missing")
+                raise DataError(f"{where}: frame {words[0]} follows frame {len(rows)}: frames are missing; {AGAIN}")
             rows.append([math.nan] * width)
             seen.clear()
             continue
         if not rows:
-            raise DataError(f"{where}: {words[0]!r} before the first frame number; not an AMC motion")
+            raise DataError(f"{where}: {words[0]!r} before the first frame number; not an AMC motion; {AGAIN}")
         if words[0] not in moving:
-            raise DataError(f"{where}: unknown bone {words[0]!r}; {skeleton.path.name} has {', '.join(moving)}")
+            raise DataError(
+                f"{where}: unknown bone {words[0]!r}; {skeleton.path.name} has {', '.join(moving)}; {AGAIN}"
+            )
         if words[0] in seen:
-            raise DataError(f"{where}: bone {words[0]!r} twice in frame {len(rows)}")
+            raise DataError(f"{where}: bone {words[0]!r} twice in frame {len(rows)}; {AGAIN}")
         seen.add(words[0])
         start, count = starts[words[0]], moving[words[0]]
         rows[-1][start : start + count] = numbers(where, words[1:], count)
     close(where)
     if not rows:
-        raise DataError(f"{path}: holds no frames; the file may be truncated")
+        raise DataError(f"{path}: holds no frames, may be truncated; {AGAIN}")
     return np.array(rows)
 
 

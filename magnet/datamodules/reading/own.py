@@ -15,7 +15,7 @@ from magnet.datamodules.reading.arrays import hashed_split
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own_files import TABLE, PersonFile, SceneFiles, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
-from magnet.motion.resample import FPS
+from magnet.motion.scene import FPS
 
 FEW = 4
 """Fewer scenes than these are each split in time: whole ones would leave next to nothing to train on."""
@@ -111,7 +111,7 @@ class OwnReader(Reader, Generic[T]):
             if not groups:
                 raise DataError(
                     f"{self.root}: no file fits the pattern {self.pattern}; the first is "
-                    f"{left[0].relative_to(self.root).with_suffix('').as_posix()}"
+                    f"{left[0].relative_to(self.root).with_suffix('').as_posix()}; give a pattern that it fits"
                 )
         else:
             groups, left = by_names(self.root, self._files), []

@@ -156,12 +156,12 @@ def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[SceneFile
         where = f"{table}, line {number}"
         file = _file(where, root, row["file"], suffixes)
         if file in used:
-            raise DataError(f"{where}: {row['file']} is named in line {used[file]} already; one row a file")
+            raise DataError(f"{where}: {row['file']} is named in line {used[file]} already: leave one of them out")
         used[file] = number
         person = " ".join(filter(None, (row.get("person", ""), row.get("role", ""))))
         together.setdefault(row["scene"], []).append(PersonFile(person, file, _seconds(where, row.get("start", ""))))
     if not together:
-        raise DataError(f"{table}: lists no file; expected a row a file with {', '.join(COLUMNS)}")
+        raise DataError(f"{table}: lists no file; expected a row a file with {', '.join(COLUMNS)}: write them")
     return [SceneFiles(scene, tuple(people)) for scene, people in together.items()]
 
 
@@ -180,7 +180,7 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
     if strange or lacking or len(set(head)) < len(head):
         raise DataError(
             f"{table}, line 1: the columns are {', '.join(head) or 'none'}; expected {', '.join(NEEDED)}, and of "
-            "person, role and start those that are wanted"
+            "person, role and start those that you want: mend it"
         )
     found = []
     for number, line in enumerate(lines[1:], 2):
@@ -188,7 +188,7 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
         if not any(words):
             continue
         if len(words) != len(head) or not all(words[head.index(name)] for name in NEEDED):
-            raise DataError(f"{table}, line {number}: got {line!r}, expected {', '.join(head)}")
+            raise DataError(f"{table}, line {number}: got {line!r}, expected {', '.join(head)}; mend that line")
         found.append((number, dict(zip(head, words, strict=True))))
     return found
 
@@ -210,5 +210,5 @@ def _seconds(where: str, text: str) -> float:
     except ValueError:
         start = math.nan
     if not math.isfinite(start):
-        raise DataError(f"{where}: start is {text!r}, expected seconds on the scene's clock, such as 1.25")
+        raise DataError(f"{where}: start is {text!r}, expected seconds on the scene's clock, such as 1.25: mend it")
     return start

@@ -116,21 +116,25 @@ class Recording:
             T, P = self.positions.shape[:2]
             expected = {"positions": (T, P, len(self.joints), 3)}
         else:
-            raise DataError("a recording needs poses, transl and betas, or positions and joints")
+            raise DataError("a recording needs poses, transl and betas, or positions and joints: mend the reader")
         if self.valid is not None:
             expected["valid"] = (T, P)
         for name, want in expected.items():
             if (got := np.shape(getattr(self, name))) != want:
-                raise DataError(f"{name}: got {got}, expected {want} for {T} frames of {P} people")
+                raise DataError(
+                    f"{name}: got {got}, expected {want} for {T} frames of {P} people; take the file as it was "
+                    "published"
+                )
         for name, words in {"persons": self.persons, "genders": self.genders, "skeletons": self.skeletons}.items():
             if words and len(words) != P:
                 raise DataError(
-                    f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} people"
+                    f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} "
+                    "people: mend the reader"
                 )
         if strange := [gender for gender in self.genders if gender not in GENDERS]:
-            raise DataError(f"genders: got {strange[0]!r}, expected one of {', '.join(GENDERS)}")
+            raise DataError(f"genders: got {strange[0]!r}, expected one of {', '.join(GENDERS)}: mend the reader")
         if not T or not P:
-            raise DataError(f"a recording of {T} frames and {P} people")
+            raise DataError(f"a recording of {T} frames and {P} people, expected at least one of each; leave it out")
 
     @property
     def frames(self) -> int:

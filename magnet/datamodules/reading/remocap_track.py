@@ -17,7 +17,7 @@ from magnet.datamodules.reading.fields import mapping
 from magnet.datamodules.reading.recording import DataError
 from magnet.unpickle import contents, load_pickle
 
-FPS = 50.0
+RATE = 50.0
 MAP = {
     0: "Hips", 1: "LeftUpLeg", 2: "RightUpLeg", 4: "LeftLeg", 5: "RightLeg", 7: "LeftFoot", 8: "RightFoot",
     10: "LeftToeBase", 11: "RightToeBase", 12: "Neck", 15: "Head", 16: "LeftArm", 17: "RightArm", 18: "LeftForeArm",
@@ -54,8 +54,8 @@ def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
     found = "headings" if table.names else "lengths of bones"
     table = min(table.named(header), key=lambda one: _misfit(header, one))
     notes = [f"positions from {table.path.name}, joints by its {found}"]
-    if abs(rate - FPS) > 0.5:
-        notes.append(f"{rate:g} fps by its BVH, not {FPS:g}")
+    if abs(rate - RATE) > 0.5:
+        notes.append(f"{rate:g} fps by its BVH, not {RATE:g}")
     step = float(np.median(np.diff(clock))) if len(clock) > 1 else header.seconds
     if abs(step - 1.0) > 1e-6 and abs(step - header.seconds) > 0.02 * header.seconds:
         raise DataError(
@@ -112,7 +112,8 @@ def _table(path: Path) -> tuple[_Table, Doubles]:
         raise DataError(f"{path}: not a table of numbers after its first line ({said}); {AGAIN}") from error
     if not len(values) or values.shape[1] < 4 or (values.shape[1] - 1) % 3:
         raise DataError(
-            f"{path}: {values.shape[0]} rows of {values.shape[1]} columns, expected time and x, y, z a joint"
+            f"{path}: {values.shape[0]} rows of {values.shape[1]} columns, expected time and x, y, z a joint; "
+            "download it again"
         )
     if len(heading) != values.shape[1]:
         raise DataError(f"{path}: {len(heading)} headings over {values.shape[1]} columns; {AGAIN}")

@@ -152,7 +152,7 @@ def test_no_frames_is_an_error(files: tuple[Path, Path]) -> None:
 
 
 def test_missing_frames_are_an_error(files: tuple[Path, Path]) -> None:
-    with pytest.raises(ValueError, match="frame 51 follows frame 49; frames are missing"):
+    with pytest.raises(ValueError, match="frame 51 follows frame 49: frames are missing"):
         text = files[1].read_bytes().decode().replace("\r", "")
         files[1].write_text(text[: text.index("\n50\n")] + text[text.index("\n51\n") :])
         read(files)
