@@ -1,7 +1,7 @@
 """Fitting a body to joint positions: one shape a person, one pose a frame.
 
 A closed-form start, from known rotations or from the directions between joints alone, is refined by a short
-optimisation over all frames at once. Whatever is not our body model comes in this way.
+optimisation over all frames at once. Motion of other bodies and skeletons is converted in this way.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, sure:
 def clearance(body: Body, betas: Tensor) -> Tensor:
     """Height of the feet's joints above the sole of a body at rest. (P, 10) -> (P, 4) metres
 
-    Ankles of a kneeling person are lower than at rest: they are let down to the balls' height.
+    A kneeling person's ankles are lower than at rest, so theirs is that of the balls of the feet at most.
     """
     low = body.v_template[:, 1] < body.v_template[:, 1].min() + 0.15
     soles = body.v_template[low, 1] + betas @ body.shapedirs[low, 1].T  # (P, V)

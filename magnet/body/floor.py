@@ -40,7 +40,7 @@ def lowest(scene: Scene, body: Body | None = None) -> Tensor:
 
 
 def standing(lowest: Tensor, counts: Tensor) -> Tensor:
-    """Height over y = 0 that each person stands, sits or lies at: that of low frames.
+    """Height over y = 0 that each person stands, sits or lies at, taken from the lowest frames.
 
     lowest (B, T, P), counts (B, T, P) bool, frames that are looked at -> (B, P) metres, NaN where there are none
     """
@@ -48,9 +48,9 @@ def standing(lowest: Tensor, counts: Tensor) -> Tensor:
 
 
 def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> Tensor:
-    """How far over y = 0 everybody stands in scenes whose floor must be elsewhere; 0 in the others.
+    """How far over y = 0 everybody stands, in scenes whose floor cannot be there; 0 in the others.
 
-    Whoever is near the floor, or may be in the middle of a jump, clears the scene.
+    One person near the floor, or possibly jumping, is enough for a scene to count as standing on it.
 
     Args:
         lowest: (B, F, P) metres.

@@ -22,7 +22,7 @@ SHARPEST = 2e-3
 class PairwisePosterior(nn.Module):
     """Replaces the pairwise transforms that a network predicts by their posterior mean in closed form.
 
-    A network returns a pairwise transform worse than it was shown it, while its steps are good to millimetres. So what
+    A network returns a pairwise transform worse than it was shown it, while its deltas are good to millimetres. So what
     is shown (noisy, with the variance that its level tells) is carried along the predicted steps to every other frame,
     and fused by precision with the network's own prediction as one more observation.
 

@@ -1,4 +1,4 @@
-"""Where people are asked to be: goals on the floor, keyframes at a time, and scenes in which they are put there."""
+"""Goals on the floor, keyframes, and scenes with people placed at them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
 
 
 def reached(T_world_can: Tensor, goal: Goal, seconds: float) -> Goal:
-    """The goal, or where on the way to it somebody gets in that time. T_world_can (4, 4)"""
+    """The goal, or the point on the way to it that can be reached in that time. T_world_can (4, 4)"""
     here = Goal.of(T_world_can)
     length = math.hypot(goal.x - here.x, goal.z - here.z)
     share = min(1.0, FASTEST * seconds / length) if length > 0 else 1.0

@@ -1,4 +1,4 @@
-"""A model that plays on and on: motion generated chunk by chunk from the last second, while its settings change.
+"""A live scene: motion generated chunk by chunk from the last second, while the settings change.
 
 Nothing here knows of a browser or of threads; see `Worker` for one that keeps it a little ahead of who watches.
 """
@@ -69,7 +69,7 @@ class LiveChunk:
 
 
 class Live:
-    """A scene that grows; its `given` says what the model did not make itself.
+    """A scene that grows; `given` marks what the model did not generate.
 
     Each chunk is a sample of the chosen task that continues the last `CONTEXT` frames. Where a task is given
     somebody's future (as `motion_control` is), that future comes first: from `partner`, if there is one; from
@@ -155,7 +155,7 @@ class Live:
         check_given(start, torch.ones(start.frames // TOKEN_FRAMES, start.agents, dtype=torch.bool))
 
     def restart(self, frame: int) -> int:
-        """Forget what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
+        """Remove what comes after a frame. -> frames that are left, whole tokens and at least `CONTEXT`"""
         with self.lock:
             keep = max(min(frame // TOKEN_FRAMES * TOKEN_FRAMES, self.scene.frames), CONTEXT)
             self.scene = self.scene.slice(0, keep)
@@ -252,7 +252,7 @@ class Live:
         return max(CONTEXT, min(self.scene.frames, first - REACH) // TOKEN_FRAMES * TOKEN_FRAMES)
 
     def _append(self, scene: Scene, chunk: Scene, version: int, begun: float, anew: bool = False) -> LiveChunk:
-        """Put a chunk behind the scene that it continues, unless that was restarted meanwhile."""
+        """Append a chunk to the scene that it continues, unless that was restarted meanwhile."""
         with self.lock:
             took = time.perf_counter() - begun
             if version != self.version:  # what this chunk continues is no longer there

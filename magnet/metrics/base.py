@@ -61,7 +61,7 @@ class MotionMetric(Metric):
 
     @abstractmethod
     def add(self, futures: Futures) -> None:
-        """Take one batch into the sums."""
+        """Add one batch to the sums."""
 
     @abstractmethod
     def compute(self) -> dict[str, Tensor]:

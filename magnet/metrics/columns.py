@@ -1,4 +1,4 @@
-"""How a metric is shown. Each metric's class says it of its own numbers; a table asks the metrics."""
+"""How the numbers of a metric are shown: each metric class describes its own, and tables read that."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Column(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What may stand behind `@` in a number's name, and how it is said."""
+    """A suffix `@...` of a number's name, and how it is shown."""
 
     pattern: str
     title: str
@@ -79,7 +79,7 @@ def column(name: str, known: Mapping[str, Column]) -> Column:
 
 
 def part_notes(names: Iterable[str]) -> list[str]:
-    """What is meant by the parts that stand behind `@` in names, each kind explained once."""
+    """Explanations of the suffixes `@...` in names, each kind once."""
     notes: dict[str, str] = {}
     for name in names:
         for kind in PARTS:

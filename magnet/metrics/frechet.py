@@ -122,7 +122,7 @@ class FrechetDistance(MotionMetric):
             self.pool(which, features, counts)
 
     def pool(self, which: int, features: Tensor, counts: Tensor) -> None:
-        """Take one motion's features into the sums. (B, T, ..., 63), and which of them count: (B, T, ...) bool"""
+        """Add one motion's features to the sums. (B, T, ..., 63), and which of them count: (B, T, ...) bool"""
         kept = features[counts]
         self.count[which] += len(kept)
         self.sum[which] += kept.sum(dim=0)

@@ -1,4 +1,4 @@
-"""What every metric is given: samples of the future beside the future that was recorded."""
+"""The input of every metric: sampled futures and the recorded one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Futures:
         agents: Tensor | None = None,
         units: Tensor | None = None,
     ) -> Futures:
-        """Checks what came and cuts both to the shorter one.
+        """Check the input and cut both futures to the shorter one.
 
         Args:
             generated: (S, B, T, P, 22, 3) future joints of S samples a scene.

@@ -1,4 +1,4 @@
-"""What the header of a BVH file says, whoever wrote it: joints with their channels, frames and their duration."""
+"""Headers of BVH files of any origin: joints with their channels, number of frames and their duration."""
 
 from __future__ import annotations
 

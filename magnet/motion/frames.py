@@ -83,8 +83,8 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
     """Frame on the ground under the pelvis, facing where the pelvis faces. (..., 4, 4) -> same
 
     The yaw comes from the pelvis's left axis, which stays horizontal in bows and dips where a forward
-    axis would flip. Of a person lying exactly on the side the forward axis, then horizontal, decides. Each frame
-    is judged by itself, so that it does not matter which others are known.
+    axis would flip. For a person lying exactly on the side it comes from the forward axis, then horizontal. Each frame
+    is computed alone, so that it does not depend on which others are known.
 
     >>> T_world_root = rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0]))  # a pelvis 0.9 m up
     >>> canonical_frame(T_world_root)[:3, 3]
@@ -158,7 +158,7 @@ POSE_FEATURES = 21 * 6 + 9
 
 
 def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
-    """Inverse of `pose_features`: bodies put at canonical frames. (B, T, P, 135), (B, T, P, 4, 4)
+    """Inverse of `pose_features`: bodies placed at canonical frames. (B, T, P, 135), (B, T, P, 4, 4)
 
     Shapes, presence, names and body come from `like`, of which nothing else is read.
     """
@@ -174,7 +174,7 @@ def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
 
 
 def align_planar(path: Tensor, target: Tensor) -> Tensor:
-    """The turn and move over the ground that best lay a path onto another: headings first, then positions.
+    """The planar transform that best aligns a path with another: headings first, then positions.
 
     (..., T, 4, 4), (..., T, 4, 4) -> (..., 4, 4), such that shift @ path is about target.
     """

@@ -1,7 +1,7 @@
-"""Where people stand, from their own deltas and from what they see of each other: one least-squares solve.
+"""Poses on the ground from deltas and pairwise transforms: one least-squares solve.
 
-The unknowns are the headings and ground positions of all agents over a stretch of frames. Steps tie an agent's frames
-to each other, pairwise transforms tie agents to each other, and each comes with a precision (one over its variance).
+The unknowns are the headings and ground positions of all agents over consecutive frames. Deltas relate an agent's
+frames to each other, pairwise transforms relate agents to each other, and each has a precision (one over its variance).
 Headings are solved first, then positions with those headings: two linear systems in closed form, without iterations.
 """
 
@@ -16,7 +16,7 @@ from magnet.motion.frames import partners
 from magnet.motion.planar import rotate_ground
 
 GAUGE = 1e-6
-"""Precision that holds everybody where their deltas alone would lead, where nothing else says where they are."""
+"""Small precision of the integrated deltas, which decides where nothing else determines a position."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def solve_pose_graph(deltas: Planar, pairs: Planar, start_yaw: Tensor, start_gro
 
 
 def _correct(delta_precision: Tensor, pair_precision: Tensor, off: Tensor) -> Tensor:
-    """By how much each agent leaves its integrated path in each frame.
+    """Correction of each agent's integrated path in each frame.
 
     delta_precision (B, T, P), pair_precision (B, T, P, P - 1), off (B, T, P, P - 1, C), how far each pairwise transform
     is from the integrated paths -> (B, T, P, C)

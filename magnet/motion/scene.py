@@ -152,7 +152,7 @@ class Scene:
         )
 
     def people(self) -> Scene:
-        """Everybody present as a scene of their own, (M, T, 1), in the order of scenes and slots; names are dropped."""
+        """Each person present as a scene of its own, (M, T, 1), in the order of scenes and slots; names are dropped."""
         there = self.present
         return Scene(
             body_rot=self.body_rot.transpose(1, 2)[there].unsqueeze(2),
@@ -166,7 +166,7 @@ class Scene:
         )
 
     def pad_frames(self, frames: int) -> Scene:
-        """The scene with its first and its last frame held for so many frames more, in front and behind."""
+        """The scene with its first and last frame repeated so many times, before and after it."""
         T = self.frames
         return self.frames_at(torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1))
 

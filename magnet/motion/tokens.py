@@ -51,8 +51,8 @@ class TokenLayout:
     def group_levels(self, levels: Tensor) -> Tensor:
         """Noise level of each group: pairwise ones are as noisy as their noisier end. (..., P) -> (..., P, 1 + slots)
 
-        Otherwise a clean token would give away where its unknown partner is: `pairwise_noise="token"`
-        does that, for comparison.
+        Otherwise a clean token would reveal where its unknown partner is; `pairwise_noise="token"` does that, for
+        comparison.
         """
         own = levels[..., None]
         if not self.slots:
@@ -62,14 +62,14 @@ class TokenLayout:
         return torch.cat([own, torch.maximum(own, levels[..., partners(self.agents, levels.device)])], dim=-1)
 
     def group_present(self, present: Tensor) -> Tensor:
-        """Whether each group speaks of people who are there. (B, P) -> (B, P, 1 + slots) bool"""
+        """Whether each group concerns people who are present. (B, P) -> (B, P, 1 + slots) bool"""
         own = present[..., None]
         if not self.slots:
             return own
         return torch.cat([own, own & present[..., partners(self.agents, present.device)]], dim=-1)
 
     def spread(self, grouped: Tensor) -> Tensor:
-        """One value a group to one value a number. (..., 1 + slots) -> (..., D)"""
+        """Expand one value for each group to one for each number of a token. (..., 1 + slots) -> (..., D)"""
         return grouped[..., self.groups(grouped.device)]
 
     def pack(self, latent: Tensor, deltas: Tensor, pairs: Tensor) -> Tensor:
@@ -109,12 +109,12 @@ def scene_deltas(scene: Scene) -> Tensor:
 
 
 def scene_transforms(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Steps (B, N, P, 4, 9) and pairwise transforms (B, N, P, P - 1, 4, 9) of a scene, by token."""
+    """Deltas (B, N, P, 4, 9) and pairwise transforms (B, N, P, P - 1, 4, 9) of a scene, by token."""
     return transforms(canonical_frame(scene.T_world_root))
 
 
 def transforms(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
-    """Steps and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
+    """Deltas and pairwise transforms of canonical frames, by token. (B, T, P, 4, 4)"""
     return by_token(to_9d(canonical_deltas(T_world_can))), pairwise_by_token(to_9d(pairwise(T_world_can)))
 
 

@@ -15,7 +15,7 @@ from magnet.tasks.registry import register_task
 @register_task("agentic_sync")
 @dataclass(frozen=True)
 class AgenticSync:
-    """All agents at once, each from everybody's past alone: nobody sees what the others are about to do (paper 3.3).
+    """All agents at once, each given everybody's past alone; nobody sees what the others do next (paper 3.3).
 
     Args:
         block: token steps that an agent plans at a time.
@@ -34,9 +34,9 @@ class AgenticSync:
 @register_task("agentic_async")
 @dataclass(frozen=True)
 class AgenticAsync:
-    """Agents take turns: each starts `offset` of its denoising later than the one before, and sees it (paper 3.3).
+    """Agents take turns: each starts a share `offset` of the denoising steps after the one before (paper 3.3).
 
-    Whoever has not started is hidden; from then on all who have see each other as noisy as they are. By the chain rule
+    Agents that have not started are hidden; those that have started see each other's noisy tokens. By the chain rule
     every offset and order samples the same joint distribution of a turn's tokens.
 
     Args:

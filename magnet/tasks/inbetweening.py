@@ -17,7 +17,7 @@ from magnet.tasks.registry import register_task
 @register_task("inbetweening")
 @dataclass(frozen=True)
 class Inbetweening:
-    """The motion between keyframes, from the past and all keyframes within sight (paper A.9).
+    """The motion between keyframes, from the past and all keyframes inside the window (paper A.9).
 
     A keyframe is a token: 4 frames. Without `keys` and `pairs` there is one every `every` token steps, and the
     last token step is one.
@@ -67,9 +67,9 @@ class Inbetweening:
 
 
 def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
-    """Generate all that is not known, window by window, each token in sight of the next keyframe where it can be.
+    """Generate all that is not known, window by window, each token with the next keyframe in its window if possible.
 
-    known (N, P) bool. `MaskSchedule.full_sequence` would have the last of each window's tokens see nothing ahead.
+    known (N, P) bool. In the windows of `MaskSchedule.full_sequence` the last tokens would see nothing ahead.
 
     Raises:
         ValueError: everything is known.
@@ -80,10 +80,10 @@ def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
 
 
 def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
-    """Where the window stands: (start, first token step to generate, one past the last), until all is done.
+    """Positions of the window: (start, first token step to generate, one past the last), until all is done.
 
-    A gap shorter than the window is generated at once, with the keyframe behind it in view. Of a longer one
-    the beginning is generated as any future is, and the rest once its end comes into view.
+    A gap shorter than the window is generated at once, with the keyframe after it in view. A longer gap is generated
+    stride by stride, and the rest at once when its end comes into view.
     """
     N, W = len(known), grid.window
     coming = next_keys(known)

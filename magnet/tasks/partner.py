@@ -37,7 +37,7 @@ class PartnerInpainting:
 
     Args:
         target: slots of the agents to generate; nothing of their motion is read, unless `own_past`.
-        own_past: they are given their own past too, and what follows it is generated: P(A_t:L | A_0:t-1, B_0:L).
+        own_past: give them their own past too, and generate what follows it: P(A_t:L | A_0:t-1, B_0:L).
     """
 
     formula: ClassVar[str] = "P(A_0:L | B_0:L, ...)"
@@ -74,7 +74,7 @@ class PartnerPrediction:
 @register_task("motion_control")
 @dataclass(frozen=True)
 class MotionControl:
-    """Some agents' next motion from their past and the others' motion up to now, which may be live (paper A.9).
+    """Some agents' next motion, given their past and the others' motion up to now, which may be live (paper A.9).
 
     Args:
         target: slots of the agents to generate.

@@ -1,4 +1,4 @@
-"""What watching and playing live share: a stage in the browser with people, a timeline and cameras."""
+"""What both viewers share: a scene in the browser with people, a timeline and cameras."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ class ViewerBase:
         return "  \n".join(lines)
 
     def settle(self, now: float) -> None:
-        """Say once more where a slider stands that a person has let go: frames still on their way may have moved it."""
+        """Set a slider again after a person released it: frames in transit may have moved it."""
         if self.unsettled is None or now < self.unsettled + SETTLES:
             return
         self.unsettled = None

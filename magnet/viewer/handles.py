@@ -147,7 +147,7 @@ class KeyframePanel:
     # -- what buttons do -----------------------------------------------------------------------
 
     def _told(self, client: Any, action: Callable[[], None]) -> None:
-        """Do it; what cannot be done is said to who pressed the button."""
+        """Run an action; an error is shown to the person who pressed the button."""
         try:
             action()
         except ValueError as error:
@@ -158,7 +158,7 @@ class KeyframePanel:
         self.add(keyframe(self.live.scene, agent, self.app.clock.frame, None if pose == HERE else pose))
 
     def add(self, key: Keyframe) -> None:
-        """Put a keyframe on the stage; one of the same person and frame makes room."""
+        """Add a keyframe; it replaces one of the same person and frame."""
         for row in self.rows:
             if (row.key.agent, row.key.frame) == (key.agent, key.frame):
                 self._drop(row)

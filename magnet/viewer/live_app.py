@@ -26,7 +26,7 @@ WHAT = {
 
 
 class LiveApp(ViewerBase):
-    """Watch a model that plays on and on, and interfere.
+    """Watch a model that generates endlessly, and steer it.
 
     Args:
         live: the engine; its model's people stand on `body`.
@@ -68,7 +68,7 @@ class LiveApp(ViewerBase):
         return take("", self.live.scene)
 
     def _cast(self) -> None:
-        """Bring the people of the scene onto the stage, who may have been there before."""
+        """Show the people of the scene; meshes of people shown before are used again."""
         scene = self.live.scene
         key = tuple(scene.betas.flatten().tolist())
         for view in self.views:
@@ -186,7 +186,7 @@ class LiveApp(ViewerBase):
         apply()
 
     def set_loop(self, on: bool) -> None:
-        """Play what there is round and round while the model rests, or go on with it."""
+        """Loop over what has been generated, with the model paused, or continue generating."""
         super().set_loop(on)
         self._rest()
 

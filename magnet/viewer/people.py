@@ -123,7 +123,7 @@ def quick_poser(mesh: Any) -> Poser | None:
 
 
 class LimbPeople:
-    """Everybody's same limb is one batch of tapered capsules: a frame costs two messages a limb for any crowd."""
+    """The same limb of all people as one batch of tapered capsules: two messages for each limb and frame."""
 
     def __init__(
         self, server: Any, name: str, rest: Array, table: tuple[Limb, ...], colours: Colours, opacity: float | None

@@ -145,7 +145,7 @@ class SceneView:
 
 
 def light_up(server: Any, plain: bool) -> None:
-    """Light of surroundings, or an even one: without a GPU, surroundings cost more than all limbs of a crowd."""
+    """Light from an environment map, or ambient light, which is much cheaper without a GPU."""
     server.scene.configure_environment_map(None if plain else "city")  # viser's own choice, which it sends whole
     server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)
 

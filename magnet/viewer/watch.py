@@ -71,7 +71,7 @@ class Viewer(ViewerBase):
 
 
 def default_render_options(takes: list[ShownTake], style: Style | None = None, shadows: bool = True) -> RenderOptions:
-    """What is shown at first: of a crowd what is light, unless a style is asked for."""
+    """Default options: a crowd is shown with few triangles and no extras, unless a style is asked for."""
     crowd = sum(len(each.slots) for each in takes) > CROWD
     style = style or first_style(sum(len(each.slots) for each in takes))
     rich = not crowd

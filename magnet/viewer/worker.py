@@ -1,4 +1,4 @@
-"""A thread that keeps a live scene a little ahead of who watches it."""
+"""A thread that generates a live scene a little ahead of the frame that is shown."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Worker:
 
     Args:
         live: the engine.
-        ahead: fewer answer sooner to steering, more outlast a slow moment.
+        ahead: frames; fewer react sooner to steering, more bridge slow moments.
         failed: told a message when the task refuses; the worker then waits for `wake`.
         done: told each chunk.
     """
