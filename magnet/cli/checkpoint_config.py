@@ -105,6 +105,11 @@ class Arguments:
         parts = [config[key] for config in reversed(self.configs) if isinstance(config.get(key), dict)]
         return next((value for part in parts if (value := (part.get("init_args") or {}).get(name)) is not None), None)
 
+    def of(self, key: str) -> list[str]:
+        """The flags that name a class under a key, with their values."""
+        value = class_in_flags(self.flags, key)
+        return [] if value is None else [f"--{key}", value]
+
     def without(self, key: str) -> list[str]:
         """The flags, less one and its value."""
         kept: list[str] = []
@@ -126,7 +131,9 @@ def import_named(given: Arguments) -> None:
     from magnet.datamodules.registry import import_local
 
     named = [(f"--{key}", given.class_of(key)) for key in ("model", "data")]
-    named += [(layer.path or "a file", path) for layer in given.layers for path in class_paths(layer.options)]
+    for layer in given.layers:  # tasks have names of their own
+        classes = class_paths({key: part for key, part in layer.options.items() if key != "task"})
+        named += [(layer.path or "a file", path) for path in classes]
     for where, path in named:
         if path and "." in path:
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import sys
 from dataclasses import dataclass
@@ -26,12 +25,12 @@ class Layer:
     path: str
     options: dict[str, Any]
 
-    def word(self) -> str:
-        """What stands behind `--config` for it: the file, or its options where they are not the file's text."""
+    def text(self) -> str:
+        """The file's path, or its options as YAML where they are not what the file says."""
         expanded = with_presets(self.options)
         if Path(self.path).is_file() and read_yaml(self.path) == expanded:
             return self.path
-        return json.dumps(expanded)
+        return yaml.safe_dump(expanded)
 
 
 def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:

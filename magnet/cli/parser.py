@@ -7,9 +7,10 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NoReturn
 
+from jsonargparse import ActionConfigFile, Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import wrong_value
@@ -42,6 +43,20 @@ class Parser(LightningArgumentParser):
         self.arguments: list[str] = []
         self.classes: dict[str, dict[str, type]] = {}
         self.chosen: Mapping[str, str] = {}
+        self.layers: list[str] = []
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: Namespace | None = None, **kwargs: Any
+    ) -> Namespace:
+        """Flags over the layers of configuration, of which later ones win."""
+        if self.layers:
+            namespace = self.get_defaults(skip_validation=True) if namespace is None else namespace
+            try:
+                for layer in self.layers:
+                    ActionConfigFile.apply_config(self, namespace, "config", layer)
+            except TypeError as error:
+                self.error(str(error), error)
+        return super().parse_args(args, namespace, **kwargs)
 
     def format_help(self, *args: Any, **kwargs: Any) -> str:
         """Every option: first what a run has in all cases, then the fields of each class."""
@@ -68,7 +83,7 @@ class Parser(LightningArgumentParser):
                     action.help = argparse.SUPPRESS
                 if f"--{key}" in action.option_strings:
                     action.help = argparse.SUPPRESS
-                    path = action.default["class_path"] if action.default else ""
+                    path = (action.default.get("class_path") or action.default["name"]) if action.default else ""
                     default = f"; default: {path.rpartition('.')[2]}" if path else ""
                     group.title = f"--{key} NAME"
                     group.description = f"One of {names}{default}. What each is and its --{key}.FIELD VALUE is below."

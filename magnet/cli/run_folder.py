@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -24,20 +23,16 @@ from magnet.cli.errors import CommandError
 from magnet.version import __version__
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma")
-FOLDER_VARIABLE = "MAGNET_RUN_FOLDER"
 MONITOR = "val/loss"
 LATEST = "latest"
 
 
 def run_folder(root: Path, out: str | None) -> Path:
-    """Folder of this run: `out`, else a new one under `root` named by the time. Processes it starts share it.
+    """Folder of this run: `out`, else a new one under `root` named by the time. `Record` tells it to other processes.
 
     Raises:
         CommandError: `out` is a file.
     """
-    child = "LOCAL_RANK" in os.environ and FOLDER_VARIABLE in os.environ
-    if child:
-        return Path(os.environ[FOLDER_VARIABLE])
     folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     if folder.is_file():
         raise CommandError(f"--out {out}: got a file, expected a folder for what the run leaves behind")
@@ -45,7 +40,6 @@ def run_folder(root: Path, out: str | None) -> Path:
     while out is None and folder.exists():
         number += 1
         folder = folder.with_name(f"{folder.name.partition('-v')[0]}-v{number}")
-    os.environ[FOLDER_VARIABLE] = str(folder)
     return folder
 
 
@@ -228,6 +222,10 @@ class Record(Callback):
     ) -> None:
         self.folder, self.config, self.options, self.facts, self.latest = folder, config, options, facts, latest
         self.begun = False
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Take the first process's folder: each names one by its own clock."""
+        self.folder = Path(trainer.strategy.broadcast(str(self.folder)))
 
     def _begin(self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any) -> None:
         """Write, once data, model and task have turned out to fit: a run that never began leaves nothing behind."""

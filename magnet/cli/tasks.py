@@ -2,65 +2,151 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import inspect
+import itertools
 import re
-import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
-from jsonargparse import ArgumentError, ArgumentParser, Namespace
+from jsonargparse import ArgumentError, ArgumentParser
 
-from magnet.tasks import registry
+from magnet.cli.config_files import Layer
+from magnet.cli.errors import CommandError, no_such, wrong_value
+from magnet.tasks import Task, registry
 from magnet.version import __version__
 
-ALIASES = "magnet.cli.tasks.aliases"
 SHOW_USAGE = "magnet tasks show NAME [--out FILE.png] [--people 2] [--task.FIELD VALUE]"
 
 
-class NamedTask(abc.ABC):
-    """What is sampled: one of the tasks that `magnet tasks` lists."""
+@dataclasses.dataclass(frozen=True)
+class TaskChoice:
+    """A task as it was asked for.
 
-    # The parser resolves short names only for imported subclasses of one base. Tasks share no base, and their names
-    # are not their classes': each gets a stand-in of its fields under its name, with this as base.
+    Attributes:
+        name: as `magnet tasks` lists it.
+        fields: its options, all of them, in plain values.
+    """
 
-    @abc.abstractmethod
-    def schedule(self, grid: Any) -> Any:
-        """The task's own."""
+    name: str
+    fields: dict[str, Any]
+
+    @property
+    def task(self) -> Task:
+        """The task itself.
+
+        Raises:
+            ValueError: its fields contradict each other.
+        """
+        return registry.get(self.name)(**self.fields)
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """As configuration files have it."""
+        return {"name": self.name, **listed(self.fields)}
 
 
-def aliases() -> dict[str, type]:
-    """One stand-in a task, by the task's name; made on first use, for that is when plug-ins are loaded."""
-    if ALIASES not in sys.modules:
-        module = ModuleType(ALIASES)
-        for entry in registry.entries():
-            members = {"__module__": ALIASES, "__qualname__": entry.name, "__doc__": entry.task.__doc__}
-            setattr(module, entry.name, type(entry.name, (entry.task, NamedTask), members))
-        sys.modules[ALIASES] = module
-    return {entry.name: getattr(sys.modules[ALIASES], entry.name) for entry in registry.entries()}
+def named_task(layer: Layer) -> Layer:
+    """A file's options with its task as a class and its options, where it says `task: {name: NAME, FIELD: VALUE}`."""
+    task = layer.options.get("task")
+    if not isinstance(task, dict) or "name" not in task:
+        return layer
+    spec = {"class_path": task["name"], "init_args": {key: value for key, value in task.items() if key != "name"}}
+    return Layer(layer.path, {**layer.options, "task": spec})
 
 
-def alias_path(name: str) -> str:
-    """Class path of a task's stand-in.
+def listed(value: Any) -> Any:
+    """Tuples as lists, for files."""
+    if isinstance(value, dict):
+        return {key: listed(part) for key, part in value.items()}
+    return [listed(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def task_class(name: str) -> type:
+    """A task's class by its name.
 
     Raises:
-        ValueError: no such task; names the closest one.
+        CommandError: no such task; names the closest one.
     """
-    short = name.removeprefix(f"{ALIASES}.")
-    registry.get(short)
-    return f"{ALIASES}.{short}"
+    try:
+        return registry.get(name)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
 
 
-def task_of(config: Namespace) -> Any:
-    """The task itself from what was parsed.
+def split_flags(flags: Iterable[str]) -> tuple[list[str], list[str]]:
+    """A command line's `--task.FIELD VALUE`, and the rest of it without `--task NAME`."""
+    fields: list[str] = []
+    others: list[str] = []
+    rest = iter(flags)
+    for flag in rest:
+        name, equals, _ = flag.partition("=")
+        if name != "--task" and not name.startswith("--task."):
+            others.append(flag)
+            continue
+        words = [flag] if equals else [flag, *itertools.islice(rest, 1)]
+        if name not in ("--task", "--task.class_path"):
+            fields += [words[0].replace("--task.init_args.", "--task.", 1), *words[1:]]
+    return fields, others
+
+
+def parse_task(
+    name: str, flags: list[str], below: Iterable[Mapping[str, Any]] = (), command: str = "test"
+) -> TaskChoice:
+    """A task from its flags, over the options that configuration files give it; the only way there is to read one.
+
+    Args:
+        name: the task's.
+        flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`.
+        below: options from files, later ones win.
+        command: whose help is named in errors.
 
     Raises:
-        ValueError: no such task.
+        CommandError: no such task or option, or a value that does not fit.
     """
-    options = config.as_dict().get("init_args") or {}
-    return registry.get(config.class_path.rsplit(".", 1)[-1])(**options)
+    kind = task_class(name)
+    parser = task_parser(kind)
+    return TaskChoice(name, read_fields(parser, flags, below, f"magnet {command} --help").get("task", {}))
+
+
+def task_parser(kind: type | None, **settings: Any) -> ArgumentParser:
+    """A parser that knows the options of one task."""
+    parser = ArgumentParser(exit_on_error=False, **settings)
+    if kind is not None:
+        parser.add_class_arguments(kind, "task")
+    return parser
+
+
+def read_fields(
+    parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
+) -> dict[str, Any]:
+    """What flags say over options from files.
+
+    Raises:
+        CommandError: an option that there is not, or a value that does not fit.
+    """
+    try:
+        cfg = parser.get_defaults(skip_validation=True)
+        for options in below:
+            for key, value in options.items():
+                if f"task.{key}" not in cfg:
+                    raise CommandError(unknown_option(parser, f"--task.{key}", more))
+                cfg[f"task.{key}"] = value
+        return dict(parser.parse_args(flags, namespace=cfg).as_dict())
+    except ArgumentError as error:
+        message = str(error)
+        unknown = re.search(r"(?:[Uu]nrecognized arguments: |Key ')([^\s=']+)", message)
+        if not unknown:
+            raise CommandError(wrong_value(message) or message) from error
+        raise CommandError(unknown_option(parser, "--" + unknown[1].removeprefix("--"), more)) from error
+
+
+def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
+    """What is said of an option that there is not."""
+    flags = [each for action in parser._actions for each in action.option_strings if each.startswith("--")]
+    known = [each for each in flags if not each.startswith(("--print", "--task.help")) and each != "--task"]
+    return no_such("option", flag, known, more)
 
 
 def list_tasks(arguments: list[str]) -> int:
@@ -72,8 +158,6 @@ def list_tasks(arguments: list[str]) -> int:
     from rich.console import Console
     from rich.padding import Padding
     from rich.text import Text
-
-    from magnet.cli.errors import CommandError
 
     if arguments[:1] == ["show"]:
         return show_task(arguments[1:])
@@ -165,7 +249,6 @@ def show_task(arguments: list[str]) -> int:
     from rich.console import Console
     from rich.text import Text
 
-    from magnet.cli.errors import CommandError
     from magnet.export.schedule import draw_schedule
     from magnet.export.schedule_terminal import schedule_text
     from magnet.sampling.grid import Grid
@@ -176,11 +259,7 @@ def show_task(arguments: list[str]) -> int:
             return 0
         raise CommandError(f"say which task: {SHOW_USAGE}; there are {', '.join(registry.names())}")
     name, *rest = arguments
-    try:
-        kind = registry.get(name)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
-    task, shown = parse_shown(name, kind, rest)
+    task, shown = parse_shown(name, rest)
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
     grid = Grid(*sizes, noise_sampling=shown.noise_sampling)
     schedule = task.schedule(grid)
@@ -199,31 +278,17 @@ def show_task(arguments: list[str]) -> int:
 
 def show_parser(task: type | None) -> ArgumentParser:
     """Options of `magnet tasks show`, with those of one task."""
-    parser = ArgumentParser(prog="magnet tasks show NAME", exit_on_error=False, description="Draw a task's schedule.")
+    parser = task_parser(task, prog="magnet tasks show NAME", description="Draw a task's schedule.")
     parser.add_class_arguments(Shown, as_group=False)
-    if task is not None:
-        parser.add_class_arguments(task, "task")
     return parser
 
 
-def parse_shown(name: str, task: type, arguments: list[str]) -> tuple[Any, Shown]:
+def parse_shown(name: str, arguments: list[str]) -> tuple[Task, Shown]:
     """The task and the sizes that a command line asks for.
 
     Raises:
-        CommandError: an option that neither has, or a value that does not fit.
+        CommandError: no such task, an option that neither has, or a value that does not fit.
     """
-    from magnet.cli.errors import CommandError, no_such, wrong_value
-
-    parser = show_parser(task)
-    try:
-        fields = parser.parse_args(arguments).as_dict()
-    except ArgumentError as error:
-        message = str(error)
-        unknown = re.search(r"(?:[Uu]nrecognized arguments: |Key ')([^\s=']+)", message)
-        if not unknown:
-            raise CommandError(wrong_value(message) or message) from error
-        flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
-        known = [flag for flag in flags if not flag.startswith(("--print", "--task.help"))]
-        flag = "--" + unknown[1].removeprefix("--")
-        raise CommandError(no_such("option", flag, known, f"magnet tasks show {name} --help")) from error
-    return task(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
+    kind = task_class(name)
+    fields = read_fields(show_parser(kind), arguments, (), f"magnet tasks show {name} --help")
+    return kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})

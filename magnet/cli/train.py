@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import sys
 import warnings
-from pathlib import Path
 from typing import Any, Literal
 
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's calls, not ours
@@ -17,12 +15,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import weights
-from magnet.cli import checkpoint_config, class_options, config_files, outputs, run_folder
-from magnet.cli.checkpoint_config import Arguments
-from magnet.cli.config_files import Layer
+from magnet.cli import checkpoint_config, class_options, outputs, run_folder
 from magnet.cli.errors import CommandError
 from magnet.cli.parser import Parser
-from magnet.cli.tasks import NamedTask, alias_path, aliases, task_of
+from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request
+from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import Evaluator
@@ -30,12 +27,11 @@ from magnet.files import writing
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
+from magnet.tasks import registry as task_registry
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
 """Models with short names, and where they are; the first one is the default."""
 
-DEFAULT_TASK = "joint_future"
-SAMPLING = ("test", "predict")
 SEED = 1111
 SILENCED = (
     ".*does not have many workers.*",
@@ -47,7 +43,6 @@ SILENCED = (
     ".*in eval mode at the start of training.*",
 )
 """Lightning's hints that nobody here can follow."""
-RUNS = Path("runs")
 
 
 def run_trainer(command: str, arguments: list[str]) -> int:
@@ -57,33 +52,14 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         CommandError: something the user can put right.
     """
     quiet()
-    given = Arguments.split(arguments)
-    if any(flag in ("-h", "--help") for flag in given.flags):
-        MagnetCLI(command, ["--help"], None, Path(), {})
+    if any(flag in ("-h", "--help") for flag in arguments):
+        MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {})))
         return 0
     named_classes()
-    checkpoint_config.import_named(given)
-    words = task_words(command, given)
-    name, out = run_name(command, given.files), given.value("out")
-    checkpoint = which_checkpoint(command, given, name)
-    if command == "fit":
-        checkpoint_config.refuse_linked(given)
-    layer: dict[str, Any] = {}
-    if checkpoint is not None:
-        stored = checkpoint_config.Stored.read(checkpoint)
-        keep_data = given.value("ckpt_path") is not None
-        layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
-    elif command == "fit" and (start := given.option("model", "start_from")):
-        layer = checkpoint_config.started(start, given, MODELS, registry.default_path())
-    folder = run_folder.run_folder(RUNS / name, out)
-    preset, words = sampler_words(command, words)
-    settled = class_options.settle([Layer("", layer), *given.layers, Layer("", preset)], words)
-    for note in settled.notes:
-        print(f"magnet: {note}", file=sys.stderr)
-    layers = [word for each in settled.layers if each.options for word in ("--config", each.word())]
+    request = read_request(command, arguments, MODELS)
     goes_on = "; then go on with --ckpt_path last, if there is one" if command == "fit" else ""
-    with writing(folder, f"choose another --out{goes_on}"):
-        MagnetCLI(command, [*layers, *words], checkpoint, folder, settled.classes)
+    with writing(request.folder, f"choose another --out{goes_on}"):
+        MagnetCLI(request)
     return 0
 
 
@@ -108,87 +84,25 @@ def quiet() -> None:
         log.addFilter(lambda record: "Tip:" not in record.getMessage())
 
 
-def run_name(command: str, files: list[str]) -> str:
-    """Name of a run's folder: its configuration's, else the command's."""
-    if not files:
-        return command
-    file = Path(files[-1]).resolve()
-    return file.parent.parent.name if file.name == "config.yaml" and (file.parent / "run.json").exists() else file.stem
-
-
-def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
-    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
-
-    Raises:
-        CommandError: it is not there.
-    """
-    name, out = given.value("ckpt_path"), given.value("out")
-    if name is None and (command == "fit" or given.only_shown):
-        return None
-    folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
-    return checkpoint_config.find_checkpoint(name, folders)
-
-
-def task_words(command: str, given: Arguments) -> list[str]:
-    """The flags for the parser, with the task's name checked and made a path.
-
-    Raises:
-        CommandError: no such task.
-    """
-    flags = given.without("ckpt_path")
-    name = given.class_of("task")
-    if command not in SAMPLING or name is None:
-        return flags
-    try:
-        path = alias_path(name)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
-    rest = Arguments(flags).without("task")
-    return ["--task", path, *rest]
-
-
-def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
-
-    Raises:
-        CommandError: no such preset.
-    """
-    name = Arguments(flags).flag("sampler")
-    if command not in SAMPLING or name is None or not config_files.is_preset(name):
-        return {}, flags
-    return {"sampler": config_files.sampler_preset(name)}, Arguments(flags).without("sampler")
-
-
 class MagnetCLI(LightningCLI):
-    """LightningCLI for one command, with this project's order of precedence: flag, file, checkpoint, default.
+    """LightningCLI for one command, with this project's order of precedence: flag, file, checkpoint, default."""
 
-    Args:
-        command: fit, validate, test or predict.
-        arguments: what follows it; the checkpoint's own options are already in front.
-        checkpoint: to start from.
-        folder: of this run.
-        classes: those that the layers and flags name under `model`, `data` and `task`.
-    """
-
-    def __init__(
-        self, command: str, arguments: list[str], checkpoint: Path | None, folder: Path, classes: dict[str, str]
-    ) -> None:
-        self.command, self.arguments, self.checkpoint, self.folder = command, arguments, checkpoint, folder
-        self.classes = classes
+    def __init__(self, request: Request) -> None:
+        self.request = request
+        self.command, self.checkpoint, self.folder = request.command, request.checkpoint, request.folder
         self.evaluator: Evaluator | None = None
         self.predicted: list[Any] = []
         self.models, self.data = named_classes()
-        self.tasks = aliases() if command in SAMPLING else {}
         super().__init__(
             LightningModule,
             LightningDataModule,
             save_config_callback=None,
             seed_everything_default=SEED,
-            parser_kwargs={"prog": "magnet", command: {"description": None}},
+            parser_kwargs={"prog": "magnet", self.command: {"description": None}},
             parser_class=Parser,
             subclass_mode_model=True,
             subclass_mode_data=True,
-            args=[command, *arguments],
+            args=[self.command, *request.flags],
             auto_configure_optimizers=False,
         )
 
@@ -202,8 +116,9 @@ class MagnetCLI(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """What this project adds to the Trainer's options."""
         assert isinstance(parser, Parser)
-        Parser.root, parser.command, parser.arguments = parser, self.command, self.arguments
-        parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.classes
+        Parser.root, parser.command, parser.arguments = parser, self.command, self.request.flags
+        parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.request.classes
+        parser.layers = self.request.layers
         self._default_class(parser, "data", registry.default_path())
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
         parser.add_argument(
@@ -217,9 +132,10 @@ class MagnetCLI(LightningCLI):
             parser.link_arguments("data.init_args.window_frames", "model.init_args.window", checkpoint_config.tokens)
         self._default_class(parser, "model", None if self.command == "fit" else path_of(MODELS))
         if self.command in SAMPLING:
-            parser.classes["task"] = self.tasks
-            parser.add_subclass_arguments(NamedTask, "task", required=False, instantiate=False)
-            self._default_class(parser, "task", alias_path(DEFAULT_TASK))
+            assert self.request.task is not None
+            parser.classes["task"] = {entry.name: entry.task for entry in task_registry.entries()}
+            tasks = parser.add_argument_group("task")
+            tasks.add_argument("--task", type=dict[str, Any], default=self.request.task.spec)
             parser.add_class_arguments(SamplerOptions, "sampler")
             parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
             parser.add_class_arguments(Evaluator, skip={"denoiser", "task", "sampler"}, instantiate=False)
@@ -244,7 +160,7 @@ class MagnetCLI(LightningCLI):
 
     def _default_class(self, parser: Parser, key: str, otherwise: str | None) -> None:
         """Make the class that wins the default, so that no other class's defaults come first."""
-        path = class_options.known_path(parser.classes[key], self.classes.get(key, otherwise or ""))
+        path = class_options.known_path(parser.classes[key], self.request.classes.get(key, otherwise or ""))
         try:
             there = checkpoint_config.class_named(path) is not None
         except ImportError:
@@ -279,7 +195,8 @@ class MagnetCLI(LightningCLI):
                 callbacks.append(run_folder.learning_rate())
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False
-        callbacks.append(self._record())
+        self.record = self._record()
+        callbacks.append(self.record)
         plugins = config.get("plugins") or []
         plugins = [*(plugins if isinstance(plugins, list) else [plugins]), weights.CheckpointIO()]
         changes = {
@@ -323,7 +240,7 @@ class MagnetCLI(LightningCLI):
 
     def _evaluate(self) -> None:
         """Put an evaluator around a denoiser, whose checkpoint is read here: the Trainer's model is the evaluator."""
-        if not isinstance(self.model, Denoiser):
+        if self.request.task is None or not isinstance(self.model, Denoiser):
             return
         if self.checkpoint is not None:
             stored = weights.read(self.checkpoint)
@@ -333,7 +250,7 @@ class MagnetCLI(LightningCLI):
         options = {name: config[name] for name in ("samples", "baselines", "seed", "baseline_stride", "interval")}
         if options["samples"] < 1:
             raise CommandError(f"--samples is {options['samples']}, expected at least 1")
-        self.evaluator = Evaluator(self.model, task_of(config["task"]), config["sampler"], **options)
+        self.evaluator = Evaluator(self.model, self.request.task.task, config["sampler"], **options)
 
     def before_fit(self) -> None:
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
@@ -367,7 +284,8 @@ class MagnetCLI(LightningCLI):
             return
         if self.evaluator is None or self.evaluator.results is None:
             return outputs.show_metrics(self.trainer, self.folder, self.command)
-        task = self._option("task").class_path.rsplit(".", 1)[-1]
+        assert self.request.task is not None
+        task = self.request.task.name
         facts = {"task": task, "checkpoint": str(self.checkpoint), "data": self.config_dump.get("data")}
         outputs.show_results(self.evaluator.results, self.folder, facts, self._option("full"))
 
@@ -376,6 +294,7 @@ class MagnetCLI(LightningCLI):
         scenes = [batch for batch in self.predicted if isinstance(batch, Scene)]
         if self.evaluator is not None and scenes:
             picture, count = self._option("picture"), self._option("pictures")
+            self.folder = self.record.folder  # the first process's, for each writes its own scenes
             outputs.write_scenes(scenes, self.evaluator, self.datamodule, self.folder, picture, count)
             self._point_to_viewer()
 

@@ -140,7 +140,7 @@ def test_tasks_have_their_own_defaults(name: str, command: str, capsys: pytest.C
         key: field.default if field.default_factory is missing else field.default_factory()
         for key, field in fields.items()
     }
-    assert asked.get("init_args", {}) == plain(expected)
+    assert asked == {"name": name, **plain(expected)}
 
 
 def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(

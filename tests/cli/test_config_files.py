@@ -179,3 +179,24 @@ def test_files_that_cannot_be_extended_are_told(toy: Path, capsys: pytest.Captur
     assert "extends itself, by way of one.yaml and two.yaml" in complaint(capsys, "fit", "--config", "one.yaml")
     assert "no configuration file nosuch.yaml" in complaint(capsys, "fit", "--config", "gone.yaml")
     assert "expected a file or a list of files" in complaint(capsys, "fit", "--config", "odd.yaml")
+
+
+FORMS = {
+    "a name": "task: agentic_async",
+    "a name and options": "task: {name: agentic_async, offset: 0.25}",
+    "as it was written before": "task: {class_path: magnet.cli_tasks.aliases.agentic_async, init_args: {offset: 0.25}}",
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_names_its_task_in_any_of_these_forms(toy: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    """Flags beat it option by option, and another task leaves its options out and says so."""
+    (toy / "mine.yaml").write_text(FORMS[form] + "\n")
+    task = printed(capsys, "test", "--config", "mine.yaml", "--task.block", "3")["task"]
+    assert (task["name"], task["block"]) == ("agentic_async", 3)
+    assert task["offset"] == (1.0 if form == "a name" else 0.25)
+    assert printed(capsys, "test", "--config", "mine.yaml", "--task.offset=0.5")["task"]["offset"] == 0.5
+    assert cli.main(["test", "--config", "mine.yaml", "--task", "generation", "--print_config"]) == 0
+    out, notes = capsys.readouterr()
+    assert yaml.safe_load(out)["task"] == {"name": "generation"}
+    assert ("left out (offset)" in notes) == (form != "a name")

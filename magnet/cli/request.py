@@ -1,0 +1,122 @@
+"""What a command line asks for: flags over files over a checkpoint's options, and the task."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from magnet.cli import checkpoint_config, class_options, config_files, run_folder
+from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.config_files import Layer
+from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
+from magnet.datamodules import registry
+
+DEFAULT_TASK = "joint_future"
+SAMPLING = ("test", "predict")
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a command line asks for, files and checkpoints read.
+
+    Args:
+        command: fit, validate, test or predict.
+        flags: of the command line, less configuration files and the task.
+        layers: options below them as YAML or files of it, lowest first: the checkpoint's, then those of files.
+        checkpoint: to start from.
+        folder: of this run.
+        classes: those that the layers and flags name under `model` and `data`.
+        task: what is sampled, by commands that sample.
+    """
+
+    command: str
+    flags: list[str]
+    layers: list[str] = field(default_factory=list)
+    checkpoint: Path | None = None
+    folder: Path = Path()
+    classes: dict[str, str] = field(default_factory=dict)
+    task: TaskChoice | None = None
+
+
+def read_request(command: str, arguments: list[str], models: dict[str, str]) -> Request:
+    """Read the files and the checkpoint that a command line names, and settle who beats whom.
+
+    Args:
+        command: one of the Trainer's.
+        arguments: what follows it.
+        models: modules of our models, by the class's short name.
+
+    Raises:
+        CommandError: something the user can put right.
+    """
+    given = Arguments.split(arguments)
+    checkpoint_config.import_named(given)
+    words = given.without("ckpt_path")
+    fields, words = split_flags(words) if command in SAMPLING else ([], words)
+    name, out = run_name(command, given.files), given.value("out")
+    checkpoint = which_checkpoint(command, given, name)
+    if command == "fit":
+        checkpoint_config.refuse_linked(given)
+    layer: dict[str, Any] = {}
+    if checkpoint is not None:
+        stored = checkpoint_config.Stored.read(checkpoint)
+        keep_data = given.value("ckpt_path") is not None
+        layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
+    elif command == "fit" and (start := given.option("model", "start_from")):
+        layer = checkpoint_config.started(start, given, models, registry.default_path())
+    folder = run_folder.run_folder(RUNS / name, out)
+    preset, words = sampler_words(command, words)
+    files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
+    settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
+    for note in settled.notes:
+        print(f"magnet: {note}", file=sys.stderr)
+    task = chosen_task(command, fields, settled) if command in SAMPLING else None
+    layers = [each.text() for each in settled.layers if each.options]
+    return Request(command, words, layers, checkpoint, folder, settled.classes, task)
+
+
+def run_name(command: str, files: list[str]) -> str:
+    """Name of a run's folder: its configuration's, else the command's."""
+    if not files:
+        return command
+    file = Path(files[-1]).resolve()
+    return file.parent.parent.name if file.name == "config.yaml" and (file.parent / "run.json").exists() else file.stem
+
+
+def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
+    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
+
+    Raises:
+        CommandError: it is not there.
+    """
+    name, out = given.value("ckpt_path"), given.value("out")
+    if name is None and (command == "fit" or given.only_shown):
+        return None
+    folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
+    return checkpoint_config.find_checkpoint(name, folders)
+
+
+def chosen_task(command: str, flags: list[str], settled: class_options.Settled) -> TaskChoice:
+    """What is sampled: the task that wins, its options from files and above them from flags.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
+    """
+    name = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
+    below = [class_options.spec_of(layer.options.pop("task", None)).get("init_args") or {} for layer in settled.layers]
+    return parse_task(name, flags, below, command)
+
+
+def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
+
+    Raises:
+        CommandError: no such preset.
+    """
+    name = Arguments(flags).flag("sampler")
+    if command not in SAMPLING or name is None or not config_files.is_preset(name):
+        return {}, flags
+    return {"sampler": config_files.sampler_preset(name)}, Arguments(flags).without("sampler")
