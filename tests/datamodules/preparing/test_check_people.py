@@ -47,10 +47,10 @@ def changed(motion: FakeMotion, frames: slice, **values: float) -> FakeMotion:
 
 
 def turned_over(motion: FakeMotion) -> FakeMotion:
-    """The left elbow by 170 degrees."""
+    """The left shoulder by 170 degrees across the arm, so that positions show it, too."""
     poses, frames = motion.poses.copy(), shown(motion)
-    over = Rotation.from_rotvec([np.radians(170.0), 0.0, 0.0])
-    poses[frames, 1, 18] = (Rotation.from_rotvec(poses[frames, 1, 18]) * over).as_rotvec()
+    over = Rotation.from_rotvec([0.0, np.radians(170.0), 0.0])
+    poses[frames, 1, 16] = (Rotation.from_rotvec(poses[frames, 1, 16]) * over).as_rotvec()
     return with_positions(replace(motion, poses=poses))
 
 
@@ -93,7 +93,7 @@ SPOILS: dict[str, Spoil] = {
     "a shape that nobody has": Spoil(unshaped, r"betas up to 20, expected at most 12.*person 1.*: 20, 20", True, False),
     "a joint turns over": Spoil(
         turned_over,
-        WHO + r"left_(elbow|wrist) (turns by 1\d\d degrees|is flung .* m) from frame \d+ to \d+ .*cut there",
+        WHO + r"left_(shoulder|elbow|wrist) (turns by 1\d\d degrees|is flung .* m) from frame \d+ to \d+ .*cut there",
     ),
     "a place of 1e30": Spoil(
         lambda m: changed(m, shown(m), transl=1e30, positions=1e30),
