@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from magnet.body import Body, load_body
 from magnet.datamodules.clip import Clip, Split, at_least
 from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
-from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.mapped import SplitData
 from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.window_index import WindowIndex
 from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows
@@ -169,20 +169,16 @@ class MotionDataModule(LightningDataModule):
         draws = RandomWindows(store, self.window_frames, self.weights, self.augment, self.seed, *place)
         size = self.epoch_size or 4 * -(-int(store.length.sum()) // self.window_frames)
         placed, frames, clearance = self._placed("train"), self.window_frames, self.augment.compose_clearance
-        if isinstance(placed, MappedStore):
-            self._train_loader = TrainLoader(
-                draws,
-                lambda fetched: placed.finish(fetched, clearance),
-                self.batch_size,
-                size,
-                *place,
-                shared=draws.shared,
-                fetch=lambda windows: placed.fetch(windows, frames, clearance),
-                ahead=self.read_ahead,
-            )
-        else:
-            gather = partial(self._gather, "train", frames)
-            self._train_loader = TrainLoader(draws, gather, self.batch_size, size, *place, shared=draws.shared)
+        self._train_loader = TrainLoader(
+            draws,
+            lambda windows: placed.fetch(windows, frames, clearance),
+            lambda fetched: placed.finish(fetched, clearance),
+            self.batch_size,
+            size,
+            *place,
+            shared=draws.shared,
+            ahead=self.read_ahead if placed.on_disk else 0,
+        )
         if self._resume:
             self._train_loader.load_state_dict(self._resume)
         self._resume = None
@@ -216,13 +212,17 @@ class MotionDataModule(LightningDataModule):
         """The same scenes as `test_dataloader`."""
         return self.test_dataloader()
 
-    def _fixed(self, split: Split, windows: WindowIndex, frames: int, batch_size: int) -> FixedLoader:
+    def _some(self, split: Split, windows: WindowIndex, frames: int) -> WindowIndex:
+        """The windows, when there are any."""
         if not len(windows):
-            longest = int(self.store(split).length.max())
             raise ValueError(
                 f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"
-                f" {longest}; ask for fewer frames"
+                f" {int(self.store(split).length.max())}; ask for fewer frames"
             )
+        return windows
+
+    def _fixed(self, split: Split, windows: WindowIndex, frames: int, batch_size: int) -> FixedLoader:
+        windows = self._some(split, windows, frames)
         return FixedLoader(windows, lambda part: self._gather(split, frames, part), batch_size, *self._shard())
 
     def test_windows(self) -> WindowIndex:
@@ -259,12 +259,7 @@ class MotionDataModule(LightningDataModule):
 
     def _train_index(self, frames: int, stride: int, composed: int) -> WindowIndex:
         store = self.store("train")
-        windows = fixed_windows(store, frames, stride)
-        if not len(windows):
-            raise ValueError(
-                f"{type(self).__name__}: split train has no clean stretch of {frames} frames; its longest clip has"
-                f" {int(store.length.max())}; ask for fewer frames"
-            )
+        windows = self._some("train", fixed_windows(store, frames, stride), frames)
         if composed:
             windows = WindowIndex.concatenate(
                 [windows, composed_windows(store, windows, composed, self.augment.compose_apart, self.seed)]

@@ -78,31 +78,30 @@ class TrainLoader:
 
     Args:
         draw: (epoch, first sample, count) to the windows drawn.
-        gather: what `fetch` gave to the batch; without it, windows drawn to the batch.
+        fetch: windows drawn to what `finish` takes; the part that threads do ahead. Its result must depend on the
+            windows alone.
+        finish: what `fetch` gave to the batch.
         batch_size: scenes a batch and process.
         epoch_size: samples an epoch, over all processes; rounded down to whole batches, at least one.
         rank: of this process.
         world: number of processes.
         shared: `draw` numbers the samples of this process alone.
-        fetch: windows drawn to what `gather` takes; the part that threads do ahead. Its result must depend on the
-            windows alone.
         ahead: batches fetched ahead; 0: each when it is asked for. They are no part of the state before they are seen.
     """
 
     def __init__(
         self,
         draw: Callable[[int, int, int], WindowIndex],
-        gather: Callable[[Any], Scene],
+        fetch: Callable[[WindowIndex], Any],
+        finish: Callable[[Any], Scene],
         batch_size: int,
         epoch_size: int,
         rank: int = 0,
         world: int = 1,
         shared: bool = False,
-        fetch: Callable[[WindowIndex], Any] | None = None,
         ahead: int = 0,
     ) -> None:
-        self.draw, self.gather, self.shared = draw, gather, shared
-        self.fetch = fetch or (lambda windows: windows)
+        self.draw, self.fetch, self.finish, self.shared = draw, fetch, finish, shared
         self.ahead = Prefetcher(self._fetched, self._after, ahead) if ahead else None
         self.batch_size, self.rank, self.world = batch_size, rank, world
         self.batches = max(1, epoch_size // (batch_size * world))
@@ -115,7 +114,7 @@ class TrainLoader:
         # Lightning makes the iterator before it restores anything: read the cursor only when asked for a batch.
         while True:
             cursor = (self.epoch, self.batch)
-            batch = self.gather(self.ahead.get(cursor) if self.ahead else self._fetched(cursor))
+            batch = self.finish(self.ahead.get(cursor) if self.ahead else self._fetched(cursor))
             self.epoch, self.batch = self._after(cursor)
             yield batch
             if self._after(cursor)[1] == 0:

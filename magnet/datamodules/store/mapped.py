@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -116,6 +117,8 @@ class MappedStore(MemoryStore):
         ValueError: a clip has more people than slots.
         StoreError: a file is missing or damaged.
     """
+
+    on_disk: ClassVar[bool] = True
 
     def __init__(self, piece: SplitData, max_agents: int, spread: bool = True) -> None:
         self.part = part = piece.part

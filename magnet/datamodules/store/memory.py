@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ class MemoryStore:
     Raises:
         ValueError: a clip has more people than slots, or another fps or body than the first.
     """
+
+    on_disk: ClassVar[bool] = False  # `fetch` reads files, and is worth doing ahead
 
     def __init__(self, clips: Sequence[Clip], max_agents: int) -> None:
         self.clips = list(clips)
@@ -118,6 +121,14 @@ class MemoryStore:
         other.device = torch.device(device)
         other.tensors = {name: tensor.to(device) for name, tensor in self.tensors.items()}
         return other
+
+    def fetch(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Any:
+        """The part of a batch's work that a thread may do ahead; here all of it."""
+        return self.gather(windows, frames, clearance)
+
+    def finish(self, fetched: Any, clearance: float = 0.0) -> Scene:
+        """What `fetch` gave, as a batch on the store's device."""
+        return fetched
 
     def gather(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Scene:
         """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
