@@ -28,21 +28,21 @@ SHAPES = 10
 """Shape numbers a body has; further ones in a file are left out."""
 
 
-def _levels() -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
-    """Joints of equal depth below the pelvis, and where each one's parent stands in the level above."""
-    levels: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
+def _depths() -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
+    """Joints of equal depth below the pelvis, and where each one's parent stands one level above."""
+    depths: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
     above: tuple[int, ...] = (0,)
     while above:
         here = tuple(j for j, parent in enumerate(PARENTS) if parent in above)
         if here:
-            levels.append((here, tuple(above.index(PARENTS[j]) for j in here)))
+            depths.append((here, tuple(above.index(PARENTS[j]) for j in here)))
         above = here
-    return tuple(levels)
+    return tuple(depths)
 
 
-LEVELS = _levels()
-BY_LEVEL = (0, *(j for joints, _ in LEVELS for j in joints))
-FROM_LEVEL = tuple(BY_LEVEL.index(j) for j in range(BODY_JOINTS))
+DEPTHS = _depths()
+BY_DEPTH = (0, *(j for joints, _ in DEPTHS for j in joints))
+FROM_DEPTH = tuple(BY_DEPTH.index(j) for j in range(BODY_JOINTS))
 
 
 class Body(nn.Module):
@@ -154,7 +154,7 @@ class Body(nn.Module):
         with _exact(body_rot):
             R, t = T_world_root[..., None, :3, :3], T_world_root[..., None, :3, 3]
             Rs, ts = [R], [t]
-            for joints, parent in LEVELS:
+            for joints, parent in DEPTHS:
                 mine = [j - 1 for j in joints]
                 R, t = R[..., parent, :, :], t[..., parent, :]
                 t = t + (R @ offset[..., mine, :, :])[..., 0]
@@ -164,7 +164,7 @@ class Body(nn.Module):
             lead = torch.broadcast_shapes(Rs[-1].shape[:-3], ts[-1].shape[:-2])
             Rs = [level.expand(*lead, *level.shape[-3:]) for level in Rs]
             ts = [level.expand(*lead, *level.shape[-2:]) for level in ts]
-            order = list(FROM_LEVEL)
+            order = list(FROM_DEPTH)
             return torch.cat(Rs, dim=-3)[..., order, :, :], torch.cat(ts, dim=-2)[..., order, :]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, Scene, require_one
 
 Unit = Literal["m", "cm"]
 PER_METRE: dict[str, float] = {"m": 1.0, "cm": 100.0}
@@ -58,8 +58,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m")
     ...     [path.name for path in save_bvh(scene, Path(folder) / "rest.bvh", load_body())]
     ['rest_0.bvh', 'rest_1.bvh']
     """
-    if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
+    require_one(scene)
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
     if unit not in PER_METRE:

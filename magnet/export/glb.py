@@ -15,7 +15,7 @@ from torch import Tensor
 
 from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.export.stage import AGENTS
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, Scene, require_one
 from magnet.version import __version__
 
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
@@ -49,8 +49,7 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned) -> Path:
     Raises:
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
-    if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
+    require_one(scene)
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
     slots = scene.present[0].nonzero()[:, 0].tolist()

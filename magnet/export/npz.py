@@ -13,7 +13,7 @@ from torch import Tensor
 
 from magnet.files import load_npz
 from magnet.motion.frames import rigid
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, Scene, require_one
 
 SMPLX_JOINTS = 55
 
@@ -43,8 +43,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
     Raises:
         ValueError: more than one scene, or another body's.
     """
-    if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; write each scene.select([b]) by itself")
+    require_one(scene)
     if scene.body != body.id:
         raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
     scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])

@@ -151,10 +151,10 @@ class Rollout:
         tokens = model.window if self.frames is None else -(-self.frames // TOKEN_FRAMES)
         past = context // TOKEN_FRAMES
         grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
-        self.rows: float = grid.tokens
+        self.length: float = grid.tokens
         if frames is None:
             schedule, self.plan = periodic_plan(task, grid, layout.agents, self.online)
-            self.rows = torch.inf
+            self.length = torch.inf
         else:
             schedule = task.schedule(grid).padded(layout.agents)
             self.plan = planned(schedule)
@@ -179,7 +179,7 @@ class Rollout:
             )
         self.stats.begin(B)
         self.first = self.stop = 0
-        self.there: float = self.rows
+        self.there: float = self.length
         self.reached = 0  # one past the last row that has been generated
         self.expected = Expected(receptive_field(model)[1])
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
@@ -195,8 +195,8 @@ class Rollout:
             if stage is not None:
                 self._run(stage)
             for ready in self._ready(final):
-                while start < self.rows and ready >= min(start + self.chunk, self.rows):
-                    stop = int(min(start + self.chunk, self.rows))
+                while start < self.length and ready >= min(start + self.chunk, self.length):
+                    stop = int(min(start + self.chunk, self.length))
                     made = self._decoded(start, stop, before, needed)
                     yield made if self.frames is None else made.slice(0, self.frames - start * TOKEN_FRAMES)
                     start, before = stop, made.slice(made.frames - 1)
@@ -207,7 +207,7 @@ class Rollout:
         Bodies of causal plans are decoded here, block by block, as they are in a live run.
         """
         if not self.world.causal:
-            yield self.rows if final >= self.rows else final - self._margins[1]
+            yield self.length if final >= self.length else final - self._margins[1]
             return
         for end in (min(self.reached, final), final):
             while (shown := self.first + self.world.finalized) < end:
@@ -305,7 +305,7 @@ class Rollout:
             given = self._given(low, high)
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
-            tokens = known_tokens(self.model, given, known, related, self._cuts(low, high, part))[:, part]
+            tokens = known_tokens(self.model, given, known, related, self._limits(low, high, part))[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             init_noise, mask_noise = self.noise.draw(last - self.stop)
             new = begin(tokens, init_noise, known[part], self.model.layout)
@@ -319,7 +319,7 @@ class Rollout:
         """Rows [low, high) of the recording, as far as they are known."""
         return mask_unknown(self.scene, self.known, low, high)
 
-    def _cuts(self, low: int, high: int, part: slice) -> Tensor | None:
+    def _limits(self, low: int, high: int, part: slice) -> Tensor | None:
         """Lookahead limits of some of the rows [low, high), counted from `low`; 0 for the others."""
         if self.limits is None:
             return None

@@ -24,11 +24,11 @@ class SamplingStats:
     runs: int = 0
     calls: int = 0
     scenes: int = 0
-    rows: int = 0  # windows that went through the network
+    windows: int = 0  # that went through the network
 
     @property
     def evaluations(self) -> float:
-        return self.rows / max(self.scenes, 1)
+        return self.windows / max(self.scenes, 1)
 
     def means(self) -> dict[str, float]:
         """Means over all that was added; `calls` is the mean of a run of the sampler."""
@@ -44,10 +44,10 @@ class SamplingStats:
         self.runs += 1
         self.scenes += scenes
 
-    def add_call(self, rows: int) -> None:
+    def add_call(self, windows: int) -> None:
         """The network runs on so many windows."""
         self.calls += 1
-        self.rows += rows
+        self.windows += windows
 
     def add_quantization_error(self, latent: Tensor, code: Tensor, counts: Tensor) -> None:
         """latent, code (B, n, P, C), counts (B, n, P) bool"""

@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet.checks import require_whole
 from magnet.generation.causal_bodies import own_view
 from magnet.generation.rollout import Rollout
-from magnet.motion.scene import Scene, cat_time, require_rate
+from magnet.motion.scene import Scene, cat_time, require_one, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Stage, initial_levels
@@ -43,8 +43,7 @@ def record(
     Raises:
         ValueError: several scenes, another frame rate than the model's, or whatever `generate` refuses.
     """
-    if scene.scenes != 1:
-        raise ValueError(f"got {scene.scenes} scenes, expected one; record each of scene.select([b])")
+    require_one(scene)
     require_rate(scene)
     require_whole("frames", frames, 1)
     require_whole("every", every, 1)

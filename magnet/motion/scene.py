@@ -325,3 +325,13 @@ def require_rate(scene: Scene, label: str = "the scene") -> None:
             f"{label} runs at {scene.fps:g} fps, the model at {FPS:g}: bring it there with "
             f"magnet export IN.npz OUT.npz --fps {FPS:g}, or magnet.export.resampled(scene, {FPS:g})"
         )
+
+
+def require_one(scene: Scene) -> None:
+    """Refuse a batch of several scenes, or of none.
+
+    Raises:
+        ValueError: B is not 1; says how to take one.
+    """
+    if scene.scenes != 1:
+        raise ValueError(f"got {scene.scenes} scenes, expected one; take each scene.select([b]) by itself")

@@ -89,7 +89,7 @@ class MaskSchedule:
 
     >>> grid = Grid(tokens=4, agents=2, context=2, steps=2)
     >>> plan = MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)  # go on from two known tokens
-    >>> for row in plan.rows():
+    >>> for row in plan.level_rows():
     ...     print(row[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step
     [0, 0, 1000, 1000]
     [0, 0, 500, 500]
@@ -161,7 +161,7 @@ class MaskSchedule:
             level[stage.start : stage.stop] = stage.levels[-1]
         return level
 
-    def rows(self) -> Iterator[Tensor]:
+    def level_rows(self) -> Iterator[Tensor]:
         """Levels of the whole grid before each denoising step and after the last, for pictures. (N, P) int each"""
         level = initial_levels(self.known)
         yield level.clone()

@@ -129,7 +129,7 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     size = (schedule.tokens, schedule.agents)
     _require(size == (grid.tokens, grid.agents), f"{place}: planned {size[0]} tokens of {size[1]} agents")
     _require(known.dtype == torch.bool, f"{place}: known is {known.dtype}, expected bool")
-    rows = torch.stack(list(schedule.rows()))
+    rows = torch.stack(list(schedule.level_rows()))
     rises = (rows.diff(dim=0) > 0).nonzero().tolist()
     _require(not rises, f"{place}: (step, token, agent) {rises[:1]} rises in level")
     _require((rows[:, known] == 0).all(), f"{place}: a known token is not clean throughout")
