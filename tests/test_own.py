@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from magnet import cli
 from magnet.body import load_body
 from magnet.body.joints import JOINT_NAMES, PARENTS
-from magnet.export.retime import resampled
+from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 from tests.export.strangers import NAMINGS, rerigged

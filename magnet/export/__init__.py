@@ -1,14 +1,14 @@
 """What leaves the project and comes back: moving and still pictures, and files other tools read and write."""
 
 from magnet.export.bvh import save_bvh
+from magnet.export.drawing import Camera
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.picture import contact_sheet, topview
 from magnet.export.retarget import load_bvh
-from magnet.export.retime import resampled
-from magnet.export.stage import Camera
 from magnet.export.video import render_video
+from magnet.motion.resample import resampled
 
 __all__ = [
     "Camera",

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.export.drawing import AGENTS, CONTEXT, Array, Canvas
 from magnet.export.figures import add_capsules, add_mesh, add_sticks
-from magnet.export.stage import AGENTS, CONTEXT, Array, Canvas
 from magnet.motion.scene import Scene
 
 Scenes = Scene | list[tuple[str, Scene]] | dict[str, Scene]

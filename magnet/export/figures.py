@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.export.drawing import BACKGROUND, Array, Canvas, View, strokes
 from magnet.export.limbs import CAPSULES, L_HEEL, L_TOE, R_HEEL, R_TOE, SIDE_TONE, STICKS, extended, limbs
-from magnet.export.stage import BACKGROUND, Array, Canvas, View, strokes
 
 
 def add_shadows(canvas: Canvas, joints: Array) -> None:

@@ -17,8 +17,9 @@ from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.retarget import load_bvh
-from magnet.export.retime import resampled, together
+from magnet.export.retime import together
 from magnet.files import load_npz
+from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 
 if TYPE_CHECKING:

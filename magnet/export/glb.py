@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.joints import JOINT_NAMES, PARENTS
-from magnet.export.stage import AGENTS
+from magnet.export.drawing import AGENTS
 from magnet.motion.scene import BODY_JOINTS, Scene, require_one
 from magnet.version import __version__
 

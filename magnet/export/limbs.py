@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magnet.export.stage import Array
+from magnet.export.drawing import Array
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,

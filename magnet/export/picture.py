@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from magnet.body.joints import L_HIP, PELVIS, R_HIP
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
-from magnet.export.stage import BACKGROUND, INK, PALE, TILE, Array, Camera, Size, font, plan_views
+from magnet.export.drawing import BACKGROUND, INK, PALE, TILE, Array, Camera, Size, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from magnet.export.stage import AGENTS, CONTEXT, INK, PALE, Colour, font
+from magnet.export.drawing import AGENTS, CONTEXT, INK, PALE, Colour, font
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import MaskSchedule, initial_levels
 

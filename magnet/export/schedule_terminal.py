@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.text import Text
 
+from magnet.export.drawing import AGENTS, INK, Colour
 from magnet.export.schedule import GIVEN, Key, Moment, agent_name, legend, mix, moments, thinned
-from magnet.export.stage import AGENTS, INK, Colour
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import MaskSchedule
 

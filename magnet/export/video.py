@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
+from magnet.export.drawing import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
 from magnet.export.figures import add_ghosts, add_shadows
-from magnet.export.stage import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
 from magnet.motion.scene import FPS, Scene
 
 Report = Callable[[int, int], None]

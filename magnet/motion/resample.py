@@ -90,3 +90,51 @@ def at_speed(scene: Scene, speed: float) -> Scene:
     return scene.replace(
         body_rot=turned[..., 1:, :, :], T_world_root=rigid(turned[..., 0, :, :], position), valid=valid
     )
+
+
+def resampled(scene: Scene, fps: float) -> Scene:
+    """The same motion at exact times t = i / fps: slerp between rotations, straight lines between positions.
+
+    A frame between two of which one is not valid is not valid; one between two of which one was not given to a model
+    was not given either.
+
+    Raises:
+        ValueError: the rate is not positive.
+
+    >>> from magnet.motion.scene import empty_scene
+    >>> resampled(empty_scene(1, 61, 2, like=torch.zeros(())), 15.0).frames
+    31
+    """
+    if not 0 < fps < math.inf:
+        raise ValueError(f"fps: got {fps:g}, expected more than 0")
+    if abs(fps - scene.fps) < 1e-6 * fps:
+        return scene
+    if not scene.frames:
+        return scene.replace(fps=float(fps))
+    frames = math.floor((scene.frames - 1) / scene.fps * fps + 1e-6) + 1
+    at = torch.arange(frames, dtype=torch.float64) * (scene.fps / fps)
+    low = (at + 1e-9).floor().long().clamp(max=scene.frames - 1)
+    high = (low + 1).clamp(max=scene.frames - 1)
+    share = (at - low).clamp(0.0, 1.0).to(scene.T_world_root)
+    share = torch.where(share < 1e-6, torch.zeros_like(share), share)  # a frame that is there comes back as it is
+    low, high = low.to(scene.device), high.to(scene.device)
+    place = scene.T_world_root[..., :3, 3]
+    moved = torch.lerp(place[:, low], place[:, high], share[:, None, None])
+    turned = _slerp_frames(scene.T_world_root[..., :3, :3], low, high, share)
+    exact = share == 0
+    valid = None if scene.valid is None else scene.valid[:, low] & (scene.valid[:, high] | exact)
+    given = None if scene.given is None else scene.given[:, low] & (scene.given[:, high] | exact[:, None])
+    body_rot = _slerp_frames(scene.body_rot, low, high, share)
+    return scene.replace(body_rot=body_rot, T_world_root=rigid(turned, moved), valid=valid, given=given, fps=float(fps))
+
+
+def _slerp_frames(rotation: Tensor, low: Tensor, high: Tensor, share: Tensor) -> Tensor:
+    """(B, T, ..., 3, 3) at fractional frames -> (B, frames, ..., 3, 3)"""
+    start = rotation[:, low]
+    between = share > 0
+    if not bool(between.any()):
+        return start
+    first = start[:, between]
+    part = share[between].reshape(1, -1, *[1] * (first.dim() - 4))
+    start[:, between] = slerp(first, rotation[:, high[between]], part)
+    return start

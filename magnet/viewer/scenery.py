@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from magnet.body.joints import PELVIS, TOES
+from magnet.export.drawing import SHADOW
 from magnet.export.page.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.export.page.rig import Array, Index, capsule
-from magnet.export.stage import SHADOW
 from magnet.viewer import marks
 
 AWAY, NO_SIZE = -50.0, 1e-6

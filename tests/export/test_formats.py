@@ -138,7 +138,7 @@ def test_the_open_body_is_the_default(duet: Scene, tmp_path: Path):
 
 def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, body: Body, tmp_path: Path, pixels_like):
     from magnet.export.cast import known_frames
-    from magnet.export.stage import CONTEXT
+    from magnet.export.drawing import CONTEXT
 
     given = torch.zeros(1, 12, 2, dtype=torch.bool)
     given[:, :6, 0] = True

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_glb
+from magnet.export.drawing import AGENTS
 from magnet.export.glb import influences, linear, unbroken, vertex_normals
-from magnet.export.stage import AGENTS
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 

@@ -12,8 +12,8 @@ from PIL import Image
 from magnet.body import Body
 from magnet.export import contact_sheet, topview
 from magnet.export.cast import STYLES, Style
+from magnet.export.drawing import AGENTS, CONTEXT
 from magnet.export.figures import bulged
-from magnet.export.stage import AGENTS, CONTEXT
 from magnet.motion.scene import Scene
 
 Count = Callable[[Image.Image, tuple[int, int, int]], int]

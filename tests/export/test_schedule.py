@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
+from magnet.export.drawing import AGENTS, CONTEXT
 from magnet.export.schedule import draw_schedule, moments, shade
 from magnet.export.schedule_terminal import schedule_text
-from magnet.export.stage import AGENTS, CONTEXT
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry

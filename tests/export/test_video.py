@@ -14,7 +14,7 @@ from PIL import Image
 from magnet.body import Body
 from magnet.export import Camera, render_video
 from magnet.export.cast import STYLES, Style
-from magnet.export.stage import AGENTS, CONTEXT, Canvas, plan_views, strokes
+from magnet.export.drawing import AGENTS, CONTEXT, Canvas, plan_views, strokes
 from magnet.export.video import Film
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene

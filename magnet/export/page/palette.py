@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.stage import AGENTS, TILES
+from magnet.export.drawing import AGENTS, TILES
 
 PALENESS = 0.58
 """How far the colour of given motion lies towards white."""

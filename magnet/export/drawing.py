@@ -1,4 +1,4 @@
-"""The stage that pictures are drawn on: camera, floor, shadows, and polygons painted from far to near.
+"""What pictures are drawn with: camera, floor, shadows, and polygons painted from far to near.
 
 Arrays here are numpy, world metres, y up. Nothing is random.
 """
