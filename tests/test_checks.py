@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from magnet.checks import require_number, require_whole, require_wholes
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import ddim_levels
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 

@@ -29,7 +29,8 @@ from magnet.motion.frames import canonical_frame, from_planar, inverse, to_plana
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import require_float32_scenes
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.grid import planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
 from magnet.tasks.base import Task

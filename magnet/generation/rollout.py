@@ -25,8 +25,9 @@ from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History

@@ -1,25 +1,14 @@
-"""The sizes that a task plans on, and how its plan is to be sampled."""
+"""The sizes that a task plans on, and how its plan is to be sampled: by default as `SamplerOptions` has it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from magnet.checks import require_choice, require_number, require_whole
-
-NoiseSampling = Literal["joint", "independent"]
-Spacing = Literal["even", "log_snr"]
-
-
-def require_spacing(spacing: str, shift: float) -> None:
-    """Raises ValueError where there is no such spacing, or where `shift` would be ignored."""
-    require_choice("spacing", spacing, Spacing)
-    require_number("shift", shift, over=0)
-    if spacing != "even" and shift != 1:
-        raise ValueError(f"shift: got {shift:g}, which moves even levels; leave it at 1, or take the spacing even too")
+from magnet.checks import require_choice, require_whole
+from magnet.sampling.options import NoiseSampling, SamplerOptions, Spacing, require_spacing
 
 
 @dataclass(frozen=True)
@@ -29,15 +18,13 @@ class Grid:
     tokens: int  # N
     agents: int  # P
     context: int  # recorded token steps at the start, 0 for generation from nothing
-    steps: int = 30  # denoising steps S, paper A.3
+    steps: int = SamplerOptions.steps  # denoising steps S
     window: int = 16  # token steps W that the model sees at once
-    stride: int = 4  # token steps finished before the window moves on
-    pyramid_offset: int | None = (
-        0  # denoising steps from a token to the next; 0: a stride together; None: see `token_offset`
-    )
-    shift: float = 1.0  # over 1: more of the denoising steps at high levels, see `magnet.sampling.noise.shifted`
-    noise_sampling: NoiseSampling = "joint"  # see `magnet.sampling.plans.token_levels`
-    spacing: Spacing = "even"  # of the levels that a token passes, or `log_snr`: see `magnet.sampling.noise`
+    stride: int = SamplerOptions.stride  # token steps finished before the window moves on
+    pyramid_offset: int | None = SamplerOptions.pyramid_offset  # steps between a token and the next, see `token_offset`
+    shift: float = SamplerOptions.shift  # see `magnet.sampling.noise.shifted`
+    noise_sampling: NoiseSampling = SamplerOptions.noise_sampling  # see `magnet.sampling.plans.token_levels`
+    spacing: Spacing = SamplerOptions.spacing  # of the levels that a token passes
 
     def __post_init__(self) -> None:
         for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
@@ -89,3 +76,9 @@ class Grid:
         mask = self.mask()
         mask[: self.context] = True
         return mask
+
+
+def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
+    """The grid that a task plans on: sizes in token steps, and how these options sample."""
+    o = options
+    return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)

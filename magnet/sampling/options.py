@@ -1,4 +1,4 @@
-"""Options of the sampler, and the grid that tasks plan on with them."""
+"""How scenes are sampled: the one place of the defaults."""
 
 from __future__ import annotations
 
@@ -7,14 +7,24 @@ from typing import Any, Literal
 
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.placement import Placement
-from magnet.sampling.grid import NoiseSampling, Spacing, require_spacing
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.presets import preset_fields
-from magnet.sampling.schedule import Grid
 from magnet.sampling.solvers import Solver
 
 Separation = Literal["off", "light", "firm"]
+
+
+NoiseSampling = Literal["joint", "independent"]
+Spacing = Literal["even", "log_snr"]
+
+
+def require_spacing(spacing: str, shift: float) -> None:
+    """Raises ValueError where there is no such spacing, or where `shift` would be ignored."""
+    require_choice("spacing", spacing, Spacing)
+    require_number("shift", shift, over=0)
+    if spacing != "even" and shift != 1:
+        raise ValueError(f"shift: got {shift:g}, which moves even levels; leave it at 1, or take the spacing even too")
 
 
 @dataclass(frozen=True)
@@ -96,9 +106,3 @@ class SamplerOptions:
         if "guidance" in said:
             said = {**said, "guidance": Guidance(**said["guidance"])}
         return cls(**{**said, **fields})
-
-
-def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
-    """The grid that a task plans on: sizes in token steps, and these options of the sampler."""
-    o = options
-    return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)

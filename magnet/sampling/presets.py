@@ -32,6 +32,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "noise_sampling": "joint",  # A.6.2
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
+        "apart": "off",  # the paper moves nobody out of another
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four; `paper`

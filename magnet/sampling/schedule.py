@@ -87,7 +87,7 @@ class MaskSchedule:
     Raises:
         ValueError: a law is broken; names the stage, step, token and agent.
 
-    >>> grid = Grid(tokens=4, agents=2, context=2, steps=2)
+    >>> grid = Grid(tokens=4, agents=2, context=2, steps=2, spacing="even")
     >>> plan = MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)  # go on from two known tokens
     >>> for row in plan.level_rows():
     ...     print(row[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step

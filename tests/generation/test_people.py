@@ -9,8 +9,9 @@ from magnet.generation.rollout import generate, stream
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import NoiseStream
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync

@@ -13,9 +13,10 @@ from magnet.generation.rollout import Rollout, generate, stream
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry

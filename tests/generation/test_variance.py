@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import NoiseStream, alpha_bar
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.tasks.joint import JointFuture
 

@@ -187,7 +187,7 @@ def test_smoothing_makes_samples_smoother(generator):
     from magnet.tasks.joint import JointFuture
 
     layout = TokenLayout(latent=4, agents=2)
-    grid = Grid(12, 2, 4, steps=10, window=12)
+    grid = Grid(12, 2, 4, steps=10, window=12, pyramid_offset=0, spacing="even")
     tokens = torch.randn(3, 12, 2, layout.width, generator=generator)
     there = torch.ones(3, 2, dtype=torch.bool)
 

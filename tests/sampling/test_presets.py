@@ -7,8 +7,9 @@ import torch
 
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.options import SamplerOptions, planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS, preset_name
 from magnet.tasks import registry
 from magnet.testing import tiny_denoiser

@@ -8,11 +8,11 @@ from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
 
 GRIDS = [
-    Grid(tokens=46, agents=2, context=8),
-    Grid(tokens=12, agents=3, context=8, steps=5),
-    Grid(tokens=20, agents=1, context=0, steps=3),
-    Grid(tokens=9, agents=4, context=1, steps=2, window=4, stride=2),
-    Grid(tokens=100, agents=2, context=1, steps=2),
+    Grid(tokens=46, agents=2, context=8, pyramid_offset=0),
+    Grid(tokens=12, agents=3, context=8, steps=5, pyramid_offset=0),
+    Grid(tokens=20, agents=1, context=0, steps=3, pyramid_offset=0),
+    Grid(tokens=9, agents=4, context=1, steps=2, window=4, stride=2, pyramid_offset=0),
+    Grid(tokens=100, agents=2, context=1, steps=2, pyramid_offset=0),
 ]
 
 
@@ -89,7 +89,8 @@ def test_a_lone_unknown_future_stays_at_pure_noise():
 
 
 def rolled(**options) -> MaskSchedule:
-    grid = Grid(**{"tokens": 24, "agents": 2, "context": 4, "steps": 6, "window": 8, "pyramid_offset": 2, **options})
+    sizes = {"tokens": 24, "agents": 2, "context": 4, "steps": 6, "window": 8, "pyramid_offset": 2, "spacing": "even"}
+    grid = Grid(**{**sizes, **options})
     return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 
@@ -232,7 +233,7 @@ def test_independent_levels_are_drawn_evenly():
     """500 steps leave about every second level, so a token's median is near the middle."""
     from magnet.sampling.plans import token_levels
 
-    levels = token_levels(Grid(16, 4, 0, steps=500, noise_sampling="independent"))
+    levels = token_levels(Grid(16, 4, 0, steps=500, noise_sampling="independent", spacing="even"))
     between = levels[1:-1].double() / 1000
     assert (between.mean() - 0.5).abs() < 0.01
     assert (between.std(dim=0) - 12**-0.5).abs().max() < 0.03

@@ -210,7 +210,8 @@ def check(
         pyramid_offset = steps // share if share else 0
         # Windows of blocks keep room for what lies ahead: everything is to stay in sight all the same.
         window = tokens if pyramid_offset else tokens + AHEAD
-        grid = Grid(tokens, people, context, steps, window=window, stride=1, pyramid_offset=pyramid_offset, shift=shift)
+        plan = {"pyramid_offset": pyramid_offset, "shift": shift, "spacing": "even"}
+        grid = Grid(tokens, people, context, steps, window=window, stride=1, **plan)
         schedule = task.schedule(grid)
         found.append(distribution(gaussian, schedule, values, eta, solver))
     (mean, coarse), (_, fine) = found
@@ -262,7 +263,8 @@ def test_levels_of_ones_own_sample_the_same_distributions_in_the_end(task):
     values = gaussian.mean + torch.randn(10, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     off = []
     for steps in (50, 500):
-        grid = Grid(TOKENS[2], 2, PAST, steps, window=5, stride=1, noise_sampling="independent")
+        plan = {"pyramid_offset": 0, "noise_sampling": "independent", "spacing": "even"}
+        grid = Grid(TOKENS[2], 2, PAST, steps, window=5, stride=1, **plan)
         schedule = task.schedule(grid)
         mean, covariance = distribution(gaussian, schedule, values)
         known, target = (m.flatten().nonzero()[:, 0] for m in (schedule.known, schedule.finished & ~schedule.known))

@@ -68,7 +68,8 @@ class Given:
 
 def covariance(world: Related, task: Task, steps: int) -> Tensor:
     """Of all numbers of the tokens that a task generates, with a past of zeros; nothing else is random."""
-    schedule = task.schedule(Grid(TOKENS, world.agents, PAST, steps, window=TOKENS + AHEAD, stride=1))
+    plan = {"pyramid_offset": 0, "spacing": "even"}
+    schedule = task.schedule(Grid(TOKENS, world.agents, PAST, steps, window=TOKENS + AHEAD, stride=1, **plan))
     G = world.agents
     size = TOKENS * world.agents * G
     noise = torch.zeros(2 * size, TOKENS, world.agents, world.layout.width, dtype=torch.float64)
