@@ -32,7 +32,8 @@ usage: magnet COMMAND [--option VALUE ...]
 
 {{commands}}
 
-  magnet COMMAND --help            every option of a command, and what it does
+  magnet COMMAND --help            what a command takes; fit, validate, test and predict tell more by topic:
+  magnet test --help TOPIC         model, data, task, sampler, trainer, all, or the name of a class or task
   magnet COMMAND --print_config    the configuration that would run, as YAML
   magnet --version
 

@@ -27,6 +27,9 @@ SHARING = ("model", "data")
 TRAINER = "Customize every aspect of training via flags"
 """Lightning's title over the Trainer's options."""
 
+CANDIDATES = r",\s+known\s+subclasses:\s[^)]*\)"
+"""Class paths that jsonargparse lists behind an option: a screen of them for the Trainer's."""
+
 REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
 
@@ -44,6 +47,7 @@ class Parser(LightningArgumentParser):
         self.classes: dict[str, dict[str, type]] = {}
         self.chosen: Mapping[str, str] = {}
         self.layers: list[str] = []
+        self.topic = ""
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Namespace | None = None, **kwargs: Any
@@ -59,20 +63,58 @@ class Parser(LightningArgumentParser):
         return super().parse_args(args, namespace, **kwargs)
 
     def format_help(self, *args: Any, **kwargs: Any) -> str:
-        """Every option: first what a run has in all cases, then the fields of each class."""
+        """What a run has in all cases and which topics there are; or one topic; or all of it (`TOPICS`)."""
         if not self.command:
             return super().format_help(*args, **kwargs)
+        for key, classes in self.classes.items():
+            if self.topic in classes:
+                return re.sub(CANDIDATES, ")", _fields_help(key, self.topic, classes[self.topic], set()))
         self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
         for key in self.classes:
             self._name_choices(key)
-        longest_last = sorted(self._action_groups, key=lambda group: (group.title or "").startswith(TRAINER))
-        self._action_groups = longest_last
-        parts = [super().format_help(*args, **kwargs)]
-        for key, classes in self.classes.items():
-            shared: set[str] = set()
-            for name, kind in classes.items():
+        for action in self._actions:
+            if action.option_strings and action.option_strings[0].endswith(".help"):
+                action.help = argparse.SUPPRESS  # of classes that Lightning brings
+        everything = self._action_groups
+        shown = sorted(everything, key=lambda group: (group.title or "").startswith(TRAINER))
+        if self.topic != "all":
+            shown = [group for group in shown if _topic_of(group) == self.topic]
+        self._action_groups = shown
+        parts = [super().format_help(*args, **kwargs)] if shown else []
+        self._action_groups = everything
+        if not self.topic:
+            parts.append(self._topics())
+        for key in self.classes:
+            if self.topic in (key, "all"):
+                parts += self._classes_help(key, whole=self.topic == "all")
+        return re.sub(CANDIDATES, ")", "\n".join(parts))
+
+    def topics(self) -> dict[str, str]:
+        """What stands behind `--help`, and what it tells."""
+        found = {key: f"the fields of --{key}.FIELD VALUE; of one class alone by its name" for key in self.classes}
+        if "task" in self.classes:
+            found["sampler"] = "how scenes are sampled"
+        return found | {"trainer": "Lightning's Trainer", "all": "everything at once"}
+
+    def _topics(self) -> str:
+        width = max(map(len, self.topics()))
+        lines = [f"  magnet {self.command} --help {name:<{width}}  {what}" for name, what in self.topics().items()]
+        names = ", ".join(name for classes in self.classes.values() for name in list(classes)[:2])
+        return "\n".join(["more help:", *lines, f"  magnet {self.command} --help NAME, such as {names}", ""])
+
+    def _classes_help(self, key: str, whole: bool) -> list[str]:
+        """The fields of each class under a key. Of many data sets, in short: those of the first, and what each is."""
+        parts: list[str] = []
+        shared: set[str] = set()
+        for name, kind in self.classes[key].items():
+            if key == "data" and parts and not whole:
+                first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
+                parts.append(f"--{key} {name}: {first}")
+            else:
                 parts.append(_fields_help(key, name, kind, shared if key in SHARING else set()))
-        return "\n".join(parts)
+        if key == "data" and not whole:
+            parts.append(f"\nThe fields of one of these: magnet {self.command} --help NAME\n")
+        return parts
 
     def _name_choices(self, key: str) -> None:
         """Head a group by what can be chosen, in place of class paths and of what base classes say of themselves."""
@@ -86,7 +128,7 @@ class Parser(LightningArgumentParser):
                     path = (action.default.get("class_path") or action.default["name"]) if action.default else ""
                     default = f"; default: {path.rpartition('.')[2]}" if path else ""
                     group.title = f"--{key} NAME"
-                    group.description = f"One of {names}{default}. What each is and its --{key}.FIELD VALUE is below."
+                    group.description = f"One of {names}{default}. Fields are --{key}.FIELD VALUE."
 
     def explain(self, key: str, value: str, text: str) -> None:
         """Say of an option that is a group of others what else may stand behind it."""
@@ -143,6 +185,12 @@ class Parser(LightningArgumentParser):
                 if chosen is None or chosen.rpartition(".")[2] == name:
                     flags.extend(f"--{option}" for option in _options(key, kind))
         return flags
+
+
+def _topic_of(group: Any) -> str:
+    """The topic of help that a group of options belongs to; empty for what every run has."""
+    flags = [flag for action in group._group_actions for flag in action.option_strings]
+    return next((name for name in ("trainer", "sampler") if any(flag.startswith(f"--{name}") for flag in flags)), "")
 
 
 def _closest(name: str, known: list[str]) -> str:

@@ -30,6 +30,7 @@ class Request:
         folder: of this run.
         classes: those that the layers and flags name under `model` and `data`.
         task: what is sampled, by commands that sample.
+        topic: of help, where that is asked for.
     """
 
     command: str
@@ -39,6 +40,7 @@ class Request:
     folder: Path = Path()
     classes: dict[str, str] = field(default_factory=dict)
     task: TaskChoice | None = None
+    topic: str = ""
 
 
 def read_request(command: str, arguments: list[str], models: dict[str, str]) -> Request:

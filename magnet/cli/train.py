@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import logging
 import os
 import warnings
@@ -16,7 +17,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import weights
 from magnet.cli import checkpoint_config, class_options, outputs, run_folder
-from magnet.cli.errors import CommandError
+from magnet.cli.errors import CommandError, no_such
 from magnet.cli.parser import Parser
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request
 from magnet.cli.tasks import TaskChoice
@@ -52,8 +53,8 @@ def run_trainer(command: str, arguments: list[str]) -> int:
         CommandError: something the user can put right.
     """
     quiet()
-    if any(flag in ("-h", "--help") for flag in arguments):
-        MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {})))
+    if (topic := help_topic(arguments)) is not None:
+        MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {}), topic=topic))
         return 0
     named_classes()
     request = read_request(command, arguments, MODELS)
@@ -61,6 +62,15 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     with writing(request.folder, f"choose another --out{goes_on}"):
         MagnetCLI(request)
     return 0
+
+
+def help_topic(arguments: list[str]) -> str | None:
+    """What help is asked for: `--help TOPIC`, empty for `--help` alone; None where none is."""
+    for argument, after in itertools.pairwise([*arguments, "-"]):
+        name, equals, value = argument.partition("=")
+        if name in ("-h", "--help"):
+            return value if equals else "" if after.startswith("-") else after
+    return None
 
 
 def named_classes() -> tuple[dict[str, type], dict[str, type]]:
@@ -118,7 +128,7 @@ class MagnetCLI(LightningCLI):
         assert isinstance(parser, Parser)
         Parser.root, parser.command, parser.arguments = parser, self.command, self.request.flags
         parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.request.classes
-        parser.layers = self.request.layers
+        parser.layers, parser.topic = self.request.layers, self.request.topic
         self._default_class(parser, "data", registry.default_path())
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
         parser.add_argument(
@@ -157,6 +167,10 @@ class MagnetCLI(LightningCLI):
                 default=False,
                 help='open the first scenes in the browser; needs pip install "magnet-motion[view]"',
             )
+
+        known = [*parser.topics(), *(name for classes in parser.classes.values() for name in classes)]
+        if parser.topic and parser.topic not in known:
+            raise CommandError(no_such("help topic", parser.topic, known, f"magnet {self.command} --help"))
 
     def _default_class(self, parser: Parser, key: str, otherwise: str | None) -> None:
         """Make the class that wins the default, so that no other class's defaults come first."""

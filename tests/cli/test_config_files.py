@@ -104,7 +104,7 @@ def test_a_wrong_preset_in_a_file_suggests_the_closest(toy: Path, capsys: pytest
 
 
 def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["test", "--help"]) == 0
+    assert cli.main(["test", "--help", "sampler"]) == 0
     assert "--sampler PRESET      default or steady or paper, or a file" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         view.arguments_of(["--help"])

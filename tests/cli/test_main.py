@@ -13,7 +13,7 @@ import torch
 from magnet import __version__, cli
 from magnet.cli import train
 from magnet.cli.errors import CommandError
-from magnet.cli.main import COMMANDS, usage
+from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, usage
 from magnet.datamodules import registry
 from tests import toys
 from tests.toys import OtherData, ToyData
@@ -90,7 +90,7 @@ def test_tasks_are_listed_with_what_they_sample(capsys: pytest.CaptureFixture[st
 
 
 def test_fit_help_explains_every_field(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["fit", "--help"]) == 0
+    assert cli.main(["fit", "--help", "all"]) == 0
     text = capsys.readouterr().out
     for field, meaning in {"--model.lr": "step size", "--data.takes": "how many", "--out": "folder of the run"}.items():
         assert field in text
@@ -99,10 +99,34 @@ def test_fit_help_explains_every_field(toy: Path, capsys: pytest.CaptureFixture[
 
 def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["test", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "--sampler.steps" in text
-    assert "--samples" in text
-    assert "--task joint_future: " in text
+    assert "--samples" in capsys.readouterr().out
+    assert cli.main(["test", "--help", "sampler"]) == 0
+    assert "--sampler.steps" in capsys.readouterr().out
+    assert cli.main(["test", "--help=task"]) == 0
+    assert "--task joint_future: " in capsys.readouterr().out
+    assert cli.main(["test", "--help", "OtherData"]) == 0
+    assert re.findall(r"--data\.(\w+) ", capsys.readouterr().out) == ["root", "takes", "window_frames", "max_agents"]
+
+
+@pytest.mark.parametrize("command", TRAINER_COMMANDS)
+def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    """Every field is told in some topic, or in that of its class; together they tell what `--help all` tells."""
+
+    def told(*topic: str) -> str:
+        assert cli.main([command, "--help", *topic]) == 0
+        return capsys.readouterr().out
+
+    first = told()
+    topics = re.findall(rf"^  magnet {command} --help ([a-z]+) ", first, re.MULTILINE)
+    assert {"model", "data", "trainer", "all"} <= set(topics)
+    assert {"task", "sampler"} <= set(topics) or command in ("fit", "validate")
+    texts = [first, *(told(topic) for topic in topics if topic != "all")]
+    assert max(len(text.splitlines()) for text in texts) < 300
+    names = list(registry.classes())
+    fields = set(re.findall(r"^ +(--[\w.]+)", "".join([*texts, *map(told, names)]), re.MULTILINE))
+    assert set(re.findall(r"^ +(--[\w.]+)", told("all"), re.MULTILINE)) <= fields
 
 
 @pytest.mark.parametrize(
@@ -110,6 +134,7 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
     [
         (["fti"], "did you mean fit?"),
         (["xyzzy"], "there are fit, validate"),
+        (["test", "--help", "modle"], "no help topic modle; did you mean model?"),
         (["test", "--task", "joint_futur"], "did you mean joint_future?"),
         (["test", "--task=nothing_like_it"], "There are "),
         (["fit"], "say which model: --model ToyModel"),
