@@ -98,7 +98,9 @@ def test_lists_of_whole_numbers_show_how_they_are_written():
 
 
 def test_too_many_denoising_steps_name_how_many_work():
-    with pytest.raises(ValueError, match="500 with a shift of 3 pass the same of 1000 levels twice; take 335 or fewer"):
+    with pytest.raises(
+        ValueError, match="500 with a shift of 3 would use the same of 1000 levels twice; take 335 or fewer"
+    ):
         ddim_levels(500, 3.0)
     for steps in (334, 335):
         levels = ddim_levels(steps, 3.0)

@@ -41,7 +41,7 @@ def require_people(schedule: MaskSchedule, scene: Scene) -> None:
         if bool(agents.any()) and lacking:
             slots = ", ".join(str(slot) for slot in agents.nonzero()[:, 0].tolist())
             raise ValueError(
-                f"{label(scene, lacking[0])} has nobody in slot {slots}, of whom the task wants somebody to be {what}: "
+                f"{label(scene, lacking[0])} has nobody in slot {slots}, where the task needs somebody to be {what}: "
                 "choose other slots for the task, or scenes with people in these"
             )
 

@@ -29,7 +29,7 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
     """
     model.require_tokenizer()
     if not model.normalizer.ready:
-        raise ValueError("the denoiser has never been trained: its statistics are not set; load a checkpoint")
+        raise ValueError("the denoiser is not trained: its normalizer is not fitted; load a checkpoint")
     require_whole("context", context, 0)
     if context % TOKEN_FRAMES:
         raise ValueError(

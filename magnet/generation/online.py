@@ -32,7 +32,7 @@ class OnlineRollout(Rollout):
         generator: source of randomness, on the model's device.
 
     Raises:
-        ValueError: the task reads ahead, or its plan does not repeat itself; the model was trained with pairwise
+        ValueError: the task looks ahead, or its plan is not periodic; the model was trained with pairwise
             transforms that tell of people who are not known; or a past that `magnet.generation.inputs` refuses.
     """
 
@@ -49,8 +49,8 @@ class OnlineRollout(Rollout):
         model.require_tokenizer()
         if model.layout.pairwise_noise == "token":
             raise ValueError(
-                "pairwise_noise='token': tokens of those who are given tell where the others are, and nobody knows "
-                "that live; train with pairwise_noise='noisier_end'"
+                "pairwise_noise='token': given tokens hold where the others are, which is not known "
+                "live; train with pairwise_noise='noisier_end'"
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)

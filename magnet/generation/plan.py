@@ -76,9 +76,13 @@ def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> t
     name = type(task).__name__
     later = longer.known[grid.context :]
     if bool(later.any()) and not online:
-        raise ValueError(f"{name} is given something after the context, so it has an end: say how many frames")
+        raise ValueError(
+            f"{name} is given something after the context, so it cannot be endless: give the number of frames"
+        )
     if bool(later.any()) and (longer.lookahead or bool((later != later[0]).any())):
-        raise ValueError(f"{name}: what it is given later cannot be fed as it happens, for it is read ahead")
+        raise ValueError(
+            f"{name}: what it is given later cannot be fed as it happens, because the task looks ahead at it"
+        )
     pairs = itertools.takewhile(lambda pair: _moved(*pair) == 0, zip(long.stages, longer.stages, strict=False))
     stages = [stage for stage, _ in pairs]
     for period in range(1, len(stages) // 3 + 1):
@@ -87,7 +91,7 @@ def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> t
         earlier = stages[-3 * period : -period]
         if shift > 0 and all(_moved(*pair) == shift for pair in zip(earlier, late, strict=True)):
             return long, _repeated(stages, period, shift, long.causal)
-    raise ValueError(f"{name}: its plan does not repeat itself, so it needs an end: say how many frames")
+    raise ValueError(f"{name}: its plan is not periodic, so it cannot be endless: give the number of frames")
 
 
 def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Plan:

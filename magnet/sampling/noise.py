@@ -115,7 +115,7 @@ def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
         most = next(more for more in range(steps) if _levels(more + 1, shift, K) is None)
         advice = f"take {most} or fewer, or a shift nearer to 1" if most else "take a shift nearer to 1"
         raise ValueError(
-            f"denoising steps: {steps} with a shift of {shift:g} pass the same of {K} levels twice; {advice}"
+            f"denoising steps: {steps} with a shift of {shift:g} would use the same of {K} levels twice; {advice}"
         )
     return levels
 

@@ -24,7 +24,9 @@ def require_spacing(spacing: str, shift: float) -> None:
     require_choice("spacing", spacing, Spacing)
     require_number("shift", shift, over=0)
     if spacing != "even" and shift != 1:
-        raise ValueError(f"shift: got {shift:g}, which moves even levels; leave it at 1, or take the spacing even too")
+        raise ValueError(
+            f"shift: got {shift:g}, which changes the spacing even only; leave shift at 1, or set spacing to even"
+        )
 
 
 @dataclass(frozen=True)

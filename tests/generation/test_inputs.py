@@ -254,7 +254,7 @@ def test_counts_that_are_none_are_named(numbers, message, model, duet):
 
 def test_a_model_that_was_never_trained_is_refused(duet):
     model = Denoiser(tokenizer="raw", network={"width": 16, "layers": 1, "heads": 2})
-    with pytest.raises(ValueError, match="never been trained"):
+    with pytest.raises(ValueError, match="denoiser is not trained"):
         WAYS["generate"](model, duet)
 
 

@@ -300,7 +300,7 @@ def test_a_plan_that_does_not_repeat_itself_needs_an_end():
             plan = super().schedule(grid)
             return type(plan)(plan.tokens, plan.agents, plan.stages[:1], plan.known)
 
-    with pytest.raises(ValueError, match="does not repeat itself"):
+    with pytest.raises(ValueError, match="is not periodic"):
         periodic_plan(Odd(), Grid(4, 3, 2, 2, 8, 2), 3)
 
 
