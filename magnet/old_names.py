@@ -137,6 +137,8 @@ STATE = [
     (r"(^|\.)transformer\.leave\.", r"\1transformer.out_proj."),
     (r"((?:^|\.)vqvae\..*)\.look\.", r"\1.conv."),
     (r"((?:^|\.)vqvae\..*)\.mix\.", r"\1.proj."),
+    (r"((?:^|\.)vqvae)\.steps\.", r"\1.deltas."),
+    (r"(^|\.)posterior\.log_step_", r"\1posterior.log_delta_"),
     (r"(^|\.)codebook\.started$", r"\1quantizer.initialized"),
     (r"(^|\.)codebook\.", r"\1quantizer."),
 ]

@@ -59,7 +59,7 @@ def test_guidance_and_smoothing_take_a_double_model(kind):
 def test_statistics_and_codes_keep_every_bit(dtype):
     model, other = tiny_denoiser(2), tiny_denoiser(2).to(dtype)
     kept = [name for name, module in model.named_modules() if isinstance(module, Float32)]
-    assert {name.split(".")[-1] for name in kept} == {"pose", "steps", "betas", "quantizer", "normalizer"}
+    assert {name.split(".")[-1] for name in kept} == {"pose", "deltas", "betas", "quantizer", "normalizer"}
     for name in kept:
         theirs = other.get_submodule(name).state_dict()
         for key, value in model.get_submodule(name).state_dict().items():

@@ -24,7 +24,7 @@ WITHIN_REACH = 0.4
 """Metres: only wrists that were recorded nearer to each other than this count in `hands`."""
 
 Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""latent (B, N, P, C), betas (B, P, 10), steps (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
+"""latent (B, N, P, C), betas (B, P, 10), deltas (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
 Joints = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Forward kinematics: body_rot, T_frame_root, betas -> joints (..., 22, 3) in that frame"""
 
@@ -61,9 +61,9 @@ def decoded_losses(
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
     people, true_pose = few.present, pose_features(few)
 
-    def decode(latent: Tensor, betas: Tensor, steps: Tensor) -> Tensor:
+    def decode(latent: Tensor, betas: Tensor, deltas: Tensor) -> Tensor:
         """Poses of those who are there; empty slots, half of them or more, cost nothing and stay as they are."""
-        by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, steps)]
+        by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, deltas)]
         with torch.autocast(kind, dtype, half):  # only networks may run in half precision
             decoded = tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
         return true_pose.transpose(1, 2).index_put((people,), decoded).transpose(1, 2)
@@ -121,17 +121,17 @@ def body_losses(
         the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres. hands: error
         of the vectors from one's own wrists to a partner's that were recorded within reach, metres.
     """
-    latent, steps, pairs = layout.unpack(tokens)
-    _, true_steps, true_pairs = layout.unpack(truth)
+    latent, deltas, pairs = layout.unpack(tokens)
+    _, true_deltas, true_pairs = layout.unpack(truth)
     shape = betas[:, None]
-    mine = joints(*matrices(decode(latent, betas, steps)), shape)  # (B, T, P, 22, 3)
+    mine = joints(*matrices(decode(latent, betas, deltas)), shape)  # (B, T, P, 22, 3)
     real = joints(*matrices(true_pose), shape)
     weight = signal.repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
     counts = there.repeat_interleave(TOKEN_FRAMES, dim=1)
     own = counts[..., 0]
     losses = {"joint": masked_mean(weight * _mean_length(mine - real), own)}
 
-    velocity = world_velocity(mine, by_frame(steps)) - world_velocity(real, by_frame(true_steps))
+    velocity = world_velocity(mine, by_frame(deltas)) - world_velocity(real, by_frame(true_deltas))
     both = own[:, 1:] & own[:, :-1]
     losses["velocity"] = masked_mean(weight[:, 1:] * _mean_length(FPS * velocity), both)
     if layout.slots:

@@ -17,7 +17,7 @@ def snr_weights(levels: Tensor, gamma: float) -> Tensor:
     """Weight of a predicted clean number by its noise level: min(SNR, gamma), SNR = a / (1 - a) of a = `alpha_bar`.
 
     The min-SNR weighting for a network that predicts x0 (Hang et al. 2023, Efficient diffusion training via min-SNR
-    weighting strategy, Sec. 3.4, with gamma 5): what noise has drowned cannot be told, and at SNR 0 counts nothing.
+    weighting strategy, Sec. 3.4, with gamma 5): what noise hides cannot be told, and counts nothing at SNR 0.
     levels (...) int -> (...)
     """
     signal = alpha_bar(levels)
@@ -31,15 +31,15 @@ def token_losses(
 
     clean, truth (B, N, P, D) normalized; there (B, N, P, 1 + slots) bool, which groups speak of people
     who are there in valid frames; weights (B, N, P, 1 + slots) of each group's error, None: all 1. 512 latent numbers
-    against 36 P transforms: one common mean would drown the transforms.
+    against 36 P transforms: in one common mean the transforms would hardly count.
     """
     error = F.smooth_l1_loss(clean, truth, reduction="none")
     if weights is not None:
         error = error * layout.spread(weights)
-    latent, steps, pairs = layout.unpack(error)
+    latent, deltas, pairs = layout.unpack(error)
     losses = {
         "latent": masked_mean(latent, there[..., :1]),
-        "delta": masked_mean(steps.flatten(-2), there[..., :1]),
+        "delta": masked_mean(deltas.flatten(-2), there[..., :1]),
     }
     if layout.slots:
         losses["pairwise"] = masked_mean(pairs.flatten(-2), there[..., 1:, None])
@@ -47,7 +47,7 @@ def token_losses(
 
 
 def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tuple[Tensor, Tensor]:
-    """How far predicted pairwise transforms are from what the predicted steps make of them (Eq. 11).
+    """How far predicted pairwise transforms are from what the predicted deltas make of them (Eq. 11).
 
     Per frame, across token borders, where it holds exactly on real motion. tokens (B, N, P, D) in real
     units; there as in `token_losses`. -> rotation (1 - cos of the angle), translation (Huber, metres).
@@ -55,8 +55,8 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     numbers and ground vectors.
     """
     P = layout.agents
-    _, steps, pairs = layout.unpack(tokens)
-    turn, shift = unit_ground(by_frame(steps))  # (B, T, P, 2) each
+    _, deltas, pairs = layout.unpack(tokens)
+    turn, shift = unit_ground(by_frame(deltas))  # (B, T, P, 2) each
     pair_turn, pair_shift = unit_ground(pairwise_by_frame(pairs))  # (B, T, P, P - 1, 2)
     partner = partners(P, tokens.device)
     own_turn, own_shift = turn[:, 1:, :, None], shift[:, 1:, :, None]
@@ -68,7 +68,7 @@ def consistency_losses(tokens: Tensor, layout: TokenLayout, there: Tensor) -> tu
     expected_shift = rotate_by(conjugate(own_turn), moved)
     rotation = 1 - (expected_turn * pair_turn[:, 1:]).sum(-1)
     translation = F.smooth_l1_loss(expected_shift, pair_shift[:, 1:], reduction="none").sum(-1)
-    frames = there[..., 1:].repeat_interleave(steps.shape[-2], dim=1)
+    frames = there[..., 1:].repeat_interleave(deltas.shape[-2], dim=1)
     both = frames[:, 1:] & frames[:, :-1]
     return masked_mean(rotation, both), masked_mean(translation, both)
 
@@ -84,7 +84,7 @@ def near_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, 
     """Error of pairwise transforms where centimetres near a partner count (ours).
 
     Metres over the ground, divided by `NEAR` + the recorded distance, and the same of radians; each weighted by the
-    share of signal that was shown, for what noise has drowned is a matter of chance.
+    share of signal that was shown, for what noise hides is a matter of chance.
 
     clean, truth (B, N, P, D) in real units, there as in `token_losses`, levels (B, N, P, 1 + slots) of the groups -> ()
     """

@@ -1,4 +1,4 @@
-"""The most likely pairwise transforms, given what is shown of them, the predicted steps and the network's own guess."""
+"""The most likely pairwise transforms, given what is shown of them, the predicted deltas and the network's guess."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class PairwisePosterior(nn.Module):
     """Replaces the pairwise transforms that a network predicts by their posterior mean in closed form.
 
     A network returns a pairwise transform worse than it was shown it, while its deltas are good to millimetres. So what
-    is shown (noisy, with the variance that its level tells) is carried along the predicted steps to every other frame,
+    is shown (noisy, with the variance that its level tells) is carried along the predicted deltas to every other frame,
     and fused by precision with the network's own prediction as one more observation.
 
     Args:
         layout: what a token holds; with pairwise transforms.
 
     Its parameters, learnt or measured, are logarithms of standard deviations at `KNOTS` levels from 0 to K: of the
-    network's own pairwise transforms (metres, radians), and of the predicted steps, a frame.
+    network's own pairwise transforms (metres, radians), and of the predicted deltas, a frame.
     """
 
     def __init__(self, layout: TokenLayout) -> None:
@@ -41,8 +41,8 @@ class PairwisePosterior(nn.Module):
         ramp = torch.linspace(0, 1, KNOTS)
         self.log_pair_ground = nn.Parameter((0.25 + 0.1 * ramp).log())
         self.log_pair_yaw = nn.Parameter(torch.full((KNOTS,), 0.5).log())
-        self.log_step_ground = nn.Parameter(torch.full((KNOTS,), 0.006).log())
-        self.log_step_yaw = nn.Parameter(torch.full((KNOTS,), 0.015).log())
+        self.log_delta_ground = nn.Parameter(torch.full((KNOTS,), 0.006).log())
+        self.log_delta_yaw = nn.Parameter(torch.full((KNOTS,), 0.015).log())
 
     def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Tensor:
         """The same prediction with better pairwise transforms.
@@ -59,20 +59,20 @@ class PairwisePosterior(nn.Module):
         """
         layout = self.layout
         group_levels = layout.group_levels(levels)
-        latent, steps, predicted = layout.unpack(normalizer.denormalize(clean))
+        latent, deltas, predicted = layout.unpack(normalizer.denormalize(clean))
         shown = shown_clean(noisy, group_levels, layout, normalizer)
-        _, shown_steps, shown_pairs = layout.unpack(shown)
+        _, shown_deltas, shown_pairs = layout.unpack(shown)
         known = (levels == 0)[..., None, None]
-        steps = torch.where(known, shown_steps, steps)
-        fused = self._fused(steps, predicted, shown_pairs, group_levels, present, normalizer)
-        packed = normalizer.normalize(layout.pack(latent, steps, fused.to(clean.dtype)))
+        deltas = torch.where(known, shown_deltas, deltas)
+        fused = self._fused(deltas, predicted, shown_pairs, group_levels, present, normalizer)
+        packed = normalizer.normalize(layout.pack(latent, deltas, fused.to(clean.dtype)))
         pairs = layout.group_present(present)
         pairs = torch.cat([torch.zeros_like(pairs[..., :1]), pairs[..., 1:]], dim=-1)[:, None]
         return torch.where(layout.spread(pairs), packed, clean)
 
     def _fused(
         self,
-        steps: Tensor,
+        deltas: Tensor,
         predicted: Tensor,
         shown: Tensor,
         group_levels: Tensor,
@@ -80,16 +80,16 @@ class PairwisePosterior(nn.Module):
         normalizer: Normalizer,
     ) -> Tensor:
         """Posterior means in 9-D, as tokens hold them. -> (B, N, P, P - 1, 4, 9)"""
-        step = yaw_ground(by_frame(steps))
+        step = yaw_ground(by_frame(deltas))
         own = group_levels[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
         pair_levels = group_levels[..., 1:].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P, P - 1)
         there = self.layout.group_present(present)[:, None, :, 1:]
-        steps_known = own == 0
-        step_ground = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_ground, own)))
-        step_yaw = precision(torch.where(steps_known, SHARPEST, self._at(self.log_step_yaw, own)))
-        # Where the window stands in the world is arbitrary: the first frame's steps tie nobody to anything.
-        first = torch.zeros_like(step_yaw[:, :1])
-        step_yaw, step_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (step_yaw, step_ground))
+        deltas_known = own == 0
+        delta_ground = precision(torch.where(deltas_known, SHARPEST, self._at(self.log_delta_ground, own)))
+        delta_yaw = precision(torch.where(deltas_known, SHARPEST, self._at(self.log_delta_yaw, own)))
+        # Where the window stands in the world is arbitrary: the first frame's deltas tie nobody to anything.
+        first = torch.zeros_like(delta_yaw[:, :1])
+        delta_yaw, delta_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (delta_yaw, delta_ground))
         guess = yaw_ground(pairwise_by_frame(predicted))
         seen = yaw_ground(pairwise_by_frame(shown))
         ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, normalizer)
@@ -106,9 +106,9 @@ class PairwisePosterior(nn.Module):
         start = heading_at_start(yaw, step[0], total_yaw, present.int().argmax(dim=1))
         zero = torch.zeros_like(start)[..., None].expand(*start.shape, 2)
         solved_yaw, solved = solve_pose_graph(
-            Planar(*step, step_yaw, step_ground), Planar(yaw, ground, total_yaw, total), start, zero
+            Planar(*step, delta_yaw, delta_ground), Planar(yaw, ground, total_yaw, total), start, zero
         )
-        partner = partners(self.layout.agents, steps.device)
+        partner = partners(self.layout.agents, deltas.device)
         apart = solved_yaw[:, :, partner] - solved_yaw[..., None]
         away = rotate_ground(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
         return pairwise_by_token(nine_of(apart, away))
@@ -146,15 +146,15 @@ def precision(deviation: Tensor) -> Tensor:
     return deviation.double().square().reciprocal()
 
 
-def heading_at_start(yaw: Tensor, step_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
+def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
     """Headings at the start that fit pairwise headings roughly, so that what is left is far from a half turn.
 
-    yaw, weight (B, T, P, P - 1), step_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
+    yaw, weight (B, T, P, P - 1), delta_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
     anchor
     """
     B, _, P, _ = yaw.shape
     scene, partner = torch.arange(B, device=yaw.device), partners(P, yaw.device)[anchor]  # (B, P - 1)
-    along = step_yaw.cumsum(dim=1)
+    along = delta_yaw.cumsum(dim=1)
     others = along.gather(2, partner[:, None].expand(-1, along.shape[1], -1))
     offset = yaw[scene, :, anchor] - others + along[scene, :, anchor][..., None]  # (B, T, P - 1)
     w = weight[scene, :, anchor]

@@ -71,9 +71,9 @@ def with_self_forcing(
     noisy = add_noise(truth[few], noise, layout.spread(layout.group_levels(renoised)))
     restored = denoise(noisy, renoised, scene.present[few], None if cond is None else cond[few]).float()
     with torch.autocast(truth.device.type, enabled=False):
-        latent, steps, _ = layout.unpack(normalizer.denormalize(restored))
-        own = by_frame(past[..., None, None].expand(*past.shape, steps.shape[-2], 1))[..., 0]  # (b, T, P)
-        T_prev_can = project_se2(from_9d(by_frame(steps)))
+        latent, deltas, _ = layout.unpack(normalizer.denormalize(restored))
+        own = by_frame(past[..., None, None].expand(*past.shape, deltas.shape[-2], 1))[..., 0]  # (b, T, P)
+        T_prev_can = project_se2(from_9d(by_frame(deltas)))
         T_prev_can[:, 0] = torch.eye(4, device=truth.device)
         placed = place(
             T_prev_can,

@@ -25,12 +25,12 @@ def token_statistics(
         there: (B, N, P, 1 + slots) bool, which groups count.
         pairwise_metres: metres that count as one over the ground in pairwise transforms; 0: their standard deviation.
     """
-    latent, steps, pairs = layout.unpack(tokens.double())
+    latent, deltas, pairs = layout.unpack(tokens.double())
     own = there[..., 0]
     latent_scale = latent[own].square().mean().sqrt().clamp_min(1e-6)
     means = [torch.zeros(layout.latent, device=tokens.device)]
     stds = [latent_scale.expand(layout.latent)]
-    for values, repeats in ((steps[own], 1), (pairs[there[..., 1:]], layout.slots)):
+    for values, repeats in ((deltas[own], 1), (pairs[there[..., 1:]], layout.slots)):
         flat = values.reshape(-1, 9)
         known = len(flat) > 1
         mean = flat.mean(0) if known else torch.zeros(9, device=tokens.device)

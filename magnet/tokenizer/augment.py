@@ -59,23 +59,23 @@ def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene
     )
 
 
-def root_noise(steps: Tensor, speed: float, generator: torch.Generator) -> Tensor:
-    """Steps that lead people astray over the ground, slowly and each in another way, as sampled steps do.
+def root_noise(deltas: Tensor, speed: float, generator: torch.Generator) -> Tensor:
+    """Deltas with a slow error over the ground, of each person its own, as sampled ones have it.
 
     Args:
-        steps: (B, T, P, 9) canonical steps.
+        deltas: (B, T, P, 9) canonical deltas.
         speed: each person's standard deviation in m/s along either axis is drawn from 0 to this.
         generator: source of all randomness.
     """
-    B, T, P, _ = steps.shape
-    draws = torch.randn(B, T, P, 2, generator=generator, device=generator.device).to(steps)
-    most = torch.rand(B, 1, P, 1, generator=generator, device=generator.device).to(steps)
-    time = torch.arange(T, device=steps.device, dtype=steps.dtype)
+    B, T, P, _ = deltas.shape
+    draws = torch.randn(B, T, P, 2, generator=generator, device=generator.device).to(deltas)
+    most = torch.rand(B, 1, P, 1, generator=generator, device=generator.device).to(deltas)
+    time = torch.arange(T, device=deltas.device, dtype=deltas.dtype)
     near = torch.exp(-0.5 * ((time[:, None] - time) / DRIFT_FRAMES).square())
     smooth = torch.einsum("st,btpg->bspg", near / near.norm(dim=1, keepdim=True), draws)
-    astray = steps.clone()
-    astray[..., [6, 8]] += speed / FPS * most * smooth
-    return astray
+    noisy = deltas.clone()
+    noisy[..., [6, 8]] += speed / FPS * most * smooth
+    return noisy
 
 
 def _rand(n: int, generator: torch.Generator, like: Tensor) -> Tensor:

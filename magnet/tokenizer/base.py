@@ -31,7 +31,7 @@ class PoseTokenizer(Protocol):
         """Latents of a scene, cut to whole tokens, codes or as they are before. -> (B, N, P, C) float32"""
         ...
 
-    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
+    def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, window: int | None = None) -> Tensor:
         """Poses with true rotations. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
 
         `window` bounds how many tokens are decoded at a time; it must not change the poses.

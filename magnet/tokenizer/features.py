@@ -19,7 +19,7 @@ class Features:
     """Poses of a scene with their conditions, in real units."""
 
     pose: Tensor  # (B, T, P, 135)
-    steps: Tensor  # (B, T, P, 9)
+    deltas: Tensor  # (B, T, P, 9)
     betas: Tensor  # (B, P, 10)
     counts: Tensor  # (B, T, P) bool, somebody is there and the frame is good
     tokens: Tensor  # (B, N, P) bool, all four frames count
@@ -36,21 +36,21 @@ def features(scene: Scene) -> Features:
     scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
     # Mixed precision would round the products of transforms.
     with torch.autocast(scene.device.type, enabled=False):
-        pose, steps = pose_features(scene), scene_deltas(scene)
+        pose, deltas = pose_features(scene), scene_deltas(scene)
     counts = scene.present[:, None].expand(pose.shape[:3])
     if scene.valid is not None:
         counts = counts & scene.valid[..., None]
     tokens = counts.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=2)
-    return Features(pose, steps, scene.betas, counts, tokens, scene.valid)
+    return Features(pose, deltas, scene.betas, counts, tokens, scene.valid)
 
 
-def step_known(valid: Tensor) -> Tensor:
+def delta_known(valid: Tensor) -> Tensor:
     """A step is known where both of its frames are; the first one is by definition. (..., T) bool -> same"""
     return valid & torch.cat([valid[..., :1], valid[..., :-1]], dim=-1)
 
 
 def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Mean and standard deviation (D,) of `pose`, `steps` and `betas` over everybody present in all processes.
+    """Mean and standard deviation (D,) of `pose`, `deltas` and `betas` over everybody present in all processes.
 
     Raises:
         ValueError: nobody is present in any frame.
@@ -58,10 +58,10 @@ def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
     sums: dict[str, Tensor] = {}
     for scene in scenes:
         seen = features(scene)
-        steps_count = seen.counts if seen.valid is None else seen.counts & step_known(seen.valid)[..., None]
+        deltas_count = seen.counts if seen.valid is None else seen.counts & delta_known(seen.valid)[..., None]
         parts = {
             "pose": seen.pose[seen.counts],
-            "steps": seen.steps[steps_count],
+            "deltas": seen.deltas[deltas_count],
             "betas": seen.betas[:, None].expand(*seen.counts.shape, -1)[seen.counts],
         }
         for name, rows in parts.items():

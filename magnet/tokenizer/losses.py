@@ -51,8 +51,8 @@ def reconstruction_losses(
     truth: Tensor,
     mask: Tensor,
     joints: Callable[[Tensor], Tensor] | None = None,
-    steps: Tensor | None = None,
-    true_steps: Tensor | None = None,
+    deltas: Tensor | None = None,
+    true_deltas: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """The terms of paper Eq. 4, each a mean over people, frames and joints; and four of ours.
 
@@ -64,15 +64,15 @@ def reconstruction_losses(
         mask: (B, T, P) bool, the frames that count.
         joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`,
             `velocity` and `foot_velocity` (ours).
-        steps: (B, T, P, 9) canonical steps that the decoder was given; adds `foot_contact` (ours).
-        true_steps: the same of the recording.
+        deltas: (B, T, P, 9) canonical deltas that the decoder was given; adds `foot_contact` (ours).
+        true_deltas: the same of the recording.
 
     Returns:
         joint_rotation: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of
         the joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that flicker
         cost nothing else, and are what an eye sees first. foot_velocity: the same of ankles and toes alone, whose
         flicker is seen as sliding. foot_contact: error of the velocities over the ground of toes that stand in the
-        recording, m/s, on the way that the given steps lead.
+        recording, m/s, on the way that the given deltas lead.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -92,9 +92,9 @@ def reconstruction_losses(
         slip = FPS * length(away.diff(dim=1))
         losses["velocity"] = masked_mean(slip, both)
         losses["foot_velocity"] = masked_mean(slip[..., FEET], both)
-        if steps is not None and true_steps is not None:
-            slide = (world_velocity(mine, steps) - world_velocity(real, true_steps))[..., TOES, :]
-            losses["foot_contact"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_steps))
+        if deltas is not None and true_deltas is not None:
+            slide = (world_velocity(mine, deltas) - world_velocity(real, true_deltas))[..., TOES, :]
+            losses["foot_contact"] = masked_mean(FPS * length(slide), both[..., None] & standing(real, true_deltas))
     return losses
 
 
@@ -113,17 +113,17 @@ def moved(nine: Tensor, points: Tensor) -> Tensor:
     return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
-def world_velocity(joints: Tensor, steps: Tensor) -> Tensor:
+def world_velocity(joints: Tensor, deltas: Tensor) -> Tensor:
     """Way of joints from frame to frame in the world, as seen from the canonical frame before.
 
     (B, T, P, 22, 3) in canonical frames, (B, T, P, 9) -> (B, T - 1, P, 22, 3) metres
     """
-    return moved(steps[:, 1:], joints[:, 1:]) - joints[:, :-1]
+    return moved(deltas[:, 1:], joints[:, 1:]) - joints[:, :-1]
 
 
-def standing(joints: Tensor, steps: Tensor) -> Tensor:
+def standing(joints: Tensor, deltas: Tensor) -> Tensor:
     """Which toes stand from a frame to the next, being low and slow. Arguments as above -> (B, T - 1, P, 2) bool"""
     height, speed = STANDS
     low = joints[..., TOES, 1] < height
-    slow = FPS * world_velocity(joints, steps)[..., TOES, :].norm(dim=-1) < speed
+    slow = FPS * world_velocity(joints, deltas)[..., TOES, :].norm(dim=-1) < speed
     return low[:, 1:] & low[:, :-1] & slow

@@ -22,7 +22,7 @@ from magnet.seeding import derive
 from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
 from magnet.tokenizer.base import Quantized
 from magnet.tokenizer.checkpoint import check_fields, check_weights, read_checkpoint, shaping
-from magnet.tokenizer.features import Features, features, fold, put, statistics, step_known, unfold
+from magnet.tokenizer.features import Features, delta_known, features, fold, put, statistics, unfold
 from magnet.tokenizer.fsq import FSQ
 from magnet.tokenizer.losses import JOINT_LOSSES, masked_mean, matrices, orthonormalize, reconstruction_losses
 from magnet.tokenizer.options import AugmentOptions, AutoencoderOptions, QuantizerOptions, TokenizerLoss
@@ -107,37 +107,37 @@ class Tokenizer(L.LightningModule):
     # -- using it ------------------------------------------------------------------------------
 
     def encode(
-        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantize: bool = True
+        self, pose: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
         """Quantized latents, summed over levels.
 
         Args:
             pose: (B, T, P, 135), T a multiple of 4.
             betas: (B, P, 10).
-            steps: (B, T, P, 9), the identity at the first frame.
+            deltas: (B, T, P, 9), the identity at the first frame.
             valid: (B, T) bool, frames that may be looked at; None: all.
             quantize: False: the encoder's latents as they are.
 
         Returns:
             (B, N, P, C) float32.
         """
-        latent = self.quantizer.continuous(self.embed(pose, betas, steps, valid))
+        latent = self.quantizer.continuous(self.embed(pose, betas, deltas, valid))
         return self.quantizer.nearest(latent) if quantize else latent
 
-    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
+    def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, window: int | None = None) -> Tensor:
         """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
 
         `window` tokens are decoded at a time, each with all the neighbours it can depend on: the same poses in
         bounded memory. None decodes the whole clip at once.
         """
         if window is None or latent.shape[1] <= window:
-            return self._reconstruct(latent, betas, steps)
+            return self._reconstruct(latent, betas, deltas)
         before, after = self.receptive_field
         parts = []
         for start in range(0, latent.shape[1], window):
             first = max(start - before, 0)
             near = slice(first, start + window + after)
-            frames = self._reconstruct(latent[:, near], betas, steps[:, near])
+            frames = self._reconstruct(latent[:, near], betas, deltas[:, near])
             parts.append(frames[:, (start - first) * TOKEN_FRAMES : (start - first + window) * TOKEN_FRAMES])
         return torch.cat(parts, dim=1)
 
@@ -153,16 +153,16 @@ class Tokenizer(L.LightningModule):
     def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
         """Latents of a scene, cut to whole tokens; frames that are not valid are not looked at."""
         seen = features(scene)
-        return self.encode(seen.pose, seen.betas, seen.steps, seen.valid, quantize)
+        return self.encode(seen.pose, seen.betas, seen.deltas, seen.valid, quantize)
 
     def reconstruct(self, scene: Scene) -> Scene:
         """The scene after encoding and decoding, bodies put at their true canonical frames."""
         scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
         seen = features(scene)
-        latent = self.encode(seen.pose, seen.betas, seen.steps, seen.valid)
-        return put(self._reconstruct(latent, seen.betas, by_token(seen.steps), seen.valid), scene)
+        latent = self.encode(seen.pose, seen.betas, seen.deltas, seen.valid)
+        return put(self._reconstruct(latent, seen.betas, by_token(seen.deltas), seen.valid), scene)
 
-    def embed(self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None) -> Tensor:
+    def embed(self, pose: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None) -> Tensor:
         """(B, T, P, 135) ... -> (B, N, P, C) before quantisation"""
         B, T, P, _ = pose.shape
         if T % TOKEN_FRAMES:
@@ -171,24 +171,24 @@ class Tokenizer(L.LightningModule):
             )
         known = pose.new_ones(B, T, 2, dtype=torch.bool)
         if valid is not None:
-            known = torch.stack([valid, step_known(valid)], dim=-1)
+            known = torch.stack([valid, delta_known(valid)], dim=-1)
         known = known.repeat_interleave(P, dim=0)
-        vectors = self.vqvae.encode(fold(pose), betas.flatten(0, 1), fold(steps), known)
+        vectors = self.vqvae.encode(fold(pose), betas.flatten(0, 1), fold(deltas), known)
         return unfold(vectors, pose)
 
-    def _reconstruct(self, latent: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None) -> Tensor:
+    def _reconstruct(self, latent: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None = None) -> Tensor:
         P = latent.shape[2]
         known = (
-            None if valid is None else step_known(valid).unflatten(1, (-1, TOKEN_FRAMES)).repeat_interleave(P, dim=0)
+            None if valid is None else delta_known(valid).unflatten(1, (-1, TOKEN_FRAMES)).repeat_interleave(P, dim=0)
         )
-        pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(steps), known)
+        pose = self.vqvae.decode(fold(latent), betas.flatten(0, 1), fold(deltas), known)
         with torch.autocast(pose.device.type, enabled=False):
             return orthonormalize(unfold(pose, latent))
 
     # -- statistics and start ------------------------------------------------------------------
 
     def fit_normalizers(self, scenes: Iterable[Scene]) -> None:
-        """z-scores of poses, steps and shapes from scenes; kept in the checkpoint."""
+        """z-scores of poses, deltas and shapes from scenes; kept in the checkpoint."""
         for name, (mean, std) in statistics(scenes).items():
             getattr(self.vqvae, name).set(mean, std)
 
@@ -207,7 +207,7 @@ class Tokenizer(L.LightningModule):
         vectors: list[Tensor] = []
         for scene in some:
             seen = features(scene)
-            vectors.append(self.embed(seen.pose, seen.betas, seen.steps, seen.valid)[seen.tokens])
+            vectors.append(self.embed(seen.pose, seen.betas, seen.deltas, seen.valid)[seen.tokens])
             if sum(map(len, vectors)) >= KMEANS_VECTORS * self.quantizer.size:
                 break
         self.quantizer.kmeans_init(torch.cat(vectors), self._generator("start"))
@@ -284,15 +284,15 @@ class Tokenizer(L.LightningModule):
     def losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
         """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.hparams["decoder_only"]):
-            embedded = self.embed(seen.pose, seen.betas, seen.steps, seen.valid)
+            embedded = self.embed(seen.pose, seen.betas, seen.deltas, seen.valid)
         quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
-        steps = seen.steps
+        deltas = seen.deltas
         if self.training and self.augment.root_noise:
-            steps = root_noise(steps, self.augment.root_noise, self._generator("drift", self.global_step, batch_idx))
-        pose = self._reconstruct(quantized.latent, seen.betas, by_token(steps), seen.valid)
+            deltas = root_noise(deltas, self.augment.root_noise, self._generator("drift", self.global_step, batch_idx))
+        pose = self._reconstruct(quantized.latent, seen.betas, by_token(deltas), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
             joints = self._canonical_joints(seen) if any(getattr(self.loss, name) for name in JOINT_LOSSES) else None
-            losses = reconstruction_losses(pose, seen.pose, seen.counts, joints, steps, seen.steps)
+            losses = reconstruction_losses(pose, seen.pose, seen.counts, joints, deltas, seen.deltas)
         losses["commitment"] = quantized.commitment
         total = sum(getattr(self.loss, name) * value for name, value in losses.items())
         return {"loss": total, **losses}, pose, quantized

@@ -29,12 +29,12 @@ class RawPose(nn.Module):
         self.pose.set(*statistics(scenes)["pose"])
 
     def encode(
-        self, pose: Tensor, betas: Tensor, steps: Tensor, valid: Tensor | None = None, quantize: bool = True
+        self, pose: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
         """(B, T, P, 135) -> (B, N, P, 540); the rest is not read."""
         return by_token(self.pose.normalize(pose)).flatten(-2)
 
-    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, window: int | None = None) -> Tensor:
+    def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, window: int | None = None) -> Tensor:
         """(B, N, P, 540) -> (B, T, P, 135); the rest is not read."""
         return orthonormalize(self.pose.denormalize(by_frame(latent.unflatten(-1, (TOKEN_FRAMES, POSE_FEATURES)))))
 
@@ -45,4 +45,4 @@ class RawPose(nn.Module):
     def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
         """-> (B, N, P, 540)"""
         seen = features(scene)
-        return self.encode(seen.pose, seen.betas, seen.steps)
+        return self.encode(seen.pose, seen.betas, seen.deltas)

@@ -113,7 +113,7 @@ class Decoder(nn.Module):
 class VQVAE(nn.Module):
     """Encoder and decoder of one agent's pose, with the statistics of what goes in and out.
 
-    Conditions: shape and canonical step at every frame for the encoder; shape and the token's four steps at
+    Conditions: shape and canonical delta at every frame for the encoder; shape and the token's four deltas at
     every token for the decoder (paper 3.1).
 
     Args:
@@ -132,30 +132,30 @@ class VQVAE(nn.Module):
         super().__init__()
         self.stride, self.latent = stride, latent
         self.pose = Normalizer(pose)
-        self.steps = Normalizer(9)
+        self.deltas = Normalizer(9)
         # Shape numbers come in units of a population's spread; few people in training must not narrow that,
         # or a new person would lie hundreds of deviations away.
         self.betas = Normalizer(10, floor=1.0)
         self.encoder = Encoder(pose + 10 + 9, width, latent, depth, causal, unit)
         self.decoder = Decoder(latent + 10 + 9 * stride, width, pose, depth, causal)
 
-    def encode(self, pose: Tensor, betas: Tensor, steps: Tensor, known: Tensor) -> Tensor:
+    def encode(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
         """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)
 
         What is not known enters as the mean, whatever it holds.
         """
         shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
         seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
-        moved = torch.where(known[..., 1:], self.steps.normalize(steps.float()), 0.0)
+        moved = torch.where(known[..., 1:], self.deltas.normalize(deltas.float()), 0.0)
         inputs = torch.cat([seen, moved, shape], dim=-1)
         if not inputs.numel():  # convolutions refuse nothing
             return inputs.new_zeros(len(pose), pose.shape[1] // self.stride, self.latent)
         return self.encoder(inputs.to(dtype_of(self.encoder))).float()
 
-    def decode(self, latent: Tensor, betas: Tensor, steps: Tensor, known: Tensor | None = None) -> Tensor:
+    def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, known: Tensor | None = None) -> Tensor:
         """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
         shape = self.betas.normalize(betas.float())[:, None].expand(-1, latent.shape[1], -1)
-        moved = self.steps.normalize(steps.float())
+        moved = self.deltas.normalize(deltas.float())
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
         inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)

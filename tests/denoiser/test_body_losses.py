@@ -18,8 +18,8 @@ def body():
 
 
 def tokens_of(scene: Scene) -> torch.Tensor:
-    steps, pairs = scene_transforms(scene)
-    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, pairs)
+    deltas, pairs = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*deltas.shape[:3], 8), deltas, pairs)
 
 
 def run(body, seen: Scene, real: Scene, signal: float = 1.0, there: torch.Tensor | None = None):
@@ -34,7 +34,7 @@ def run(body, seen: Scene, real: Scene, signal: float = 1.0, there: torch.Tensor
         torch.full(tokens.shape[:3], signal),
         counts,
         LAYOUT,
-        lambda latent, betas, steps: pose_features(seen),
+        lambda latent, betas, deltas: pose_features(seen),
         body.forward_kinematics,
     )
 
@@ -174,8 +174,8 @@ def test_only_people_who_are_there_are_decoded_and_as_if_all_were(generator, mon
         model.tokenizer, "decode", lambda *given: decoded.append((given, plain(*given))) or decoded[-1][1]
     )
     assert model.losses(scene, generator)["joint"].isfinite()
-    (latent, betas, steps), poses = decoded[0]
+    (latent, betas, deltas), poses = decoded[0]
     assert latent.shape == (9, 8, 1, model.layout.latent), "nine people of four scenes"
-    together = [x.transpose(0, 2) for x in (latent, steps)]  # the same people as one scene of nine
+    together = [x.transpose(0, 2) for x in (latent, deltas)]  # the same people as one scene of nine
     whole = plain(together[0], betas.transpose(0, 1), together[1])
     assert torch.allclose(whole.transpose(0, 2), poses, atol=1e-5)

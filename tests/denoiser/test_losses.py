@@ -22,8 +22,8 @@ LAYOUT = TokenLayout(latent=8, agents=3)
 
 
 def packed(scene: Scene) -> torch.Tensor:
-    steps, pairs = scene_transforms(scene)
-    return LAYOUT.pack(torch.zeros(*steps.shape[:3], 8), steps, pairs)
+    deltas, pairs = scene_transforms(scene)
+    return LAYOUT.pack(torch.zeros(*deltas.shape[:3], 8), deltas, pairs)
 
 
 def everybody(scene: Scene) -> torch.Tensor:
@@ -38,12 +38,12 @@ def test_real_motion_is_consistent(scene: Scene):
 def test_consistency_equals_eq_11_computed_with_whole_matrices(scene: Scene, generator):
     tokens = packed(scene)
     yaw_noise = 0.1 * torch.randn(tokens.shape, generator=generator)
-    latent, steps, pairs = LAYOUT.unpack(tokens)
+    latent, deltas, pairs = LAYOUT.unpack(tokens)
     shift = LAYOUT.unpack(yaw_noise)[1].clone()
     shift[..., :6], shift[..., 7] = 0, 0  # ground shifts only, so that the transforms stay turns and shifts
-    noisy = LAYOUT.pack(latent, steps + shift, pairs)
+    noisy = LAYOUT.pack(latent, deltas + shift, pairs)
 
-    T_prev_can = from_9d((steps + shift).transpose(2, 3).flatten(1, 2))
+    T_prev_can = from_9d((deltas + shift).transpose(2, 3).flatten(1, 2))
     T_self_partner = pairwise(canonical_frame(scene.T_world_root))
     expected = propagate_pairwise(T_self_partner, T_prev_can)
     rotation = (1 - geodesic(expected[..., :3, :3], T_self_partner[:, 1:, ..., :3, :3]).cos()).mean()
@@ -83,8 +83,8 @@ def test_steps_and_relations_have_finite_gradients_at_zero():
 
 
 def test_canonical_steps_are_what_the_first_frame_starts_from(scene: Scene):
-    steps = canonical_deltas(canonical_frame(scene.T_world_root))
-    assert torch.equal(steps[:, 0], torch.eye(4).expand_as(steps[:, 0]))
+    deltas = canonical_deltas(canonical_frame(scene.T_world_root))
+    assert torch.equal(deltas[:, 0], torch.eye(4).expand_as(deltas[:, 0]))
 
 
 # -- min-SNR weights -----------------------------------------------------------------------------
@@ -119,8 +119,8 @@ def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_sho
     offset = from_planar(torch.tensor(turned), torch.zeros(2))
     T_self_partner = pairwise(pairs) @ offset
     T_self_partner[..., [0, 2], 3] += moved
-    latent, steps, _ = LAYOUT.unpack(truth)
-    clean = LAYOUT.pack(latent, steps, pairwise_by_token(to_9d(T_self_partner)))
+    latent, deltas, _ = LAYOUT.unpack(truth)
+    clean = LAYOUT.pack(latent, deltas, pairwise_by_token(to_9d(T_self_partner)))
     distance = pairwise(pairs)[..., [0, 2], 3].norm(dim=-1)
     off = math.hypot(0.05, FINE_GROUND) - FINE_GROUND + math.hypot(turned, FINE_YAW) - FINE_YAW
     levels = torch.full((*truth.shape[:3], 3), 300)

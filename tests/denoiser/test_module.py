@@ -109,10 +109,10 @@ def test_statistics_make_training_tokens_standard(tmp_path):
     fitted(model, 1)
     tokens, there = zip(*(model.tokenize(scene) for scene in data().statistics_batches()), strict=True)
     normal = model.normalizer.normalize(torch.cat(tokens))
-    _, steps, pairs = model.layout.unpack(normal)
+    _, deltas, pairs = model.layout.unpack(normal)
     there = torch.cat(there)
-    _, step_std, pairwise_std = model.layout.unpack(model.normalizer.std)
-    for values, std in ((steps[there[..., 0]], step_std), (pairs[there[..., 1:]], pairwise_std)):
+    _, delta_std, pairwise_std = model.layout.unpack(model.normalizer.std)
+    for values, std in ((deltas[there[..., 0]], delta_std), (pairs[there[..., 1:]], pairwise_std)):
         values, std = values.reshape(-1, 9), std.reshape(-1, 9)[0]
         assert values.mean(0).abs().max() < 1e-3
         floored = std <= 0.0101

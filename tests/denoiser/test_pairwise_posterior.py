@@ -19,7 +19,7 @@ def model() -> Denoiser:
 
 
 def shown(model: Denoiser, level: int, people: int = 3, off: float = 0.1, seed: int = 0) -> tuple[Tensor, ...]:
-    """Truth, a guess whose steps are right and whose pairwise transforms are off, the noisy tokens, levels, present."""
+    """Truth, a guess whose deltas are right and pairwise transforms are off, the noisy tokens, levels, present."""
     generator = torch.Generator().manual_seed(seed)
     there = torch.arange(3) < people
     scene = random_scene(4, 32, 3, generator, present=there.expand(4, 3).clone())
@@ -27,11 +27,11 @@ def shown(model: Denoiser, level: int, people: int = 3, off: float = 0.1, seed: 
     layout = model.layout
     levels = torch.full(truth.shape[:3], level)
     noisy = add_noise(truth, torch.randn(truth.shape, generator=generator), layout.spread(layout.group_levels(levels)))
-    latent, steps, pairs = layout.unpack(model.normalizer.denormalize(truth))
+    latent, deltas, pairs = layout.unpack(model.normalizer.denormalize(truth))
     moved = pairs.clone()
     moved[..., 6] += off * torch.randn(moved.shape[:-1], generator=generator)
     moved[..., 8] += off * torch.randn(moved.shape[:-1], generator=generator)
-    guess = model.normalizer.normalize(layout.pack(latent, steps, moved))
+    guess = model.normalizer.normalize(layout.pack(latent, deltas, moved))
     return truth, guess, noisy, levels, scene.present
 
 

@@ -47,10 +47,10 @@ def test_only_the_past_of_those_who_are_generated_is_made_anew(model, scene):
 
 
 def test_steps_and_pairwise_transforms_of_a_made_past_agree(model, scene):
-    """As those of finished tokens do: each frame's relation follows from the frame before and the steps (Eq. 11)."""
+    """As those of finished tokens do: each frame's relation follows from the frame before and the deltas (Eq. 11)."""
     _, made = shown(model, scene, rolled_out())
-    _, steps, pairs = model.layout.unpack(model.normalizer.denormalize(made[:, :PAST]))
-    T_self_partner, T_prev_can = from_9d(pairwise_by_frame(pairs)), from_9d(by_frame(steps))
+    _, deltas, pairs = model.layout.unpack(model.normalizer.denormalize(made[:, :PAST]))
+    T_self_partner, T_prev_can = from_9d(pairwise_by_frame(pairs)), from_9d(by_frame(deltas))
     torch.testing.assert_close(propagate_pairwise(T_self_partner, T_prev_can), T_self_partner[:, 1:], atol=1e-4, rtol=0)
 
 

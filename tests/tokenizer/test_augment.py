@@ -51,9 +51,9 @@ def test_joints_turn_by_the_same_in_all_frames_and_by_as_much_as_asked(people, g
 
 
 def test_drift_is_slow_and_smooth_and_over_the_ground_alone(generator):
-    steps = torch.randn(400, 64, 1, 9, generator=generator)
-    assert torch.equal(root_noise(steps, 0.0, generator), steps)
-    away = 30 * (root_noise(steps, 0.3, generator) - steps)
+    deltas = torch.randn(400, 64, 1, 9, generator=generator)
+    assert torch.equal(root_noise(deltas, 0.0, generator), deltas)
+    away = 30 * (root_noise(deltas, 0.3, generator) - deltas)
     assert not away[..., [0, 1, 2, 3, 4, 5, 7]].any()
     speed = away[:, :, 0, [6, 8]]
     assert speed.std(dim=1).mean() < 0.3 and speed.std() == pytest.approx(0.3 / 3**0.5, rel=0.15)

@@ -34,8 +34,8 @@ def toes(height: float, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
     joints = torch.zeros(1, 2, 1, 22, 3)
     joints[..., TOES, 1] = height
     joints[:, 1, ..., TOES, 2] = speed / 30 - 0.01
-    steps = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0.01]).expand(1, 2, 1, 9)
-    return joints, steps
+    deltas = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0.01]).expand(1, 2, 1, 9)
+    return joints, deltas
 
 
 @pytest.mark.parametrize(("height", "speed", "stands"), [(0.02, 0.1, True), (0.08, 0.1, False), (0.02, 0.5, False)])
@@ -44,7 +44,7 @@ def test_a_toe_stands_that_is_low_and_slow(height, speed, stands):
 
 
 def test_foot_contact_is_the_speed_at_which_given_steps_make_standing_toes_slide(body):
-    """Somebody stands; the steps that the decoder was given lead over the ground at 0.3 m/s."""
+    """Somebody stands; the deltas that the decoder was given lead over the ground at 0.3 m/s."""
     scene = random_scene(1, 1, 2, torch.Generator().manual_seed(1))
     still = scene.replace(
         body_rot=scene.body_rot.expand(-1, 16, -1, -1, -1, -1),
@@ -53,18 +53,18 @@ def test_foot_contact_is_the_speed_at_which_given_steps_make_standing_toes_slide
     lowest = body.joints(still)[..., TOES, 1].amax()
     pose = pose_features(still)
     pose[..., -2] -= lowest  # both toes on the floor or under it
-    steps = scene_deltas(still)
-    away = steps.clone()
+    deltas = scene_deltas(still)
+    away = deltas.clone()
     away[..., 8] += 0.3 / 30
     mask = torch.ones(pose.shape[:3], dtype=torch.bool)
 
     def joints(pose: torch.Tensor) -> torch.Tensor:
         return body.forward_kinematics(*matrices(pose), still.betas[:, None])
 
-    assert standing(joints(pose), steps).all()
-    got = reconstruction_losses(pose, pose, mask, joints, away, steps)
+    assert standing(joints(pose), deltas).all()
+    got = reconstruction_losses(pose, pose, mask, joints, away, deltas)
     assert got["foot_contact"] == pytest.approx(0.3, rel=1e-2)
-    assert reconstruction_losses(pose, pose, mask, joints, steps, steps)["foot_contact"] == pytest.approx(0, abs=1e-2)
+    assert reconstruction_losses(pose, pose, mask, joints, deltas, deltas)["foot_contact"] == pytest.approx(0, abs=1e-2)
     assert "foot_contact" not in reconstruction_losses(pose, pose, mask, joints)
 
 

@@ -102,7 +102,7 @@ def test_where_a_scene_lies_in_the_world_does_not_matter(scene: Scene) -> None:
     T_new_world[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.6, 0.8, -0.8, 0.6])
     T_new_world[:3, 3] = torch.tensor([2.0, 0.0, -1.0])
     seen, moved = features(scene), features(scene.transformed(T_new_world))
-    vectors = [tokenizer.embed(s.pose, s.betas, s.steps, None) for s in (seen, moved)]
+    vectors = [tokenizer.embed(s.pose, s.betas, s.deltas, None) for s in (seen, moved)]
     torch.testing.assert_close(vectors[0], vectors[1], rtol=0, atol=1e-3)
 
 
@@ -133,8 +133,8 @@ def test_symmetric_tokens_do_look_ahead(generator: torch.Generator) -> None:
     scene = random_scene(1, 64, 1, generator)
     tokenizer = tiny(scene).eval()
     seen, cut = features(scene), features(scene.slice(0, 32))
-    whole = tokenizer.embed(seen.pose, seen.betas, seen.steps, None)[:, :8]
-    assert (whole - tokenizer.embed(cut.pose, cut.betas, cut.steps, None)).abs().max() > 1e-3
+    whole = tokenizer.embed(seen.pose, seen.betas, seen.deltas, None)[:, :8]
+    assert (whole - tokenizer.embed(cut.pose, cut.betas, cut.deltas, None)).abs().max() > 1e-3
 
 
 # -- what must not count -----------------------------------------------------------------------
