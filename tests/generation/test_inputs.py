@@ -96,7 +96,7 @@ def test_another_floor_is_refused_at_every_way_in(way, metres, model, duet):
         WAYS[way](model, lifted(duet, metres))
 
 
-@pytest.mark.parametrize("way", set(WAYS) - {"live", "live partner"})
+@pytest.mark.parametrize("way", [way for way in WAYS if way not in ("live", "live partner")])
 def test_an_empty_batch_is_refused_at_every_way_in(way, model, duet):
     with pytest.raises(ValueError, match=r"^got an empty batch of 0 scenes|^got 0 scenes, expected one"):
         WAYS[way](model, duet.select([]))
