@@ -39,14 +39,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz, which nobody needs.
-
-    Args:
-        out: root of the fake.
-        takes: scenes of two people.
-        frames: of a scene at 30 fps.
-        seed: of the motion.
-    """
+    """Write the fake, and out/body.npz, which nobody needs."""
     write_scenes(out, scenes(takes, frames, seed))
 
 

@@ -34,14 +34,7 @@ def name(number: int) -> str:
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz: the first take trains, the second validates, the next two test.
-
-    Args:
-        out: root of the fake.
-        takes: pairs of files.
-        frames: of a take at 30 fps.
-        seed: of the motion.
-    """
+    """Write the fake, and out/body.npz: the first take trains, the second validates, the next two test."""
     write_scenes(out, scenes(takes, frames, seed), seed)
 
 

@@ -52,14 +52,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; every take has all three splits.
-
-    Args:
-        out: root of the fake.
-        takes: files of each kind.
-        frames: of a take's test part at 30 fps; the take is five times as long.
-        seed: of the motion.
-    """
+    """Write the fake, and out/body.npz; every take has all three splits."""
     write_scenes(out, scenes(takes, frames, seed))
 
 

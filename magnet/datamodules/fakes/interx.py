@@ -38,14 +38,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; clips are in training, validation and test in turn.
-
-    Args:
-        out: root of the fake.
-        takes: clips.
-        frames: of a clip at 30 fps.
-        seed: of the motion.
-    """
+    """Write the fake, and out/body.npz; clips are in training, validation and test in turn."""
     write_scenes(out, scenes(takes, frames, seed), seed)
 
 

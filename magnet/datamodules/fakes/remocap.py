@@ -114,14 +114,7 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; of four takes two train, one validates and one tests, by either split.
-
-    Args:
-        out: root of the fake.
-        takes: sequences.
-        frames: of a sequence at 30 fps.
-        seed: of the motion.
-    """
+    """Write the fake, and out/body.npz; of four takes two train, one validates and one tests, by either split."""
     write_scenes(out, scenes(takes, frames, seed))
 
 
