@@ -31,7 +31,6 @@ def test_no_function_is_longer_than_a_screen() -> None:
 
 
 def test_the_frame_rate_of_models_is_written_once() -> None:
-    """As a default; a data set's own rate is its reader's."""
     written = [
         f"{path}:{default.lineno}"
         for path, _, tree in parsed("magnet")
@@ -39,7 +38,7 @@ def test_the_frame_rate_of_models_is_written_once() -> None:
         for name, default in defaults(node)
         if name in ("fps", "FPS") and isinstance(default, ast.Constant) and default.value == 30
     ]
-    assert [place.partition(":")[0] for place in written] == ["magnet/datamodules/dd100.py", "magnet/motion/scene.py"]
+    assert [place.partition(":")[0] for place in written] == ["magnet/motion/scene.py"]
 
 
 def defaults(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
