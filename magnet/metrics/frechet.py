@@ -47,7 +47,7 @@ def moments(count: Tensor, total: Tensor, outer: Tensor) -> tuple[Tensor, Tensor
     return mean, (outer - count * torch.outer(mean, mean)) / (count - 1)
 
 
-def pose_features(joints: Tensor, features: Features, fps: float = FPS) -> Tensor:
+def joint_features(joints: Tensor, features: Features, fps: float = FPS) -> Tensor:
     """What is compared, 63 numbers each. (..., T, P, 22, 3) -> (..., T, P, 63); see `FrechetDistance`.
 
     `velocity` and `own_velocity` have T - 1 frames; `pair` has (..., T, P, P - 1, 63).
@@ -118,7 +118,7 @@ class FrechetDistance(MotionMetric):
     def add(self, futures: Futures) -> None:
         counts = self._counts(futures)
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
-            features = pose_features(joints, self.features, self.fps)
+            features = joint_features(joints, self.features, self.fps)
             self.pool(which, features, counts)
 
     def pool(self, which: int, features: Tensor, counts: Tensor) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.metrics import PartnerBearing, TurnRate, bearing, turn_rate
-from magnet.metrics.frechet import pose_features
+from magnet.metrics.frechet import joint_features
 from magnet.motion.frames import from_planar
 
 from .batches import WHO, Choose, draw_batch, pair_places, result, scored
@@ -107,7 +107,7 @@ def test_a_turn_on_the_spot_past_half_a_circle_has_the_speed_that_it_has() -> No
 def test_features_in_ones_own_frame_are_what_trigonometry_says() -> None:
     truth = draw_batch(scenes=1, people=2, frames=6)[1][0].double()
     body = truth.numpy()
-    features = {name: pose_features(truth, name) for name in ("canonical_joints", "pair", "own_velocity")}  # type: ignore[arg-type]
+    features = {name: joint_features(truth, name) for name in ("canonical_joints", "pair", "own_velocity")}  # type: ignore[arg-type]
     for t, p in np.ndindex(6, 2):
         own = [in_own_frame(body[t, p], body[t, p, j]) for j in range(1, 22)]
         np.testing.assert_allclose(features["canonical_joints"][t, p].view(21, 3), own, atol=1e-12)

@@ -26,7 +26,7 @@ from magnet.metrics import (
     frechet_distance,
     ground_truth_metrics,
 )
-from magnet.metrics.frechet import pose_features
+from magnet.metrics.frechet import joint_features
 from magnet.motion.frames import from_planar
 
 from .batches import EVERY, ONLY_SECOND, WHO, Choose, draw_batch, pair_places, result, scored, some_frames
@@ -104,7 +104,7 @@ def test_frechet_distance_equals_the_textbook_with_sqrtm(features: str, choose: 
     for b, p in itertools.product(range(6), range(3)):
         for which, motions in enumerate((generated[:, b], truth[None, b])):
             for motion in motions:
-                found = pose_features(motion, features)  # type: ignore[arg-type]
+                found = joint_features(motion, features)  # type: ignore[arg-type]
                 for t in range(len(found)):
                     if features != "pair":
                         if counts[b][t][p] or ("velocity" in features and counts[b][t + 1][p]):
@@ -267,7 +267,7 @@ def test_own_frame_features_do_not_see_where_the_world_is(features: str) -> None
     joints = draw_batch(people=2)[1].double()
     T = from_planar(torch.tensor(1.1).double(), torch.tensor([3.0, -2.0]).double())
     moved = joints @ T[:3, :3].T + T[:3, 3]
-    a, b = (pose_features(motion, features) for motion in (joints, moved))  # type: ignore[arg-type]
+    a, b = (joint_features(motion, features) for motion in (joints, moved))  # type: ignore[arg-type]
     torch.testing.assert_close(a, b, atol=1e-10, rtol=0)
 
 
