@@ -21,6 +21,7 @@ LIGHT_COMMANDS = {
     "demo": "the main job on the embedded default, from nothing to a table and pictures",
     "data": "prepare, check, describe, fake and download data sets",
     "view": "watch scenes in the browser, or let a model play live",
+    "refine": "move people of a scene out of each other's bodies",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS

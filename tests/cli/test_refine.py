@@ -1,0 +1,85 @@
+"""`magnet refine`: people out of each other's bodies, on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet import cli
+from magnet.body import load_body
+from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
+
+
+@pytest.fixture(scope="module")
+def crowded() -> Scene:
+    """Two who walk in one place."""
+    walker = synthesize("follow", 2, 120, torch.Generator().manual_seed(0), load_body()).scene.permute_agents(
+        torch.tensor([0])
+    )
+    T_new_world = torch.eye(4)
+    T_new_world[0, 3] = 0.12
+    other = walker.transformed(T_new_world)
+    return walker.replace(
+        body_rot=torch.cat([walker.body_rot, other.body_rot], dim=2),
+        T_world_root=torch.cat([walker.T_world_root, other.T_world_root], dim=2),
+        betas=walker.betas.expand(1, 2, 10),
+        present=walker.present.expand(1, 2),
+    )
+
+
+def numbers(line: str) -> tuple[float, float]:
+    """Centimetres of the deepest, and the share of frames over 10 cm."""
+    words = line.split()
+    return float(words[2]), float(words[words.index("10") - 3])
+
+
+def test_people_are_out_of_each_other_afterwards_and_the_table_says_so(crowded: Scene, tmp_path: Path, capsys) -> None:
+    scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "apart.npz"
+    assert cli.main(["refine", str(scene), str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    before, after = (next(line for line in lines if line.startswith(word)) for word in ("before", "after"))
+    assert numbers(before)[0] > 10 and numbers(before)[1] > 50
+    assert numbers(after)[0] < 10 and numbers(after)[1] == 0, "arms may lie on arms"
+    made = Scene.load(out)
+    assert torch.equal(made.body_rot, crowded.body_rot), "poses stay"
+    assert torch.allclose(made.T_world_root[..., 1, 3], crowded.T_world_root[..., 1, 3]), "and heights"
+
+
+def test_who_is_kept_does_not_move(crowded: Scene, tmp_path: Path) -> None:
+    scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "apart.npz"
+    assert cli.main(["refine", str(scene), str(out), "--keep", "1", "--apart", "light"]) == 0
+    made = Scene.load(out)
+    assert torch.allclose(made.T_world_root[:, :, 1], crowded.T_world_root[:, :, 1], atol=1e-6)
+    assert not torch.allclose(made.T_world_root[:, :, 0], crowded.T_world_root[:, :, 0], atol=0.02)
+
+
+def test_skeleton_files_of_several_people_are_refined_as_well(crowded: Scene, tmp_path: Path, capsys) -> None:
+    scene = crowded.save(tmp_path / "crowded.npz")
+    assert cli.main(["export", str(scene), str(tmp_path / "two.bvh")]) == 0
+    paths = sorted(map(str, tmp_path.glob("two_*.bvh")))
+    capsys.readouterr()
+    assert cli.main(["refine", *paths, str(tmp_path / "apart.bvh")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert numbers(next(line for line in lines if line.startswith("after")))[1] == 0
+    assert len(list(tmp_path.glob("apart_*.bvh"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("--keep", "7"), "people 0 to 1"), (("--apart", "very"), "invalid choice")],
+)
+def test_wrong_wishes_are_told_what_was_expected(crowded: Scene, tmp_path: Path, words, said, capsys) -> None:
+    scene = crowded.save(tmp_path / "crowded.npz")
+    assert cli.main(["refine", str(scene), str(tmp_path / "out.npz"), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_one_person_and_unknown_formats_are_refused(crowded: Scene, tmp_path: Path, capsys) -> None:
+    alone = crowded.permute_agents(torch.tensor([0])).save(tmp_path / "alone.npz")
+    assert cli.main(["refine", str(alone), str(tmp_path / "out.npz")]) == 2
+    assert "one person" in capsys.readouterr().err
+    assert cli.main(["refine", str(alone), str(tmp_path / "out.xyz")]) == 2
+    assert "nothing writes .xyz" in capsys.readouterr().err
