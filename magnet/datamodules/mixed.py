@@ -69,13 +69,13 @@ class Mixed(MotionDataModule):
 
     def split_data(self, split: Split) -> SplitData | None:
         """Rows of all data sets, or of the one chosen for the split."""
-        pieces = [piece for part in self._used(split) if (piece := part.split_data(split)) is not None]
-        return SplitData.concatenate(pieces) if pieces else None
+        parts = [data for part in self._used(split) if (data := part.split_data(split)) is not None]
+        return SplitData.concatenate(parts) if parts else None
 
     def open_store(self, split: Split) -> MemoryStore:
         """By memory map where a data set is; else all clips in memory."""
-        if self.maps_files and (piece := self.split_data(split)) is not None:
-            return MappedStore(piece, self.max_agents, self.spread)
+        if self.maps_files and (data := self.split_data(split)) is not None:
+            return MappedStore(data, self.max_agents, self.spread)
         return super().open_store(split)
 
     def _used(self, split: Split) -> list[MotionDataModule]:

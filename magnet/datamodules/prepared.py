@@ -101,13 +101,13 @@ class Prepared(MotionDataModule):
 
     def split_data(self, split: Split) -> SplitData | None:
         """The split's rows on disk."""
-        piece = SplitData.stored(self.folder, split, self.roles)
-        return piece if piece.sources else None
+        data = SplitData.stored(self.folder, split, self.roles)
+        return data if data.sources else None
 
     def open_store(self, split: Split) -> MemoryStore:
         """The split by memory map; in memory if `device_resident`."""
-        piece = self.split_data(split)
-        if piece is None:
+        data = self.split_data(split)
+        if data is None:
             has = [name for name, facts in self.folder.manifest["splits"].items() if facts["clips"]]
             raise EmptySplitError(
                 f"{self.folder.path}: split {split} is empty, the store has {', '.join(has)}; prepare it with a list "
@@ -115,4 +115,4 @@ class Prepared(MotionDataModule):
             )
         if self.device_resident:
             return super().open_store(split)
-        return MappedStore(piece, self.max_agents, self.spread)
+        return MappedStore(data, self.max_agents, self.spread)

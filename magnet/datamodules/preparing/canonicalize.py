@@ -106,7 +106,7 @@ def canonicalize(
     Args:
         recording: as read, at any rate and with any up axis.
         body: whose shape numbers `betas` are; for positions: the body to fit.
-        name: the take's; pieces of it are called "name [start:stop]" by their frames at 30 fps.
+        name: the take's; parts of it are called "name [start:stop]" by their frames at 30 fps.
         source: the data set.
         split: of the take.
         family: of the data set.
@@ -319,18 +319,18 @@ def _cut(
 ) -> list[Clip]:
     together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
     frames = len(together)
-    pieces: list[tuple[int, int]] = []
+    stretches: list[tuple[int, int]] = []
     edges = [0, *cuts, frames]
     for first, end in pairwise(edges):
-        pieces += [(first + a, first + b) for a, b in true_runs(together[first:end], least)]
-    if not pieces:
+        stretches += [(first + a, first + b) for a, b in true_runs(together[first:end], least)]
+    if not stretches:
         raise DataError(
             f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "
             f"{int(together.sum())} of them valid{''.join(f'; {one}' for one in flagged)}; lower --min_frames to keep "
             f"shorter ones"
         )
     clips = []
-    for start, stop in pieces:
+    for start, stop in stretches:
         label = name if (start, stop) == (0, frames) else f"{name} [{start}:{stop}]"
         pelvis = motion.pelvis[start:stop]
         origin = pelvis[0].mean(dim=0) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)

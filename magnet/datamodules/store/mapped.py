@@ -40,7 +40,7 @@ class SplitData:
     sources: list[str]
     fps: float
     body: str
-    seats: Ints  # (C, P) which person of a clip is shown as its first, second and so on
+    slot_order: Ints  # (C, P) which person of a clip is shown as its first, second and so on
     bad: Mapping[int, NDArray[np.bool_]]  # clips with invalid frames: which are valid (T,)
 
     @staticmethod
@@ -48,7 +48,7 @@ class SplitData:
         """Of a prepared store, people in the order of `roles`; may be empty."""
         part = folder.split(split)
         sources = [folder.manifest["name"]] * len(part.name)
-        return SplitData(part, sources, folder.fps, folder.body, part.seats(roles), {})
+        return SplitData(part, sources, folder.fps, folder.body, part.slot_order(roles), {})
 
     @staticmethod
     def encoded(clips: Sequence[Clip]) -> SplitData:
@@ -66,29 +66,30 @@ class SplitData:
         )
         goods = {c: good for c, clip in enumerate(clips) if not (good := clip.good()).all()}
         first = clips[0].scene
-        return SplitData(part, [clip.source for clip in clips], first.fps, first.body, part.seats(()), goods)
+        return SplitData(part, [clip.source for clip in clips], first.fps, first.body, part.slot_order(()), goods)
 
     @staticmethod
-    def concatenate(pieces: Sequence[SplitData]) -> SplitData:
+    def concatenate(parts: Sequence[SplitData]) -> SplitData:
         """One after the other.
 
         Raises:
             ValueError: bodies or rates differ.
         """
-        first, clips = pieces[0], 0
+        first, clips = parts[0], 0
         bad: dict[int, NDArray[np.bool_]] = {}
-        most = max(piece.seats.shape[1] for piece in pieces)
-        for piece in pieces:
-            if (piece.fps, piece.body) != (first.fps, first.body):
+        most = max(data.slot_order.shape[1] for data in parts)
+        for data in parts:
+            if (data.fps, data.body) != (first.fps, first.body):
                 raise ValueError(
-                    f"clip {piece.part.name[0]}: {piece.fps:g} fps and body {piece.body}, but clip "
+                    f"clip {data.part.name[0]}: {data.fps:g} fps and body {data.body}, but clip "
                     f"{first.part.name[0]} has {first.fps:g} fps and body {first.body}"
                 )
-            bad |= {clips + c: good for c, good in piece.bad.items()}
-            clips += len(piece.sources)
-        part = StoreSplit.concatenate([piece.part for piece in pieces])
-        seats = np.concatenate([np.pad(piece.seats, ((0, 0), (0, most - piece.seats.shape[1]))) for piece in pieces])
-        return SplitData(part, [s for piece in pieces for s in piece.sources], first.fps, first.body, seats, bad)
+            bad |= {clips + c: good for c, good in data.bad.items()}
+            clips += len(data.sources)
+        part = StoreSplit.concatenate([data.part for data in parts])
+        orders = [np.pad(data.slot_order, ((0, 0), (0, most - data.slot_order.shape[1]))) for data in parts]
+        order, sources = np.concatenate(orders), [source for data in parts for source in data.sources]
+        return SplitData(part, sources, first.fps, first.body, order, bad)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class MappedStore(MemoryStore):
     Only the index is held in memory: some hundred bytes a clip. Rows travel to the device as they lie on disk.
 
     Args:
-        piece: the clips; at least one.
+        data: the clips; at least one.
         max_agents: slots P of every batch.
         spread: let each process read a length of every source of its own, where there are enough clips.
 
@@ -120,18 +121,18 @@ class MappedStore(MemoryStore):
 
     on_disk: ClassVar[bool] = True
 
-    def __init__(self, piece: SplitData, max_agents: int, spread: bool = True) -> None:
-        self.part = part = piece.part
-        self.seats, self.bad = piece.seats, piece.bad
+    def __init__(self, data: SplitData, max_agents: int, spread: bool = True) -> None:
+        self.part = part = data.part
+        self.slot_order, self.bad = data.slot_order, data.bad
         self._index(
             names=part.name,
-            sources=piece.sources,
+            sources=data.sources,
             length=part.frames,
             people=part.people,
             whole=[c not in self.bad for c in range(len(part.name))],
             max_agents=max_agents,
-            fps=piece.fps,
-            body=piece.body,
+            fps=data.fps,
+            body=data.body,
         )
         self.shards: dict[int, NDArray[np.void]] = {}
         self.device = torch.device("cpu")
@@ -188,7 +189,7 @@ class MappedStore(MemoryStore):
         present = windows.members >= 0
         clip = np.take_along_axis(np.maximum(windows.clips, 0), windows.groups, 1)  # (B, P)
         start = np.take_along_axis(windows.starts, windows.groups, 1)
-        member = self.seats[clip, np.maximum(windows.members, 0)]
+        member = self.slot_order[clip, np.maximum(windows.members, 0)]
         row = self.part.first[clip] + member * self.length[clip] + start
         count = np.minimum(frames, self.length[clip] - start)
         shard = np.searchsorted(self.part.ends, row, side="right")

@@ -103,7 +103,7 @@ class StoreSplit:
         """Names or roles of each clip's people; () where the data set gives none."""
         return self.persons or [()] * len(self.name)
 
-    def seats(self, roles: Sequence[str]) -> Ints:
+    def slot_order(self, roles: Sequence[str]) -> Ints:
         """Each clip's people in the order of their roles: the first whose name holds the first word, and so on. (C, P)
 
         People of none of the roles come last, in the order of the recording.
@@ -237,12 +237,12 @@ class StoreReader:
         )
 
     def clips(self, split: Split, roles: Sequence[str] = ()) -> list[Clip]:
-        """All clips of a split in memory, people in the order of `roles`, as `StoreSplit.seats` says."""
+        """All clips of a split in memory, people in the order of `roles`, as `StoreSplit.slot_order` says."""
         part = self.split(split)
-        seats = part.seats(roles)
+        slot_order = part.slot_order(roles)
         clips = []
         for c, name in enumerate(part.name):
-            order = seats[c, : part.people[c]]
+            order = slot_order[c, : part.people[c]]
             rows = part.rows(c)[order]
             body_rot, T_world_root = decode(
                 torch.from_numpy(rows["rotations"].copy()), torch.from_numpy(rows["pelvis"].copy())
