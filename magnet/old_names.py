@@ -1,7 +1,7 @@
 """What checkpoints and configurations of earlier versions call things, and what they are called now.
 
 The one map of names. Whoever renames an option, a class or a weight adds a line here; the reader of checkpoints
-(`magnet.weights.read`) and that of configuration files apply it. Everything is idempotent: new names stay.
+(`magnet.checkpoints.read`) and that of configuration files apply it. Everything is idempotent: new names stay.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from magnet import weights
+from magnet import checkpoints
 
 ROOT = Path(__file__).resolve().parents[1]
 SAVING = 0.5
@@ -53,8 +53,8 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("how long: give --minutes or --steps")
     run = (given.run or given.out / "run").resolve()
     subprocess.run(fit_command(given, run), check=True, cwd=ROOT)
-    checkpoint = weights.read(run / "checkpoints" / "last.ckpt")
-    folder = weights.write(checkpoint, given.out / "weights", {"steps": int(checkpoint["global_step"])})
+    checkpoint = checkpoints.read(run / "checkpoints" / "last.ckpt")
+    folder = checkpoints.write(checkpoint, given.out / "weights", {"steps": int(checkpoint["global_step"])})
     if (run / "metrics.csv").exists():  # few steps log nothing
         shutil.copy(run / "metrics.csv", given.out / "metrics.csv")
     parts = sorted(folder.glob("*.safetensors"))

@@ -14,7 +14,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from magnet import datamodules, weights
+from magnet import checkpoints, datamodules
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
 HELD_OUT = ("03", "05", "10", "15")
@@ -66,15 +66,15 @@ def main() -> None:
     options.add_argument("checkpoint", type=Path)
     options.add_argument("name")
     options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
-    options.add_argument("--folder", type=Path, default=weights.FOLDER, help="where the model's folder is made")
+    options.add_argument("--folder", type=Path, default=checkpoints.FOLDER, help="where the model's folder is made")
     given = options.parse_args()
     about = ABOUT | {"recordings": manifest()} | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
-    checkpoint = weights.read(given.checkpoint)
+    checkpoint = checkpoints.read(given.checkpoint)
     if given.decoder:
-        checkpoint = weights.with_decoder(checkpoint, weights.read(given.decoder))
+        checkpoint = checkpoints.with_decoder(checkpoint, checkpoints.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
-    folder = weights.write(checkpoint, given.folder / given.name, without_folders(about))
+    folder = checkpoints.write(checkpoint, given.folder / given.name, without_folders(about))
     parts = sorted(folder.glob("*.safetensors"))
     size = sum(part.stat().st_size for part in parts) / 1e6
     print(f"{folder}: {len(parts)} parts, {size:.1f} MB")

@@ -6,7 +6,7 @@ import pytest
 import torch
 import yaml
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.cli.config_files import read_layers
 from magnet.denoiser.module import Denoiser
 from magnet.old_names import (
@@ -35,9 +35,9 @@ trainer:
 
 
 def test_the_shipped_weights_load_whole_although_they_have_the_old_names():
-    stored = json.loads((weights.FOLDER / "duet" / "config.json").read_text())
+    stored = json.loads((checkpoints.FOLDER / "duet" / "config.json").read_text())
     assert "relation_noise" in stored["hyper_parameters"], "written before names changed"
-    checkpoint = weights.read(weights.resolve("duet"))
+    checkpoint = checkpoints.read(checkpoints.resolve("duet"))
     model = Denoiser.load("duet")
     assert checkpoint["state_dict"].keys() == model.state_dict().keys()
     assert bool(model.normalizer.ready) and bool(model.tokenizer.quantizer.initialized)

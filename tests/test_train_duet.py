@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
 
@@ -82,8 +82,8 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     said = capfd.readouterr().out
     assert "tokenizer: has its 1 steps already" in said and "denoiser, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")
-    released = weights.read(tmp_path / "weights" / "duet")["state_dict"]
-    decoder = weights.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
+    released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
+    decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
     name = next(name for name in decoder if name.startswith("decoder.") and decoder[name].dim() == 1)
     assert torch.equal(released[f"tokenizer.{name}"], decoder[name])
     assert model.normalizer.ready

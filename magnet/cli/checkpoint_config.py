@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
@@ -156,7 +156,7 @@ def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:
             raise CommandError(f"--ckpt_path {name}: no run with a checkpoints/{name}.ckpt in {looked}; name a file")
         return max(found, key=lambda file: file.stat().st_mtime)
     try:
-        return weights.resolve(name)
+        return checkpoints.resolve(name)
     except ValueError as error:
         if name is None:
             raise CommandError("no weights come with this version: train a model, then give --ckpt_path") from error
@@ -179,7 +179,7 @@ class Stored:
             CommandError: no checkpoint, a damaged one, or one of a class that nobody here has named.
         """
         try:
-            checkpoint = weights.read(path)
+            checkpoint = checkpoints.read(path)
         except (OSError, ValueError) as error:
             if isinstance(error.__cause__, pickle.UnpicklingError):
                 reason = "not a checkpoint, or one that holds more than weights and plain values, which could run code"
@@ -254,7 +254,7 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
         CommandError: there is no such checkpoint.
     """
     try:
-        checkpoint = weights.read(weights.resolve(name))
+        checkpoint = checkpoints.read(checkpoints.resolve(name))
     except (OSError, ValueError) as error:
         if given.only_shown:
             return {}

@@ -13,7 +13,7 @@ import lightning as L
 import torch
 from rich.console import Console
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.body import Body
 from magnet.cli import outputs, run_folder
 from magnet.cli.train import quiet
@@ -185,6 +185,6 @@ def picture(show: Show, rows: dict[str, Scene], body: Body, out: Path) -> list[P
 def test_scene(data: Synthetic, coupling: str, people: int) -> Scene:
     """Context and future of a test scene of that kind, or of one that comes with the model."""
     if coupling == MADE:
-        return Scene.load(weights.FOLDER / "duet" / "scenes" / f"{coupling}.npz").pad_agents(data.max_agents)
+        return Scene.load(checkpoints.FOLDER / "duet" / "scenes" / f"{coupling}.npz").pad_agents(data.max_agents)
     kind = data.kinds.index((coupling, people))
     return aligned(data.scene("test", kind).scene.pad_agents(data.max_agents).slice(0, CONTEXT + HORIZON), CONTEXT - 1)

@@ -15,7 +15,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.cli import checkpoint_config, class_options, outputs, run_folder
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.parser import Parser
@@ -212,7 +212,7 @@ class MagnetCLI(LightningCLI):
         self.record = self._record()
         callbacks.append(self.record)
         plugins = config.get("plugins") or []
-        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), weights.CheckpointIO()]
+        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), checkpoints.CheckpointIO()]
         changes = {
             "callbacks": callbacks,
             "logger": logger or False,
@@ -257,7 +257,7 @@ class MagnetCLI(LightningCLI):
         if self.request.task is None or not isinstance(self.model, Denoiser):
             return
         if self.checkpoint is not None:
-            stored = weights.read(self.checkpoint)
+            stored = checkpoints.read(self.checkpoint)
             self.model.on_load_checkpoint(stored)
             self.model.load_state_dict(stored["state_dict"])
         config = self.config_init[self.command]
@@ -269,7 +269,7 @@ class MagnetCLI(LightningCLI):
     def before_fit(self) -> None:
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
         if self.checkpoint is not None and not getattr(self.model, "built", True):
-            self.model.on_load_checkpoint(weights.read(self.checkpoint))
+            self.model.on_load_checkpoint(checkpoints.read(self.checkpoint))
         if isinstance(self.model, Denoiser):  # now, and not once data are made and files are written
             self.model.require_tokenizer()
 

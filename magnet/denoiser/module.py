@@ -11,7 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.body import Body, load_body
 from magnet.checks import require_choice
 from magnet.denoiser import starting
@@ -91,9 +91,9 @@ class Denoiser(L.LightningModule):
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
-        elif tokenizer is not None and weights.named(tokenizer).exists():
+        elif tokenizer is not None and checkpoints.named(tokenizer).exists():
             self.build(Tokenizer.load(tokenizer))
-        elif tokenizer is None and start_from is not None and weights.named(start_from).exists():
+        elif tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
             self.build(starting.tokenizer_of(start_from))
 
     # -- parts ---------------------------------------------------------------------------------
@@ -159,8 +159,8 @@ class Denoiser(L.LightningModule):
         Raises:
             ValueError: no such checkpoint, or not a denoiser's.
         """
-        path = weights.resolve(name_or_path)
-        checkpoint = weights.read(path)
+        path = checkpoints.resolve(name_or_path)
+        checkpoint = checkpoints.read(path)
         if "tokenizer_hyper_parameters" not in checkpoint:
             raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
         fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these

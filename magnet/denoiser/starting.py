@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.denoiser.statistics import with_pairwise_metres
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
@@ -37,7 +37,7 @@ def denoiser_of(path: str | Path) -> dict[str, Any]:
     Raises:
         ValueError: no such checkpoint, or another model's.
     """
-    checkpoint = weights.read(weights.resolve(path))
+    checkpoint = checkpoints.read(checkpoints.resolve(path))
     if "tokenizer_hyper_parameters" not in checkpoint:
         raise ValueError(
             f"start_from: {path} is not a denoiser's checkpoint, for it carries no tokenizer; a tokenizer's is given "

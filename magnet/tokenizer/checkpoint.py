@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from magnet import weights
-from magnet.old_names import renamed_checkpoint
+from magnet import checkpoints
 
 SHAPING = {
     "network": ("width", "depth", "causal"),
@@ -37,16 +34,12 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, or holds no tokenizer.
     """
-    path = weights.named(path)
+    path = checkpoints.named(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such tokenizer checkpoint; train one with `magnet fit`")
-    weights.verify(path)
+    checkpoints.verify(path)
     try:
-        if path.is_dir():
-            checkpoint = weights.read(path)
-        else:
-            checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
-        checkpoint = renamed_checkpoint(checkpoint)
+        checkpoint = checkpoints.load(path, mmap=True)
         fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
     except Exception as error:  # whatever a damaged or foreign file makes torch raise
         reason = str(error).strip().split("\n")[0]

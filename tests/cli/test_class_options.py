@@ -17,7 +17,7 @@ import pytest
 import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
 
-from magnet import cli, weights
+from magnet import checkpoints, cli
 from magnet.cli import class_options, train
 from magnet.cli.checkpoint_config import LINKS, OWN_WAY
 from magnet.cli.config_files import Layer, merged, read_layers
@@ -178,9 +178,9 @@ def test_callbacks_have_their_own_defaults(tmp_path: Path, capsys: pytest.Captur
 
 def taken_over(name: str | None) -> dict[str, Any]:
     """What a configuration that starts from a shipped model has from it."""
-    if name not in weights.names():
+    if name not in checkpoints.names():
         return {}
-    stored = weights.read(weights.resolve(name))["hyper_parameters"]
+    stored = checkpoints.read(checkpoints.resolve(name))["hyper_parameters"]
     return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
 
 

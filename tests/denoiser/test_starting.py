@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from magnet import cli, weights
+from magnet import checkpoints, cli
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.starting import tokenizer_of
 from magnet.testing import tiny_denoiser
@@ -63,7 +63,7 @@ def test_a_tokenizers_checkpoint_is_no_start(tmp_path: Path) -> None:
         tokenizer_of(tmp_path / "t.ckpt")
 
 
-@pytest.mark.parametrize("name", weights.names())
+@pytest.mark.parametrize("name", checkpoints.names())
 def test_a_shipped_models_tokenizer_is_known_by_its_name(name: str) -> None:
     shipped = Denoiser.load(name)
     assert equal(Tokenizer.load(name), shipped.tokenizer) and equal(tokenizer_of(name), shipped.tokenizer)
@@ -78,9 +78,9 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     return yaml.safe_load(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", weights.names())
+@pytest.mark.parametrize("name", checkpoints.names())
 def test_a_start_brings_its_sizes_and_losses_and_the_user_says_otherwise(name: str, capsys) -> None:
-    stored = weights.read(weights.resolve(name))["hyper_parameters"]
+    stored = checkpoints.read(checkpoints.resolve(name))["hyper_parameters"]
     got = printed(capsys, "--model.start_from", name, "--model.network.dropout", "0.3")
     model, data = got["model"]["init_args"], got["data"]["init_args"]
     for group in ("network", "noise", "loss", "self_forcing"):
@@ -91,9 +91,9 @@ def test_a_start_brings_its_sizes_and_losses_and_the_user_says_otherwise(name: s
     assert (data["max_agents"], data["window_frames"]) == (stored["max_agents"], 4 * stored["window"])
 
 
-@pytest.mark.parametrize("name", weights.names())
+@pytest.mark.parametrize("name", checkpoints.names())
 def test_a_tokenizer_starts_from_that_inside_a_shipped_model(name: str, capsys) -> None:
-    stored = weights.read(weights.resolve(name))["tokenizer_hyper_parameters"]
+    stored = checkpoints.read(checkpoints.resolve(name))["tokenizer_hyper_parameters"]
     model = printed(capsys, "--model", "Tokenizer", "--model.start_from", name)["model"]["init_args"]
     assert shaping(stored) and shaping(stored).items() <= shaping(model).items()
     assert (model["start_from"], model["decoder_only"]) == (name, False)

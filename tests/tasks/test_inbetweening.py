@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import next_known, seam_weights, warp_to_keyframe
@@ -124,7 +124,7 @@ def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, option
 def test_nothing_jumps_at_the_keyframes_of_the_model_that_ships(task):
     """As it samples by default, but for the number of steps, on a scene that it made and on people it never saw."""
     model, options = Denoiser.load("duet"), SamplerOptions(steps=6)
-    made = Scene.load(weights.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 64)
+    made = Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 64)
     handshake = Synthetic(test_clips=1).scene("test", 2).scene.slice(0, 64)
     for scene in (made, handshake):
         whole = generate(model, scene, task, 8, 56, 2, options, torch.Generator().manual_seed(0))

@@ -1,6 +1,6 @@
 import torch
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.testing import random_scene, tiny_tokenizer
 from magnet.training.ema import WeightEMA
@@ -43,7 +43,7 @@ def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):
     run = trainer(2)
     run.fit(model, datamodule=data())
     run.save_checkpoint(tmp_path / "model.ckpt")
-    folder = weights.write(weights.read(tmp_path / "model.ckpt"), tmp_path / "release", half=False)
+    folder = checkpoints.write(checkpoints.read(tmp_path / "model.ckpt"), tmp_path / "release", half=False)
     loaded, released = Denoiser.load(tmp_path / "model.ckpt"), Denoiser.load(folder)
     assert all(torch.equal(x, released.state_dict()[name]) for name, x in loaded.state_dict().items())
 

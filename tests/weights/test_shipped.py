@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 
-from magnet import weights
+from magnet import checkpoints
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
@@ -22,15 +22,15 @@ def model() -> Denoiser:
 
 
 def test_it_is_complete_and_small():
-    folder = weights.resolve()
+    folder = checkpoints.resolve()
     parts = list(folder.glob("*.safetensors"))
     assert all(part.stat().st_size <= 16_500_000 for part in parts)
     assert sum(part.stat().st_size for part in parts) < 80e6
-    assert weights.read(folder)["state_dict"]
+    assert checkpoints.read(folder)["state_dict"]
 
 
 def test_it_says_what_it_was_trained_on_and_names_no_machine():
-    text = (weights.resolve() / "config.json").read_text()
+    text = (checkpoints.resolve() / "config.json").read_text()
     config = json.loads(text)
     assert "mocap.cs.cmu.edu" in config["about"]["acknowledgement"]
     assert not re.search(r"[\" =]/\w", text), "an absolute path"

@@ -4,7 +4,7 @@ import pickle
 import pytest
 import torch
 
-from magnet import weights
+from magnet import checkpoints
 
 
 @pytest.fixture
@@ -17,48 +17,48 @@ def checkpoint():
             "normalizer.mean": torch.randn(3, 3),
             "count": torch.tensor(3),
         },
-        "hyper_parameters": {"width": 8},
-        "tokenizer_hyper_parameters": {"causal": True},
+        "hyper_parameters": {"network": {"width": 8}},
+        "tokenizer_hyper_parameters": {"network": {"causal": True}},
         "magnet_config": {"model": {"class_path": "Denoiser"}},
         "global_step": 12,
     }
 
 
 def test_a_released_model_comes_back(checkpoint, tmp_path):
-    back = weights.read(weights.write(checkpoint, tmp_path / "m"))
+    back = checkpoints.read(checkpoints.write(checkpoint, tmp_path / "m"))
     assert back["state_dict"].keys() == checkpoint["state_dict"].keys()
     for name in ("bias", "normalizer.mean", "count"):
         assert torch.equal(back["state_dict"][name], checkpoint["state_dict"][name])
     assert torch.allclose(back["state_dict"]["big"], checkpoint["state_dict"]["big"], atol=2e-3)
-    assert all(back[key] == checkpoint[key] for key in (*weights.KEPT, "global_step"))
+    assert all(back[key] == checkpoint[key] for key in (*checkpoints.KEPT, "global_step"))
 
 
 def test_no_part_is_larger_than_the_limit(checkpoint, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "PART_BYTES", 10_000)
-    folder = weights.write({**checkpoint, "state_dict": {str(i): torch.randn(50, 40) for i in range(9)}}, tmp_path)
+    monkeypatch.setattr(checkpoints, "PART_BYTES", 10_000)
+    folder = checkpoints.write({**checkpoint, "state_dict": {str(i): torch.randn(50, 40) for i in range(9)}}, tmp_path)
     parts = list(folder.glob("*.safetensors"))
     assert len(parts) > 1
     assert all(part.stat().st_size < 12_000 for part in parts)
-    assert len(weights.read(folder)["state_dict"]) == 9
+    assert len(checkpoints.read(folder)["state_dict"]) == 9
 
 
 def test_a_damaged_part_is_named(checkpoint, tmp_path):
-    folder = weights.write(checkpoint, tmp_path)
+    folder = checkpoints.write(checkpoint, tmp_path)
     part = folder / "weights-01.safetensors"
     part.write_bytes(part.read_bytes()[:-1] + b"\0")
     with pytest.raises(ValueError, match=r"weights-01\.safetensors is damaged"):
-        weights.read(folder)
+        checkpoints.read(folder)
     part.unlink()
     with pytest.raises(ValueError, match="is missing"):
-        weights.read(folder)
+        checkpoints.read(folder)
 
 
 def test_a_later_format_is_refused(checkpoint, tmp_path):
-    folder = weights.write(checkpoint, tmp_path)
+    folder = checkpoints.write(checkpoint, tmp_path)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "format": 99}))
     with pytest.raises(ValueError, match="format 99"):
-        weights.read(folder)
+        checkpoints.read(folder)
 
 
 class Evil:
@@ -70,16 +70,16 @@ def test_foreign_code_in_a_checkpoint_is_not_run(tmp_path, capsys):
     path = tmp_path / "evil.ckpt"
     path.write_bytes(pickle.dumps({"state_dict": Evil()}))
     with pytest.raises(ValueError, match="not a checkpoint that can be read safely"):
-        weights.read(path)
+        checkpoints.read(path)
     torch.save({"state_dict": Evil()}, path)
     with pytest.raises(ValueError, match="not a checkpoint that can be read safely"):
-        weights.CheckpointIO().load_checkpoint(path)
+        checkpoints.CheckpointIO().load_checkpoint(path)
     assert "code has run" not in capsys.readouterr().out
 
 
 def test_an_unknown_name_says_which_there_are():
     with pytest.raises(ValueError, match="no checkpoint no_such: not a file, nor a model"):
-        weights.resolve("no_such")
+        checkpoints.resolve("no_such")
 
 
 def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoint):
@@ -88,10 +88,10 @@ def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoi
     checkpoint["state_dict"] |= {f"tokenizer.{name}": value for name, value in old.items()}
     new = {"vqvae.decoder.b": torch.randn(3), "quantizer.ema_count": torch.randn(3)}
     tokenizer = {"state_dict": old | new, "hyper_parameters": {"decoder_only": True}}
-    state = weights.with_decoder(checkpoint, tokenizer)["state_dict"]
+    state = checkpoints.with_decoder(checkpoint, tokenizer)["state_dict"]
     changed = [name for name, value in state.items() if not torch.equal(checkpoint["state_dict"][name], value)]
     assert changed == ["tokenizer.vqvae.decoder.b"]
     for name in ("vqvae.encoder.a", "vqvae.pose.mean", "quantizer.codes"):
         other = tokenizer["state_dict"] | {name: torch.randn(3)}
         with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
-            weights.with_decoder(checkpoint, tokenizer | {"state_dict": other})
+            checkpoints.with_decoder(checkpoint, tokenizer | {"state_dict": other})

@@ -16,13 +16,13 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from magnet import files, weights
+from magnet import checkpoints, files
 from magnet.cli import checkpoint_config
 from magnet.cli.errors import CommandError
 from magnet.tokenizer.checkpoint import read_checkpoint
 from tests.toys import ToyData, ToyModel
 
-IO = weights.CheckpointIO()
+IO = checkpoints.CheckpointIO()
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_what_is_saved_comes_back_with_a_checksum_that_sha256sum_reads(saved: Pa
 
 def test_a_flipped_byte_anywhere_is_refused_by_every_reader(saved: Path) -> None:
     whole = saved.read_bytes()
-    readers = (weights.read, IO.load_checkpoint, read_checkpoint)
+    readers = (checkpoints.read, IO.load_checkpoint, read_checkpoint)
     for number, at in enumerate(np.linspace(0, len(whole) - 1, 40).astype(int)):
         flipped(saved, at)
         with pytest.raises(ValueError, match=r"last\.ckpt: damaged, its SHA-256 is not the one in last\.ckpt\.sha256"):
@@ -66,28 +66,28 @@ def test_a_flipped_byte_anywhere_is_refused_by_every_reader(saved: Path) -> None
 
 
 def test_a_checkpoint_without_a_checksum_loads_unless_its_weights_are_flipped(saved: Path) -> None:
-    weights.checksum_file(saved).unlink()
-    assert weights.read(saved)["global_step"] == 12
+    checkpoints.checksum_file(saved).unlink()
+    assert checkpoints.read(saved)["global_step"] == 12
     whole = saved.read_bytes()
-    values = whole.index(weights.read(saved)["state_dict"]["big"].numpy().tobytes())
+    values = whole.index(checkpoints.read(saved)["state_dict"]["big"].numpy().tobytes())
     for at in values + np.linspace(0, 300 * 40 * 4 - 1, 20).astype(int):
         flipped(saved, at)
         assert torch.load(saved, weights_only=True)["global_step"] == 12  # torch alone does not notice
         with pytest.raises(ValueError, match=r"last\.ckpt: not a checkpoint that is whole .*take another one"):
-            weights.read(saved)
+            checkpoints.read(saved)
         saved.write_bytes(whole)
 
 
 def test_what_lightning_itself_wrote_loads(checkpoint: dict[str, Any], tmp_path: Path) -> None:
-    super(weights.CheckpointIO, IO).save_checkpoint(checkpoint, tmp_path / "a.ckpt")
+    super(checkpoints.CheckpointIO, IO).save_checkpoint(checkpoint, tmp_path / "a.ckpt")
     torch.save(checkpoint, tmp_path / "b.ckpt")
-    assert all(weights.read(tmp_path / name)["global_step"] == 12 for name in ("a.ckpt", "b.ckpt"))
+    assert all(checkpoints.read(tmp_path / name)["global_step"] == 12 for name in ("a.ckpt", "b.ckpt"))
 
 
 def test_a_damaged_checksum_is_told_from_a_damaged_checkpoint(saved: Path) -> None:
-    weights.checksum_file(saved).write_text("rubbish")
+    checkpoints.checksum_file(saved).write_text("rubbish")
     with pytest.raises(ValueError, match=r"last\.ckpt\.sha256: holds no SHA-256; copy it again, or delete it"):
-        weights.read(saved)
+        checkpoints.read(saved)
 
 
 def test_a_checkpoint_that_takes_the_place_of_another_has_its_own_checksum_or_none(
@@ -98,17 +98,17 @@ def test_a_checkpoint_that_takes_the_place_of_another_has_its_own_checksum_or_no
 
     def looked(*words: Any, **more: Any) -> None:
         replace(*words, **more)
-        seen.append(weights.read(saved)["global_step"])  # as a process that is killed here would leave it
+        seen.append(checkpoints.read(saved)["global_step"])  # as a process that is killed here would leave it
 
     def looked_too(self: Path, *words: Any, **more: Any) -> None:
         unlink(self, *words, **more)
-        seen.append(weights.read(saved)["global_step"])
+        seen.append(checkpoints.read(saved)["global_step"])
 
     monkeypatch.setattr(os, "replace", looked)
     monkeypatch.setattr(Path, "unlink", looked_too)
     IO.save_checkpoint(checkpoint | {"global_step": 13}, saved)
     assert seen == [12, 13, 13]
-    assert weights.checksum_file(saved).exists()
+    assert checkpoints.checksum_file(saved).exists()
 
 
 def test_a_checkpoint_that_is_removed_takes_its_checksum_along(saved: Path) -> None:
@@ -133,7 +133,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(
     with pytest.raises(OSError, match=r"checkpoints: the disk is full .*then go on with --ckpt_path last"):
         IO.save_checkpoint(checkpoint | {"global_step": 13}, saved)
     monkeypatch.undo()
-    assert weights.read(saved)["global_step"] == 12
+    assert checkpoints.read(saved)["global_step"] == 12
     assert sorted(path.name for path in saved.parent.iterdir()) == ["last.ckpt", "last.ckpt.sha256"]
 
 
@@ -141,7 +141,7 @@ def test_a_training_run_keeps_a_checksum_of_every_checkpoint_and_goes_on_from_it
     def fitted(epochs: int, checkpoint: Path | None) -> None:
         keep = ModelCheckpoint(tmp_path, "{epoch}", save_last=True, save_top_k=1, monitor="epoch", mode="max")
         words = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-        trainer = Trainer(max_epochs=epochs, plugins=[weights.CheckpointIO()], callbacks=[keep], **words)
+        trainer = Trainer(max_epochs=epochs, plugins=[checkpoints.CheckpointIO()], callbacks=[keep], **words)
         trainer.fit(ToyModel(), ToyData(), ckpt_path=None if checkpoint is None else str(checkpoint), weights_only=True)
 
     fitted(2, None)
@@ -158,23 +158,23 @@ def test_a_training_run_keeps_a_checksum_of_every_checkpoint_and_goes_on_from_it
 
 def test_a_flipped_byte_in_what_ships_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "duet"
-    shutil.copytree(weights.resolve(), folder, ignore=shutil.ignore_patterns("scenes"))
-    assert weights.read(folder)["state_dict"]
+    shutil.copytree(checkpoints.resolve(), folder, ignore=shutil.ignore_patterns("scenes"))
+    assert checkpoints.read(folder)["state_dict"]
     for file in [*sorted(folder.glob("*.safetensors")), folder / "config.json"]:
         whole, places = file.read_bytes(), 40 if file.suffix == ".json" else 3
         for at in np.linspace(0, len(whole) - 2, places).astype(int):  # the last byte is an end of line
             flipped(file, at)
             with pytest.raises(ValueError, match=rf"{file.name}.*(damaged|missing|later|up to).*"):
-                weights.read(folder)
+                checkpoints.read(folder)
             file.write_bytes(whole)
 
 
 def test_a_config_without_its_own_hash_still_loads(tmp_path: Path, checkpoint: dict[str, Any]) -> None:
-    folder = weights.write(checkpoint | {key: {} for key in weights.KEPT}, tmp_path / "m")
+    folder = checkpoints.write(checkpoint | {key: {} for key in checkpoints.KEPT}, tmp_path / "m")
     config = json.loads((folder / "config.json").read_text())
     del config["sha256"]
     (folder / "config.json").write_text(json.dumps(config))
-    assert weights.read(folder)["global_step"] == 12
+    assert checkpoints.read(folder)["global_step"] == 12
     (folder / "config.json").write_text(json.dumps(config | {"parts": [{"file": "../a.safetensors", "sha256": ""}]}))
     with pytest.raises(ValueError, match="its index names"):
-        weights.read(folder)
+        checkpoints.read(folder)

@@ -23,7 +23,8 @@ from torch import Tensor
 from magnet.files import file_hash, inside, write_whole
 from magnet.old_names import renamed_checkpoint
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parent / "weights"
+"""Where the models lie that come with the package."""
 DEFAULT = "duet"
 PART_BYTES = 16_000_000
 FORMAT = 1
@@ -62,11 +63,21 @@ def read(path: str | Path) -> dict[str, Any]:
         ValueError: not a checkpoint, damaged, or of a later format.
     """
     path = Path(path)
+    verify(path)
+    return load(path)
+
+
+def load(path: Path, mmap: bool = False) -> dict[str, Any]:
+    """As `read`, of a file that is known to be whole; with `mmap` only what is looked at is read from the disk.
+
+    Raises:
+        ValueError: not a checkpoint, or of a later format.
+    """
     if path.is_dir():
         return renamed_checkpoint(_read_folder(path))
-    verify(path)
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        mapped = mmap and zipfile.is_zipfile(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except FileNotFoundError:
         raise
     except Exception as error:
