@@ -122,7 +122,7 @@ def main() -> None:
     options.add_argument("--shadows", action="store_true", help="true shadows instead of discs")
     options.add_argument("--marks", action="store_true", help="trails, contacts and collisions too")
     options.add_argument("--dpr", type=float, help="viser's ?fixedDpr: 0.5 draws a quarter of the pixels")
-    options.add_argument("--no-browser", action="store_true")
+    options.add_argument("--no_browser", action="store_true")
     asked = options.parse_args()
     torch.set_num_threads(1)
     body = load_body("open")

@@ -24,7 +24,7 @@ for example:
   magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
   magnet export duet.npz duet.bvh --unit cm
   magnet export duet.npz leader.glb --person 0
-  magnet export upstairs.npz duet.npz --on-floor
+  magnet export upstairs.npz duet.npz --on_floor
 """
 
 
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument(
-        "--on-floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
+        "--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
     )
     options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
     options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
@@ -65,11 +65,11 @@ def parser() -> argparse.ArgumentParser:
     )
     pictures.add_argument("--title", help="written above")
     bvh = options.add_argument_group("reading .bvh of other programs")
-    bvh.add_argument("--in-unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
+    bvh.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
     bvh.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
     bvh.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
     bvh.add_argument(
-        "--keep-floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
+        "--keep_floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
     )
     bvh.add_argument(
         "--joint", action="append", default=[], metavar="OURS=THEIRS", help="left_hip=Thigh_L, where names say nothing"
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
     if options.on_floor:
         if options.keep_floor:
-            raise CommandError("--on-floor moves people, --keep-floor leaves them: choose one")
+            raise CommandError("--on_floor moves people, --keep_floor leaves them: choose one")
         scene = on_floor(scene, got.body)
     if options.scene is not None:
         if not 0 <= options.scene < scene.scenes:

@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; `sys.argv` by default. Returns the exit code: 0, or 2 where the user can put it right."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    arguments = [underscored(argument) for argument in arguments if argument != "--debug"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage(), end="")
         return 0
@@ -70,6 +70,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug or message is None:
             raise
         return complain(message)
+
+
+def underscored(argument: str) -> str:
+    """A flag in the one style there is, `--ckpt_path`, also where it was written `--ckpt-path`."""
+    name, equals, value = argument.partition("=")
+    if not name.startswith("--") or not name[2:3].isalpha() or " " in name:
+        return argument
+    return f"--{name[2:].replace('-', '_')}{equals}{value}"
 
 
 def run(command: str, arguments: list[str]) -> int:

@@ -25,7 +25,7 @@ examples:
   magnet view --live --sampler paper                samples as the paper does
   magnet view start.npz --context 32 --record steps.npz --task joint_future
 
-over ssh: magnet view FILE --no-browser, and on your own machine ssh -L 8080:localhost:8080 HOST
+over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:localhost:8080 HOST
 """
 
 
@@ -58,7 +58,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
         "--style", choices=("body", "light", "capsules", "skeleton"), help="default: body, light for crowds"
     )
     look.add_argument(
-        "--no-shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
+        "--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
     )
     look.add_argument("--html", metavar="OUT.html", help="write a page of its own that plays all of it, and end")
     live = parser.add_argument_group("generating")
@@ -78,7 +78,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     web = parser.add_argument_group("where")
     web.add_argument("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
     web.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
-    web.add_argument("--no-browser", action="store_true", help="only say where it is")
+    web.add_argument("--no_browser", action="store_true", help="only say where it is")
     return parser.parse_args(words)
 
 

@@ -116,7 +116,7 @@ def _grounded(scene: Scene, body: Body, notes: Sequence[str], moves: bool) -> Re
     metres = level(scene, body)
     if metres and moves:
         way = "lowered" if metres > 0 else "raised"
-        notes = [*notes, f"everybody was {way} by {abs(metres):.2f} m onto the floor; --keep-floor leaves them"]
+        notes = [*notes, f"everybody was {way} by {abs(metres):.2f} m onto the floor; --keep_floor leaves them"]
         return Read(on_floor(scene, body), body, tuple(notes))
     return Read(scene, body, (*notes, *_floor_note(scene, body)))
 
@@ -126,7 +126,7 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
     if not metres:
         return []
     where = "over" if metres > 0 else "under"
-    return [f"everybody stands {abs(metres):.2f} m {where} y = 0, where models have their floor; see --on-floor"]
+    return [f"everybody stands {abs(metres):.2f} m {where} y = 0, where models have their floor; see --on_floor"]
 
 
 def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str], bool]:

@@ -69,7 +69,7 @@ def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, 
         fitting = [name for name, metres in UNITS.items() if SHORTEST_LEG <= leg * metres <= LONGEST_LEG]
         if not fitting:
             raise ValueError(
-                f"{file.path}: legs are {leg:.3g} long, which fits no unit of length; say --in-unit m or cm (unit=...; "
+                f"{file.path}: legs are {leg:.3g} long, which fits no unit of length; say --in_unit m or cm (unit=...; "
                 "of magnet data: --reader.unit)"
             )
         unit = fitting[0]

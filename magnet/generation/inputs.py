@@ -86,7 +86,7 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
         metres = float(off[b])
         raise ValueError(
             f"{label(scene, b)}: everybody stands {abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where "
-            "the model has its floor: put them there with magnet.on_floor(scene) or magnet export --on-floor, or say "
+            "the model has its floor: put them there with magnet.on_floor(scene) or magnet export --on_floor, or say "
             "any_floor=True (--sampler.any_floor true) if they really are up there"
         )
 

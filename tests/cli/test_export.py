@@ -94,7 +94,7 @@ def test_a_skeleton_of_other_names_pose_unit_and_axis_comes_in(naming, metres, u
         )
         paths.append(str(path))
     out = stored.with_name("mine.npz")
-    assert cli.main(["export", *paths, str(out), "--keep-floor"]) == 0
+    assert cli.main(["export", *paths, str(out), "--keep_floor"]) == 0
     printed = capsys.readouterr().out
     assert f"22 joints mapped; unit {'inch' if up == 'z' else 'cm'}, {up} up" in printed
     away = (body.joints(Scene.load(out))[0, :, 0] - body.joints(scene)[0, :, 0]).norm(dim=-1)
@@ -148,11 +148,11 @@ def test_people_are_put_on_the_floor_where_one_asks_for_it(tmp_path: Path, capsy
     T_world_root[1, :, :, 1, 3] += 3.0
     high = scene.replace(T_world_root=T_world_root).save(tmp_path / "high.npz")
     out = tmp_path / "low.npz"
-    assert cli.main(["export", str(high), str(out), "--on-floor"]) == 0
+    assert cli.main(["export", str(high), str(out), "--on_floor"]) == 0
     assert "everybody stands" in capsys.readouterr().out
     assert torch.equal(Scene.load(out).T_world_root, on_floor(Scene.load(high)).T_world_root)
     assert Scene.load(out).T_world_root[..., 1, 3].max() < 1.5
-    assert cli.main(["export", str(high), str(out), "--on-floor", "--keep-floor"]) == 2
+    assert cli.main(["export", str(high), str(out), "--on_floor", "--keep_floor"]) == 2
     assert "choose one" in capsys.readouterr().err
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import torch
 from magnet import __version__, cli
 from magnet.cli import train
 from magnet.cli.errors import CommandError
-from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, usage
+from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
 from tests import toys
 from tests.toys import OtherData, ToyData
@@ -249,3 +250,13 @@ def test_our_own_faults_are_not_hidden(toy: Path, monkeypatch: pytest.MonkeyPatc
 def test_every_training_that_a_page_names_says_what_is_trained(page: Path) -> None:
     for line in re.findall(r"^ {4}(magnet fit .*)", page.read_text(), re.MULTILINE):
         assert "--config" in line or "--model " in line, line
+
+
+def test_flags_are_written_in_one_style_and_read_in_two(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in COMMANDS:
+        with contextlib.suppress(SystemExit):
+            cli.main([command, "--help"])
+    assert not re.findall(r"--[a-z]+-[a-z]+", capsys.readouterr().out)
+    for words in (["--out", "a-b"], ["--ckpt-path=runs/a-b.ckpt"], ["--task", "in-betweening"], ["-x-y"], ["---"]):
+        flag, *values = words
+        assert [underscored(word) for word in words] == [flag.replace("ckpt-path", "ckpt_path"), *values]

@@ -78,7 +78,7 @@ def test_rates_of_the_truth_are_compared_for_pages_too(tmp_path: Path, duet: Sce
 
 
 def test_after_a_run_what_cannot_be_shown_is_said_and_is_no_failure(tmp_path: Path, duet: Scene, capsys) -> None:
-    view.show_at_the_end([str(tmp_path / "gone.npz"), "--port", "0", "--no-browser"])
+    view.show_at_the_end([str(tmp_path / "gone.npz"), "--port", "0", "--no_browser"])
     err = capsys.readouterr().err
     assert "not shown: " in err and "later: magnet view " in err
     assert len(err.strip().splitlines()) == 2
