@@ -331,7 +331,7 @@ def test_a_store_of_before_these_checks_is_told_by_clip_person_and_frame(
 def test_one_glitch_is_found_in_cmus_recordings_and_no_false_one(cmu_root: Path) -> None:
     job = PrepareJob("cmu", str(cmu_root), {}, "open", CanonicalizeOptions())
     found = check_download(job, workers=2)
-    assert found.problems == [] and found.skipped == []
+    assert [take for take, _ in found.skipped] == ["135_08"]  # in which somebody stands still
     flagged = [note for note in found.notes if re.search("frozen|one point|one pose|turns by|is flung", note)]
     (only,) = flagged  # a hip turned about its leg's axis and back
     assert only.startswith(
