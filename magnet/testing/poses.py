@@ -75,7 +75,7 @@ def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> l
                 if not all(torch.equal(*(x[:, : end * TOKEN_FRAMES, agent] for x in pair)) for pair in parts):
                     raise AssertionError(
                         f"{task} on {grid}: poses of agent {agent} before frame {end * TOKEN_FRAMES} depend on what it "
-                        "not know by then"
+                        "does not know by then"
                     )
     return [blocks[number][1] for number in sorted(chosen)]
 

@@ -177,8 +177,18 @@ WRONG: dict[str, tuple[float, float, Change, str]] = {
         lambda shown: replace(shown, poses=np.rad2deg(shown.poses)),
         r"expected radians up to 3\.15: they look like degrees; convert the file",
     ),
-    "120 for 30 fps": (20.0, 4.0, lambda shown: shown, r"too slow for people; perhaps 120 .* called 30 \(--trust_fps"),
-    "30 for 120 fps": (8.0, 0.25, lambda shown: shown, r"too fast for people; perhaps 30 .* called 120 \(--trust_fps"),
+    "120 for 30 fps": (
+        20.0,
+        4.0,
+        lambda shown: shown,
+        r"too slow for people; perhaps 120 .* called 30: check the rate \(--trust_fps",
+    ),
+    "30 for 120 fps": (
+        8.0,
+        0.25,
+        lambda shown: shown,
+        r"too fast for people; perhaps 30 .* called 120: check the rate \(--trust_fps",
+    ),
 }
 """Seconds of a take at the declared rate, true rate over the declared one, what is done to it, what must be said."""
 FOUND = ("another axis up", "up is down")

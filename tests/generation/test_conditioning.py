@@ -113,7 +113,7 @@ def test_holding_the_last_pose_keeps_the_last_known_token_nearer_to_what_it_woul
     def embedded(scene: Scene, hold: int) -> torch.Tensor:
         """Before quantisation, which would hide how near two vectors are."""
         part = features(scene.people().pad_frames(4 * hold))
-        vectors = model.tokenizer.embed(part.pose, part.betas, part.steps, part.valid)[:, :, 0]
+        vectors = model.tokenizer.embed(part.pose, part.betas, part.deltas, part.valid)[:, :, 0]
         return vectors[:, hold : vectors.shape[1] - hold]
 
     away = [(embedded(scene, hold)[:, 7] - embedded(scene.slice(0, 32), hold)[:, 7]).norm() for hold in (0, 1)]

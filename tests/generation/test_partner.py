@@ -152,7 +152,7 @@ def test_what_cannot_be_answered_is_named(denoiser, duet):
         Partner(denoiser, duet.slice(0, 16), (5,), FAST)
     with pytest.raises(ValueError, match=r"multiple of 12: .* 3 are answered at a time"):
         Partner(denoiser, duet.slice(0, 16), (0,), FAST, block=3).answer(duet.slice(16, 20))
-    with pytest.raises(ValueError, match="pairwise_noise='token': tokens of those who are given tell"):
+    with pytest.raises(ValueError, match="pairwise_noise='token': given tokens hold where the others are"):
         Partner(tiny_denoiser(noise={"pairwise": "token"}), duet.slice(0, 16))
 
 

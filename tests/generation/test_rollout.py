@@ -290,7 +290,7 @@ def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name,
 
 @pytest.mark.parametrize("name", ["partner_inpainting", "motion_control", "inbetweening"])
 def test_tasks_that_are_given_something_later_need_an_end(model, recording, name):
-    with pytest.raises(ValueError, match="so it has an end"):
+    with pytest.raises(ValueError, match="so it cannot be endless: give the number of frames"):
         streamed(model, recording, TASKS[name], context_of(name), None, 8)
 
 

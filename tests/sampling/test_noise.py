@@ -35,7 +35,7 @@ def test_thirty_steps_pass_the_papers_levels():
 def test_no_more_steps_than_levels():
     with pytest.raises(ValueError, match="denoising steps: got 1001"):
         ddim_levels(1001)
-    with pytest.raises(ValueError, match="1000 with a shift of 3 pass the same"):
+    with pytest.raises(ValueError, match="1000 with a shift of 3 would use the same"):
         ddim_levels(1000, 3.0)
 
 

@@ -123,7 +123,9 @@ def test_bodies_of_another_model_are_refused(bodies, tmp_path):
     given = replace(couple(), genders=("female", "male"))
     with pytest.raises(DataError, match=r"him: male joints at rest are up to .* cm off .* expected at most 4 cm"):
         one_body(given, {**bodies, "male": other}, bodies["neutral"])
-    with pytest.raises(DataError, match="him is male, but the bodies are female, neutral alone; add the male one"):
+    with pytest.raises(
+        DataError, match="him is male, but the bodies are female, neutral alone; give the male one with --bodies"
+    ):
         one_body(given, {"female": bodies["female"]}, bodies["neutral"])
 
 
@@ -236,7 +238,9 @@ def test_a_folder_of_several_families_gives_those_of_the_data_set(folder, tmp_pa
 
 def test_somebody_of_no_gender_is_not_taken_for_another_familys_neutral(bodies, tmp_path):
     own = {"male": load_body(smpl_files(tmp_path) / "basicModel_m_lbs_10_207_0_v1.0.0.pkl")}
-    with pytest.raises(DataError, match="person 0 is neutral, but the bodies are male alone; add the neutral one"):
+    with pytest.raises(
+        DataError, match="person 0 is neutral, but the bodies are male alone; give the neutral one with --bodies"
+    ):
         one_body(replace(couple(), persons=()), own, bodies["neutral"])
 
 
