@@ -196,9 +196,11 @@ def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsy
         options = merged(own(DATA[spec["class_path"]]), spec.get("init_args", {}))
         return options | ({"data": [resolved(part) for part in options["data"]]} if "data" in options else {})
 
-    found = got["data"]["init_args"]
-    found |= {"data": [part["init_args"] for part in found["data"]]} if "data" in found else {}
-    assert found == resolved(said["data"])
+    def plain(options: dict[str, Any]) -> dict[str, Any]:
+        parts = options.get("data")
+        return options | ({"data": [plain(part["init_args"]) for part in parts]} if parts else {})
+
+    assert plain(got["data"]["init_args"]) == resolved(said["data"])
 
 
 PAGES = [Path(__file__).parents[2] / "README.md", *sorted(Path(__file__).parents[2].glob("docs/*.md"))]

@@ -103,7 +103,7 @@ def test_pieces_make_up_the_scene_made_at_once(model, recording, name, chunk):
     assert close(at_once(model, recording, TASKS[name], context, frames, FAST), whole)
 
 
-@pytest.mark.parametrize("name", CAUSAL)
+@pytest.mark.parametrize("name", some_slow(CAUSAL, "blocks", "turns", "agentic_async"))
 def test_people_who_make_way_do_not_depend_on_the_pieces_either(model, recording, name):
     """Nor, in causal plans, on when the scene ends: nobody makes way for what has not been seen."""
     options = replace(FAST, apart="firm")
