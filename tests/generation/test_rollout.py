@@ -26,6 +26,7 @@ from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from magnet.testing.poses import blocks_of
+from tests.cases import some_slow
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS = 36
