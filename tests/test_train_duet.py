@@ -84,6 +84,6 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     model = Denoiser.load(tmp_path / "weights" / "duet")
     released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
     decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
-    name = next(name for name in decoder if name.startswith("decoder.") and decoder[name].dim() == 1)
+    name = next(name for name in decoder if "decoder" in name and decoder[name].dim() == 1)
     assert torch.equal(released[f"tokenizer.{name}"], decoder[name])
     assert model.normalizer.ready
