@@ -17,8 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
+
+from magnet import checkpoints
 
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = ("tokenizer", "denoiser", "decoder")
@@ -37,7 +38,7 @@ def steps_done(folder: Path) -> int:
     path = last_checkpoint(folder)
     if not path.is_file():
         return 0
-    return int(torch.load(path, map_location="cpu", weights_only=False, mmap=True)["global_step"])
+    return int(checkpoints.read(path)["global_step"])
 
 
 def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str]:

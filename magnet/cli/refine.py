@@ -98,8 +98,7 @@ def apart(scene: Scene, body: Body, how: str, keep: Sequence[int] = ()) -> Scene
     fixed = torch.zeros(scene.agents, dtype=torch.bool)
     fixed[list(keep)] = True
     offsets = kept_apart(body.joints(scene), scene.present, fixed, APART[how], fps=scene.fps)
-    T_new_world = from_planar(torch.zeros_like(offsets[..., 0]), offsets)
-    return scene.replace(T_world_root=T_new_world @ scene.T_world_root)
+    return scene.transformed(from_planar(torch.zeros_like(offsets[..., 0]), offsets))
 
 
 def told(scene: Scene, body: Body) -> str:

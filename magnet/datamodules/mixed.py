@@ -10,8 +10,39 @@ from magnet.datamodules.store.mapped import MappedStore, SplitData
 from magnet.datamodules.store.memory import MemoryStore
 
 
+class Parts(MotionDataModule):
+    """Base of data sets that are made of others, all of one body.
+
+    Args:
+        data: the others.
+        **kwargs: as for MotionDataModule.
+
+    Raises:
+        ValueError: no data sets, or bodies differ.
+    """
+
+    def __init__(self, data: list[MotionDataModule], **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        if not data:
+            raise ValueError("data: got no data sets, expected at least one")
+        bodies = {part.body_model for part in data} | {self.body_model}
+        if len(bodies) > 1:
+            raise ValueError(f"body_model: data sets of one body can be mixed, got {sorted(bodies)}")
+        self.data = list(data)
+
+    def prepare_data(self) -> None:
+        """Let every data set prepare its files."""
+        for part in self.data:
+            part.prepare_data()
+
+    def setup(self, stage: str) -> None:
+        """Let every data set set itself up."""
+        for part in self.data:
+            part.setup(stage)
+
+
 @register_data(combines=True)
-class Mixed(MotionDataModule):
+class Mixed(Parts):
     """Trains on several data sets at once; tests on one of them, or on all.
 
     Of each data set only the clips are used: window, batch and augmentation are set here. Where one of them is a
@@ -37,31 +68,16 @@ class Mixed(MotionDataModule):
         spread: bool = True,
         **kwargs: Any,
     ) -> None:
-        super().__init__(**kwargs)
-        if not data:
-            raise ValueError("data: got no data sets, expected at least one")
+        super().__init__(data, **kwargs)
         for name, position in {"test_on": test_on, "val_on": val_on}.items():
             if position is not None and not 0 <= position < len(data):
                 raise ValueError(f"{name}: got {position}, expected a position from 0 to {len(data) - 1}")
-        bodies = {part.body_model for part in data} | {self.body_model}
-        if len(bodies) > 1:
-            raise ValueError(f"body_model: data sets of one body can be mixed, got {sorted(bodies)}")
         self.spread = spread
-        self.data, self.chosen = list(data), {"train": None, "val": val_on, "test": test_on}
+        self.chosen = {"train": None, "val": val_on, "test": test_on}
 
     @property
     def maps_files(self) -> bool:  # type: ignore[override]
         return any(part.maps_files for part in self.data)
-
-    def prepare_data(self) -> None:
-        """Let every data set prepare its files."""
-        for part in self.data:
-            part.prepare_data()
-
-    def setup(self, stage: str) -> None:
-        """Let every data set set itself up."""
-        for part in self.data:
-            part.setup(stage)
 
     def clips(self, split: Split) -> list[Clip]:
         """Clips of all data sets, or of the one chosen for the split."""

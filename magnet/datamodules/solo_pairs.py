@@ -10,6 +10,7 @@ from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.mixed import Parts
 from magnet.datamodules.registry import register_data
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
@@ -66,7 +67,7 @@ PAIRINGS: dict[str, tuple[Place, float, float]] = {
 
 
 @register_data(combines=True)
-class SoloPairs(MotionDataModule):
+class SoloPairs(Parts):
     """Pairs made of the single people of other data sets: a copy mirrors, circles, passes, walks beside or follows.
 
     The motion of each is real, and so is how it goes with the other: the copy's place follows from its own motion.
@@ -83,7 +84,7 @@ class SoloPairs(MotionDataModule):
         **kwargs: as for MotionDataModule.
 
     Raises:
-        ValueError: no data sets, or no such pairing.
+        ValueError: no data sets, bodies differ, or no such pairing.
     """
 
     def __init__(
@@ -95,30 +96,17 @@ class SoloPairs(MotionDataModule):
         pair_seed: int = 0,
         **kwargs: Any,
     ) -> None:
-        super().__init__(**kwargs)
+        super().__init__(data, **kwargs)
         names = list(PAIRINGS) if pairings is None else list(pairings)
         unknown = [name for name in names if name not in PAIRINGS]
         if unknown or not names:
             raise ValueError(f"pairings: got {unknown or names}, expected some of {', '.join(PAIRINGS)}")
-        if not data:
-            raise ValueError("data: got no data sets, expected at least one with recordings of single people")
         if delay < 0:
             raise ValueError(f"delay: got {delay} frames, expected 0 or more")
-        self.data = list(data)
         self.pairings = names
         self.delay = delay
         self.clearance = clearance
         self.pair_seed = pair_seed
-
-    def prepare_data(self) -> None:
-        """Let every data set prepare its files."""
-        for part in self.data:
-            part.prepare_data()
-
-    def setup(self, stage: str) -> None:
-        """Let every data set set itself up."""
-        for part in self.data:
-            part.setup(stage)
 
     def clips(self, split: Split) -> list[Clip]:
         """A pair of each kind for every training clip of one person; nothing to validate or test on."""

@@ -58,7 +58,7 @@ class StepRate(Callback):
         rank_zero_info(f"matrix products in bfloat16: {self.rate / 1e12:.2f} TFLOP/s on {_name(pl_module.device)}")
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        self._begun = now(pl_module.device) if self._timed(trainer) else None
+        self._begun = now(pl_module.device) if self.timed(trainer.global_step, trainer.max_steps) else None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -76,10 +76,10 @@ class StepRate(Callback):
         pl_module.log_dict({"step_seconds": seconds, "matmul_share": share})
         self.times.clear()
 
-    def _timed(self, trainer: Trainer) -> bool:
-        """Whether this step is: a waiting for the device at every step would itself cost time, so only a few are."""
-        ahead = self.every - trainer.global_step % self.every
-        return trainer.global_step >= WARM_UP and (ahead <= 10 or trainer.max_steps - trainer.global_step <= 10 > 0)
+    def timed(self, step: int, max_steps: int) -> bool:
+        """Whether a step is: waiting for the device at every step would itself cost time, so only a few are."""
+        ahead = self.every - step % self.every
+        return step >= WARM_UP and (ahead <= 10 or 0 <= max_steps - step <= 10)
 
 
 def tokens_of(batch: Any) -> int:

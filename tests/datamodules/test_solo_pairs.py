@@ -109,5 +109,7 @@ def test_wrong_wishes_are_told_what_was_expected() -> None:
         SoloPairs([Solos()], pairings=["tango"])
     with pytest.raises(ValueError, match="at least one"):
         SoloPairs([])
+    with pytest.raises(ValueError, match=r"body_model: .*\['elsewhere', 'open'\]"):
+        SoloPairs([Solos(body_model="elsewhere")])
     with pytest.raises(ValueError, match="delay"):
         SoloPairs([Solos()], delay=-1)

@@ -52,6 +52,17 @@ def test_it_prints_and_logs_the_median_step(monkeypatch: pytest.MonkeyPatch, cap
     assert float(trainer.callback_metrics["step_seconds"]) == 0.5
 
 
+def test_a_training_without_an_end_is_timed_as_seldom_as_one_with_an_end() -> None:
+    """Each timed step waits for the device."""
+
+    def timed(max_steps: int) -> list[int]:
+        rate = StepRate(every=100)
+        return [step for step in range(200) if rate.timed(step, max_steps)]
+
+    assert timed(-1) == timed(1000) == [*range(90, 100), *range(190, 200)]
+    assert timed(50)[:10] == [*range(40, 50)], "and its end"
+
+
 def test_how_often_must_be_a_number_of_steps() -> None:
     with pytest.raises(ValueError, match="expected 1 or more"):
         StepRate(every=0)
