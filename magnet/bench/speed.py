@@ -1,0 +1,264 @@
+"""What sampling costs: every task, for so many people and scenes at once."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from magnet.bench.arithmetic import Clock, products_of, seconds_of
+from magnet.denoiser.module import Denoiser
+from magnet.generation.rollout import stream
+from magnet.generation.stats import SamplingStats
+from magnet.motion.frames import from_planar
+from magnet.motion.scene import Scene, empty_scene
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks import registry
+from magnet.tokenizer.module import Tokenizer
+
+CONTEXT = 32
+"""Frames that are given of everybody, where a task takes that."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is measured.
+
+    Attributes:
+        task: name in the registry.
+        people: agents P in a scene.
+        batch: scenes B at once.
+    """
+
+    task: str
+    people: int
+    batch: int
+
+    def __str__(self) -> str:
+        return f"{self.task}, {self.people} people, batch {self.batch}"
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What was measured of a case: medians over the rounds.
+
+    Attributes:
+        evaluation_ms: one run of the network on the whole batch, views and branches of guidance included.
+        floor_ms: its matrix products alone, in the same round.
+        floor_ratio: `evaluation_ms` over `floor_ms`, the median of the rounds' ratios.
+        operators: tensor operators of an evaluation.
+        evaluations_per_frame: runs of the network for each frame of a scene.
+        windows_per_frame: windows that went through it for each frame of one scene.
+        frames_per_second: of all scenes together.
+        first_frame_ms: until the first frames are handed out.
+        memory_mib: of the process, after the case.
+    """
+
+    evaluation_ms: float
+    floor_ms: float
+    floor_ratio: float
+    operators: int
+    evaluations_per_frame: float
+    windows_per_frame: float
+    frames_per_second: float
+    first_frame_ms: float
+    memory_mib: float | None
+
+
+def paper_model(max_agents: int = 4, seed: int = 0) -> Denoiser:
+    """An untrained denoiser and tokenizer at the paper's sizes: as fast as trained ones, and as good as noise."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        tokenizer, model = Tokenizer(), Denoiser(max_agents=max_agents)
+        for part in (tokenizer.vqvae.pose, tokenizer.vqvae.deltas, tokenizer.vqvae.betas):
+            part.set(torch.zeros_like(part.mean), torch.ones_like(part.std))
+        tokenizer.quantizer.get_buffer("codes").normal_()
+        tokenizer.quantizer.get_buffer("initialized").fill_(True)
+        model.build(tokenizer)
+        model.normalizer.set(torch.zeros_like(model.normalizer.mean), torch.ones_like(model.normalizer.std))
+    return model.eval()
+
+
+def standing(batch: int, frames: int, people: int, device: torch.device) -> Scene:
+    """People who stand in a row, 1 m apart: what is computed does not depend on how they move."""
+    like = torch.zeros((), device=device)
+    scene = empty_scene(batch, frames, people, like)
+    place = torch.stack([torch.arange(people) * 1.0, torch.zeros(people)], dim=-1)
+    roots = from_planar(torch.zeros(people), place).to(device)
+    return scene.replace(
+        T_world_root=roots.expand(batch, frames, people, 4, 4).clone(),
+        body_rot=scene.body_rot.clone(),
+        present=torch.ones(batch, people, dtype=torch.bool, device=device),
+    )
+
+
+def measure(
+    model: Denoiser,
+    case: Case,
+    options: SamplerOptions,
+    frames: int = 64,
+    rounds: int = 3,
+    seed: int = 0,
+    clock: Clock = time.perf_counter,
+) -> Speed:
+    """Sample a case some times, and after each the matrix products of one of its evaluations.
+
+    Args:
+        model: a denoiser that can sample.
+        case: what is sampled.
+        options: how.
+        frames: sampled after the context.
+        rounds: times that it is done, after one that does not count.
+        seed: of the noise.
+        clock: see `Clock`.
+
+    Raises:
+        ValueError: the task cannot be sampled so; says why.
+    """
+    task = registry.get(case.task)()
+    context = 0 if case.task in FROM_NOTHING else CONTEXT
+    scene = standing(case.batch, context + frames, case.people, model.device)
+    options = dataclasses.replace(options, any_floor=True)
+    timings: list[dict[str, float]] = []
+    for _ in range(rounds + 1):
+        stats = SamplingStats()
+        generator = torch.Generator(model.device).manual_seed(seed)
+        with watched(model, clock) as watch:
+            began = clock()
+            chunks = stream(model, scene, task, context, frames, 1, options, generator, stats=stats)
+            next(chunks)
+            first = clock() - began
+            for _ in chunks:
+                pass
+            took = clock() - began
+        if not timings:
+            products, operators = products_of(watch.again)
+        floor = median(seconds_of(products, model.device, clock) for _ in range(5))
+        evaluation = watch.seconds / max(watch.calls, 1)
+        timings.append({"took": took, "first": first, "evaluation": evaluation, "floor": floor})
+    counted = timings[1:]
+
+    def middle(name: str) -> float:
+        return median(each[name] for each in counted)
+
+    made = frames if context else frames + context
+    return Speed(
+        1000 * middle("evaluation"),
+        1000 * middle("floor"),
+        median(each["evaluation"] / each["floor"] for each in counted),
+        operators,
+        stats.calls / made,
+        stats.evaluations / made,
+        case.batch * made / middle("took"),
+        1000 * middle("first"),
+        memory_mib(),
+    )
+
+
+FROM_NOTHING = ("generation",)
+"""Tasks that are given no context."""
+
+
+class Watch:
+    """What the network was asked: how often, how long it took, and the last question."""
+
+    def __init__(self, model: Denoiser, clock: Clock) -> None:
+        self.ask, self.clock = model.denoise, clock
+        self.calls, self.seconds = 0, 0.0
+        self._last: tuple[Any, ...] = ()
+
+    def denoise(self, *question: Any) -> Tensor:
+        """In place of the model's own."""
+        self._last = question
+        began = self.clock()
+        answer = self.ask(*question)
+        if answer.device.type == "cuda":
+            torch.cuda.synchronize(answer.device)
+        self.seconds += self.clock() - began
+        self.calls += 1
+        return answer
+
+    def again(self) -> Tensor:
+        """The last question once more."""
+        return self.ask(*self._last)
+
+
+@contextlib.contextmanager
+def watched(model: Denoiser, clock: Clock) -> Iterator[Watch]:
+    """Within it, a watch looks at every evaluation of a model."""
+    watch = Watch(model, clock)
+    object.__setattr__(model, "denoise", watch.denoise)
+    try:
+        yield watch
+    finally:
+        object.__delattr__(model, "denoise")
+
+
+def memory_mib() -> float | None:
+    """Memory that this process holds now; None where the system does not say."""
+    if sys.platform != "linux":
+        return None
+    import os
+    from pathlib import Path
+
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def cases(tasks: Sequence[str], people: Sequence[int], batches: Sequence[int]) -> list[Case]:
+    """Every combination that makes sense: tasks that make one agent from another need two."""
+    found = [Case(task, P, B) for task in tasks for P in people for B in batches]
+    return [case for case in found if case.people > 1 or case.task in ALONE]
+
+
+ALONE = ("joint_future", "generation", "inbetweening", "agentic_sync", "agentic_async")
+"""Tasks that one person alone can be sampled by."""
+
+
+def live_latency(model: Denoiser, options: SamplerOptions, seconds: float, people: int = 2) -> dict[str, Any]:
+    """Latency of a partner who answers each token as it happens, against the clock of the motion.
+
+    The frames of a token are there when the last of them has happened. An answer is late where the next token is there
+    before it.
+
+    Returns:
+        `median_ms`, `p99_ms`, `jitter_ms` (the standard deviation) and `most_ms` of the answers, how many there were
+        and were `late`, and the process's memory at the beginning and the end.
+    """
+    from magnet.generation.partner import Partner
+
+    past = standing(1, CONTEXT, people, model.device)
+    options = dataclasses.replace(options, any_floor=True)
+    partner = Partner(model, past, (0,), options, torch.Generator(model.device).manual_seed(0))
+    coming = past.slice(CONTEXT - TOKEN_FRAMES)
+    period = TOKEN_FRAMES / past.fps
+    for _ in range(3):
+        partner.answer(coming)
+    before, latencies = memory_mib(), []
+    began = time.perf_counter()
+    for number in range(1, max(round(seconds / period), 1) + 1):
+        due = began + number * period
+        time.sleep(max(due - time.perf_counter(), 0.0))
+        partner.answer(coming)
+        latencies.append(1000 * (time.perf_counter() - due))
+    ordered = sorted(latencies)
+    spread = torch.tensor(latencies).std(correction=0)
+    return {
+        "answers": len(latencies),
+        "median_ms": median(latencies),
+        "p99_ms": ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))],
+        "most_ms": ordered[-1],
+        "jitter_ms": float(spread),
+        "late": sum(latency > 1000 * period for latency in latencies),
+        "period_ms": 1000 * period,
+        "memory_mib": [before, memory_mib()],
+    }

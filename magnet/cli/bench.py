@@ -1,0 +1,174 @@
+"""`magnet bench`: how fast a model samples on this machine, beside the arithmetic that it cannot do without."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+EPILOG = """\
+ms/eval is one run of the network on the whole batch; floor is its matrix products alone, timed in the same round, and
+x floor the ratio, which is what other machines and other days can be compared by. first is the time until the first
+frames. live is a partner who answers token by token, against the clock of the motion.
+
+for example:
+  magnet bench --quick
+  magnet bench --model paper --task joint_future --task motion_control --out paper.json
+  magnet bench --quick --compare before.json
+"""
+COLUMNS = {
+    "evaluation_ms": "ms/eval",
+    "floor_ratio": "x floor",
+    "operators": "operators",
+    "evaluations_per_frame": "evals/frame",
+    "frames_per_second": "frames/s",
+    "first_frame_ms": "first, ms",
+    "memory_mib": "MiB",
+}
+QUICK: dict[str, Any] = {"people": [2], "batch": [1], "live": 10.0}
+WHOLE: dict[str, Any] = {"people": [1, 2, 3, 4], "batch": [1, 10], "live": 60.0}
+
+
+def parser() -> argparse.ArgumentParser:
+    options = argparse.ArgumentParser(
+        "magnet bench",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = options.add_argument
+    add("--model", default=None, metavar="NAME", help="shipped model, checkpoint, or `paper`: untrained, at its sizes")
+    add("--task", action="append", default=[], metavar="NAME", help="only this task; may be repeated (default: all)")
+    add("--people", type=int, action="append", default=[], metavar="P", help="may be repeated (default: 1 to 4)")
+    add("--batch", type=int, action="append", default=[], metavar="B", help="scenes at once (default: 1 and 10)")
+    add("--quick", action="store_true", help="two people, batch 1, ten seconds live")
+    add("--frames", type=int, default=32, help="frames that are sampled (default: %(default)s)")
+    add("--rounds", type=int, default=3, help="medians are over so many (default: %(default)s)")
+    add("--sampler", default="default", metavar="PRESET", help="how is sampled (default: %(default)s)")
+    add("--steps", type=int, default=None, help="denoising steps (default: the sampler's)")
+    add("--live", type=float, default=None, metavar="SECONDS", help="of live answers (default: 60); 0: none")
+    add("--threads", type=int, default=None, help="threads of torch (default: its own choice)")
+    add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: seconds of this process, for a busy machine")
+    add("--device", default="cpu", help="where it runs (default: %(default)s)")
+    add("--out", type=Path, default=None, metavar="FILE", help="write everything measured as JSON")
+    add("--compare", type=Path, default=None, metavar="FILE", help="JSON of another run: print now over then")
+    return options
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: no such model, task or preset; says what there is.
+    """
+    given = parser().parse_args(list(arguments))
+    from magnet.cli.errors import CommandError
+
+    for name in ("frames", "rounds", "steps", "threads"):
+        if getattr(given, name) is not None and getattr(given, name) < 1:
+            raise CommandError(f"--{name} is {getattr(given, name)}, expected at least 1")
+    then = None if given.compare is None else read(given.compare)
+    import torch
+
+    if given.threads is not None:
+        torch.set_num_threads(given.threads)
+    found = run(given)
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        print(f"written: {given.out}")
+    if then is not None:
+        print(compared(then, found))
+    return 0
+
+
+def read(path: Path) -> dict[str, Any]:
+    """What another run has written.
+
+    Raises:
+        CommandError: no such file, or not of this command.
+    """
+    from magnet.cli.errors import CommandError
+
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        found["cases"].items()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CommandError(f"--compare {path}: not a file that `magnet bench --out` has written") from error
+    return dict(found)
+
+
+def run(given: argparse.Namespace) -> dict[str, Any]:
+    """Measure and print, case by case. Returns everything that was measured, JSON-ready."""
+    import torch
+
+    from magnet.bench.speed import cases, live_latency, measure
+    from magnet.cli.run_folder import provenance
+    from magnet.evaluation.results import machine
+    from magnet.sampling.options import SamplerOptions
+    from magnet.tasks import registry
+
+    clock = time.process_time if given.clock == "cpu" else time.perf_counter
+    usual = QUICK if given.quick else WHOLE
+    model = load(given.model).to(given.device)
+    options = SamplerOptions.preset(given.sampler, **({} if given.steps is None else {"steps": given.steps}))
+    tasks = given.task or registry.names()
+    people = [P for P in given.people or usual["people"] if model.layout.agents >= P]
+    print(f"{given.model or 'the default model'}, {options.steps} steps, {torch.get_num_threads()} threads", flush=True)
+    print(row("", list(COLUMNS.values())), flush=True)
+    found: dict[str, Any] = {"cases": {}, "live": None}
+    for case in cases(tasks, people, given.batch or usual["batch"]):
+        speed = dataclasses.asdict(measure(model, case, options, given.frames, given.rounds, clock=clock))
+        found["cases"][str(case)] = speed
+        print(row(str(case), [shown(speed[name]) for name in COLUMNS]), flush=True)
+    seconds = usual["live"] if given.live is None else given.live
+    if seconds and model.layout.agents > 1:
+        found["live"] = live = live_latency(model, options, seconds)
+        print(
+            f"live: {live['answers']} answers in {live['median_ms']:.0f} ms (median), {live['p99_ms']:.0f} ms (99th "
+            f"percentile), jitter {live['jitter_ms']:.1f} ms, {live['late']} late of {live['period_ms']:.0f} ms"
+        )
+    about = {"model": given.model, "threads": torch.get_num_threads(), "frames": given.frames, "rounds": given.rounds}
+    about |= {"clock": given.clock}
+    return {**found, **about, "sampler": dataclasses.asdict(options), "machine": machine(), **provenance()}
+
+
+def load(name: str | None) -> Denoiser:
+    """The model that is measured."""
+    from magnet.bench.speed import paper_model
+    from magnet.denoiser.module import Denoiser
+
+    return paper_model() if name == "paper" else Denoiser.load(name)
+
+
+def compared(then: dict[str, Any], now: dict[str, Any]) -> str:
+    """How two runs differ: now over then, of each case that both have."""
+    both = [name for name in now["cases"] if name in then["cases"]]
+    lines = [f"now over then ({(then.get('git') or {}).get('commit', 'no commit')})", row("", list(COLUMNS.values()))]
+    for name in both:
+        old, new = then["cases"][name], now["cases"][name]
+        ratios = [new[key] / old[key] if old.get(key) and new.get(key) else None for key in COLUMNS]
+        lines.append(row(name, [shown(ratio) for ratio in ratios]))
+    if then.get("live") and now.get("live"):
+        lines.append(f"live, median answer: {now['live']['median_ms'] / then['live']['median_ms']:.2f}")
+    return "\n".join(lines)
+
+
+def row(name: str, values: Sequence[str]) -> str:
+    return f"{name:<42}" + "".join(f"{value:>12}" for value in values)
+
+
+def shown(value: float | None) -> str:
+    """A number in few digits."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,0 +1,64 @@
+"""What `magnet bench` measures: counts that do not depend on the machine, and its files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet import cli
+from magnet.bench import speed
+from magnet.bench.arithmetic import products_of
+from magnet.sampling.grid import planning_grid
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks import registry
+from magnet.testing.models import tiny_denoiser
+
+
+def test_products_are_those_of_the_network_and_can_be_run_again() -> None:
+    one, other = torch.randn(3, 4), torch.randn(4, 5)
+    products, operators = products_of(lambda: (one @ other).relu() + 1)
+    assert len(products) == 1 and operators == 3
+    assert torch.equal(products[0](), one @ other)
+
+
+@pytest.mark.parametrize("task", registry.names())
+def test_counts_are_those_of_the_plan(task: str) -> None:
+    model = tiny_denoiser(max_agents=2)
+    options = SamplerOptions(steps=2)
+    found = speed.measure(model, speed.Case(task, 2, 2), options, frames=16, rounds=1)
+    context = 0 if task in speed.FROM_NOTHING else speed.CONTEXT
+    tokens = (context + 16) // 4
+    plan = registry.get(task)().schedule(planning_grid(tokens, 2, context // 4, model.window, options))
+    assert found.evaluations_per_frame == plan.evaluations / 16
+    assert found.windows_per_frame >= found.evaluations_per_frame
+    assert found.operators > 20 and found.evaluation_ms > 0 and found.floor_ms > 0
+    assert "denoise" not in vars(model), "the model is left as it was"
+
+
+def test_cases_leave_out_what_one_alone_cannot_do() -> None:
+    names = [str(case) for case in speed.cases(["joint_future", "motion_control"], [1, 2], [1])]
+    assert names == [
+        "joint_future, 1 people, batch 1",
+        "joint_future, 2 people, batch 1",
+        "motion_control, 2 people, batch 1",
+    ]
+
+
+def test_the_command_writes_what_it_measured_and_compares_it(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("magnet.cli.bench.load", lambda name: tiny_denoiser(max_agents=2))
+    out = tmp_path / "bench.json"
+    words = ["bench", "--quick", "--task", "joint_future", "--frames", "8", "--rounds", "1", "--steps", "2"]
+    assert cli.main([*words, "--live", "0.2", "--out", str(out)]) == 0
+    found = json.loads(out.read_text())
+    assert found["machine"]["cores"] and found["git"] is not None and found["sampler"]["steps"] == 2
+    assert found["live"]["answers"] == 2
+    assert cli.main([*words, "--live", "0", "--compare", str(out)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[:5] == ["joint_future,", "2", "people,", "batch", "1"]
+    assert float(last[5 + 3]) == 1.0, "evaluations a frame are the same"
+    out.write_text("[]")
+    assert cli.main([*words, "--compare", str(out)]) == 2
+    assert cli.main([*words[:-1], "0"]) == 2
