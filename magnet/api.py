@@ -38,7 +38,7 @@ def load(
     steps: int | None = None,
     sampler: str = "default",
 ) -> Model:
-    """A trained model: one that comes with the package by its name ("duet"), or a checkpoint's path.
+    """A trained model: one of the package by its name ("duet"), a hub's ("hub:owner/name"), or a checkpoint's path.
 
     Args:
         device: where it runs.
@@ -47,6 +47,7 @@ def load(
 
     Raises:
         ValueError: no such model or sampler, which names those there are; or no such device here.
+        ImportError: a hub's model without huggingface_hub, `pip install "magnet-motion[hub]"`.
 
     >>> model = load("duet", steps=2)
     >>> scene = model.generate(people=3, frames=60, seed=0)

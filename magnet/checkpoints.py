@@ -29,6 +29,10 @@ DEFAULT = "duet"
 PART_BYTES = 16_000_000
 FORMAT = 1
 
+HUB = "hub:"
+"""What a name begins with that means a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
+HUB_FILES = ["config.json", "*.safetensors", "README.md"]
+
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config")
 
 
@@ -38,16 +42,54 @@ def names() -> list[str]:
 
 
 def named(name_or_path: str | Path) -> Path:
-    """The folder of a shipped model where there is one of that name, else the path as it is."""
+    """The folder of a shipped model where there is one of that name, one fetched from a hub, else the path as it is.
+
+    Raises:
+        ValueError, ImportError: as `from_hub`.
+    """
+    if str(name_or_path).startswith(HUB):
+        return from_hub(str(name_or_path))
     shipped = FOLDER / str(name_or_path)
     return shipped if (shipped / "config.json").exists() else Path(name_or_path)
+
+
+def from_hub(name: str) -> Path:
+    """The folder of a released model that is fetched from Hugging Face's hub once and then kept in its cache.
+
+    Only weights, the configuration and the card are fetched: no code, and nothing pickled.
+
+    Args:
+        name: hub:owner/name, or hub:owner/name@revision with a branch, a tag or a commit.
+
+    Raises:
+        ValueError: another form of name, or nothing that can be fetched.
+        ImportError: huggingface_hub is not installed.
+    """
+    match = re.fullmatch(rf"{HUB}(\w[\w.-]*/\w[\w.-]*)(?:@([\w./-]+))?", name)
+    if match is None:
+        raise ValueError(f"{name}: expected hub:owner/name or hub:owner/name@revision")
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise ImportError('models of a hub need huggingface_hub: pip install "magnet-motion[hub]"') from error
+    try:
+        folder = Path(snapshot_download(match[1], revision=match[2], allow_patterns=HUB_FILES))
+    except Exception as error:  # the hub's own, the network's and the disk's
+        said = str(error).strip().partition("\n")[0]
+        raise ValueError(
+            f"{name}: cannot be fetched ({type(error).__name__}: {said}); check the name and the network, and log in "
+            "with `hf auth login` where the model is private"
+        ) from error
+    if not (folder / "config.json").is_file():
+        raise ValueError(f"{name}: holds no config.json, so it is no released model of magnet")
+    return folder
 
 
 def resolve(name_or_path: str | Path | None = None) -> Path:
     """The checkpoint that a name or path means; None is the model that comes with the package.
 
     Raises:
-        ValueError: neither a model of the package nor a file.
+        ValueError: neither a model of the package nor a file, or as `from_hub`.
     """
     path = named(DEFAULT if name_or_path is None else name_or_path)
     if path.exists():

@@ -64,6 +64,8 @@ KINDS = {
     "str": "text",
     "tuple": "a list such as [0,1]",
     "list": "a list such as [0,1]",
+    "Sequence": "a list such as [a,b]",
+    "Mapping": "options",
     "dict": "options",
     "NoneType": "null",
 }
@@ -78,6 +80,8 @@ def wrong_value(message: str, flag: str | None = None) -> str | None:
     """
     key = re.search(r'Parser key "([\w.]+)"', message)
     got = re.search(r"(?:Got|Given) value: (.*)", message)
+    if key and got and (inner := re.match(r"NestedArg\(key='(\w+)'", got[1])):
+        return f"no option {flag or '--' + key[1]}.{inner[1]}; {flag or '--' + key[1]} takes a value, it has no fields"
     kinds = re.findall(r"Expected an? (?:<class '(?:\w+\.)*(\w+)'>|\S*Literal\[(.*?)\])", message)
     told = re.search(r"^ *- (?!Expected )", message, re.MULTILINE)  # a class that has said itself what it wants
     if told or not (key and got and kinds):

@@ -24,6 +24,7 @@ LIGHT_COMMANDS = {
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
+    "doctor": "what is installed, what is missing and what to do about it",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS
 

@@ -27,6 +27,12 @@ SHARING = ("model", "data")
 TRAINER = "Customize every aspect of training via flags"
 """Lightning's title over the Trainer's options."""
 
+CKPT_PATH = {
+    "fit": "last or a path: the training run to go on with (default: a new one)",
+    "validate": "best, last, a path or a model's name (default: the model that comes with the package)",
+}
+"""What --ckpt_path says in place of Lightning's text, whose title is cut off and whose words mean other things here."""
+
 CANDIDATES = r",\s+known\s+subclasses:\s[^)]*\)"
 """Class paths that jsonargparse lists behind an option: a screen of them for the Trainer's."""
 
@@ -72,6 +78,7 @@ class Parser(LightningArgumentParser):
         self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
         for key in self.classes:
             self._name_choices(key)
+        self._explain_checkpoint()
         for action in self._actions:
             if action.option_strings and action.option_strings[0].endswith(".help"):
                 action.help = argparse.SUPPRESS  # of classes that Lightning brings
@@ -130,6 +137,13 @@ class Parser(LightningArgumentParser):
                     group.title = f"--{key} NAME"
                     group.description = f"One of {names}{default}. Fields are --{key}.FIELD VALUE."
 
+    def _explain_checkpoint(self) -> None:
+        for group in self._action_groups:
+            for action in group._group_actions:
+                if action.option_strings == ["--ckpt_path"]:
+                    group.title, group.description = "the weights", None
+                    action.metavar, action.help = "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"])
+
     def explain(self, key: str, value: str, text: str) -> None:
         """Say of an option that is a group of others what else may stand behind it."""
         for action in self._actions:
@@ -146,36 +160,52 @@ class Parser(LightningArgumentParser):
 
     def clearer(self, message: str) -> str:
         """The parser's message without its internals."""
+        if dangling := next((word for word in self.arguments if re.match(r"--[\w.]+\.(=|$)", word)), None):
+            return f"no option {dangling.partition('=')[0]}; the name of a field belongs behind the point"
         unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
         refused = re.search(REFUSED, message)
         if unknown and not unknown[1].startswith("-"):
             meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
             hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
-            return f"{unknown[1]} is no option; {hint}"
+            return f"got {unknown[1]}, expected an option; {hint}"
         if unknown or refused:
             field = refused[1] if refused else ""
             name = unknown[1].partition("=")[0] if unknown else self._written(field, field)
-            return f"no option {name}{_closest(name, self._flags())}"
+            return f"no option {name}{self._had_by_others(name) or _closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:
             key = required[1]
             return f"say which {key}: --{key} {' or '.join(self.classes[key])}, or a --config that does"
         named = re.search(r'Parser key "(\w+)"', message)
-        path = re.search(r"Expected a dot import path string: (\S+)", message)
+        path = re.search(r"(?:Expected a dot import path string|Unexpected import path format): (\S+)", message)
         if named and path and named[1] in self.classes:
             known = ", ".join(self.classes[named[1]])
             return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
         key = re.search(r'Parser key "([\w.]+)"', message)
         if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
             return told
+        if key and (file := re.search(r"Unable to load config ['\"](.*?)['\"]", message)):
+            group = self._written(key[1], f"--{key[1]}")
+            return f"{group}: got {file[1]}, expected a YAML file of its fields, or {group}.FIELD VALUE"
         message = re.sub(r"Call to compute_fn of link .* failed: ", "", message)
         lines = [line.strip() for line in message.splitlines() if line.strip()]
         return " ".join(line for line in lines if not line.startswith(NOISE)) or message
 
     def _written(self, field: str, otherwise: str) -> str:
         """A field as the user wrote it: `--model.foo` for `foo`."""
-        flags = [argument.partition("=")[0] for argument in self.arguments]
-        return next((flag for flag in flags if flag.startswith("--") and flag.endswith(f".{field}")), otherwise)
+        words = [re.match(rf"(--(?:[\w]+\.)+{re.escape(field)})(?![\w-])", argument) for argument in self.arguments]
+        return next((word[1] for word in words if word), otherwise)
+
+    def _had_by_others(self, name: str) -> str:
+        """That another class has the option which the chosen one lacks; empty where none has."""
+        key, _, field = name.lstrip("-").partition(".")
+        classes = self.classes.get(key, {})
+        having = [each for each, kind in classes.items() if f"--{key}.{field}" in _flags_of(key, kind)] if field else []
+        chosen = self.chosen.get(key, "").rpartition(".")[2]
+        if not having or chosen in having:
+            return ""
+        others = f" ({len(having) - 1} more have it)" if len(having) > 1 else ""
+        return f" of {chosen or f'this {key}'}; it belongs to another: --{key} {having[0]}{others}"
 
     def _flags(self) -> list[str]:
         flags = [flag for action in self._actions for flag in action.option_strings]
@@ -183,7 +213,7 @@ class Parser(LightningArgumentParser):
             chosen = self.chosen.get(key)
             for name, kind in classes.items():
                 if chosen is None or chosen.rpartition(".")[2] == name:
-                    flags.extend(f"--{option}" for option in _options(key, kind))
+                    flags.extend(_flags_of(key, kind))
         return flags
 
 
@@ -196,7 +226,7 @@ def _topic_of(group: Any) -> str:
 def _closest(name: str, known: list[str]) -> str:
     """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
     group, _, leaf = name.rpartition(".")
-    flags = [flag for flag in known if not flag.endswith((".help", "+"))]
+    flags = [flag for flag in known if not flag.endswith((".help", "+")) and flag != name]
     fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
     by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
     leaf = leaf.lstrip("-")
@@ -215,8 +245,8 @@ def _words(name: str) -> tuple[str, ...]:
     return (*words, "".join(word[:1] for word in words))
 
 
-def _options(key: str, kind: type) -> list[str]:
-    return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
+def _flags_of(key: str, kind: type) -> list[str]:
+    return [f"--{field}" for field in LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False)]
 
 
 def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:

