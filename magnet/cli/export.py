@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+from magnet.cli import scene_files
 
 if TYPE_CHECKING:
     from magnet.motion.scene import Scene
@@ -29,21 +30,12 @@ for example:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser(
-        "magnet export",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
-    options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
+    options = scene_files.parser_of("export", __doc__, EPILOG)
     options.add_argument("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
     options.add_argument(
         "--person", type=int, action="append", default=[], metavar="N", help="only this person, from 0; may be repeated"
     )
     options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
-    options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument(
         "--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
     )
@@ -67,7 +59,6 @@ def parser() -> argparse.ArgumentParser:
     bvh = options.add_argument_group("reading .bvh of other programs")
     bvh.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
     bvh.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
-    bvh.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
     bvh.add_argument(
         "--keep_floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
     )
@@ -89,10 +80,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 
-    out = Path(options.out)
-    if out.suffix.lower() not in formats.WRITTEN:
-        raise CommandError(f"{out.name}: nothing writes {out.suffix or 'files without a suffix'}; use "
-                           f"{', '.join(formats.WRITTEN)}{FBX if out.suffix.lower() == '.fbx' else ''}")  # fmt: skip
+    out = scene_files.path_to_write(options.out)
     given = dict(pair.partition("=")[::2] for pair in options.joint)
     film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
     reading = formats.Reading(
@@ -103,12 +91,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         joints=given,
         keep_floor=options.keep_floor,
     )
-    got = formats.read(options.inputs, options.body, reading)
-    for note in got.notes:
-        print(note)
+    got = scene_files.read_inputs(options, reading)
     scene = got.scene
-    if not scene.scenes:
-        raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
     if options.on_floor:
         if options.keep_floor:
             raise CommandError("--on_floor moves people, --keep_floor leaves them: choose one")
@@ -132,12 +116,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         title=options.title,
         progress=True,
     )
-    for path in written:
-        print(f"written: {path} ({size(path)})")
+    scene_files.say_written(written)
     return 0
-
-
-FBX = "; for .fbx write .glb and let Blender convert it (docs/export.md)"
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:
@@ -165,9 +145,3 @@ def described(scene: Scene) -> str:
     what = f"{scene.scenes} scenes of {count}" if scene.scenes > 1 else count
     who = "person" if people == [1] else "people"
     return f"{what} {who}, {scene.frames} frames at {scene.fps:g} fps, {scene.frames / scene.fps:.1f} s"
-
-
-def size(path: Path) -> str:
-    """A file's size for people."""
-    count = path.stat().st_size
-    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

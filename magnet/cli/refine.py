@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING
 
+from magnet.cli import scene_files
+
 if TYPE_CHECKING:
     from magnet.body import Body
     from magnet.motion.scene import Scene
@@ -23,15 +25,7 @@ for example:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser(
-        "magnet refine",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
-    options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
+    options = scene_files.parser_of("refine", __doc__, EPILOG)
     options.add_argument(
         "--apart",
         choices=("light", "firm"),
@@ -41,8 +35,6 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--keep", type=int, action="append", default=[], metavar="N", help="this person does not move; may be repeated"
     )
-    options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
-    options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
     return options
 
 
@@ -54,18 +46,11 @@ def main(arguments: Sequence[str] = ()) -> int:
         ValueError: files that cannot be read or written; says what to do.
     """
     options = parser().parse_args(list(arguments))
-    from pathlib import Path
-
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 
-    out = Path(options.out)
-    if out.suffix.lower() not in formats.WRITTEN:
-        raise CommandError(f"{out.name}: nothing writes {out.suffix or 'files without a suffix'}; use "
-                           f"{', '.join(formats.WRITTEN)}")  # fmt: skip
-    got = formats.read(options.inputs, options.body, formats.Reading(trim=options.trim))
-    for note in got.notes:
-        print(note)
+    out = scene_files.path_to_write(options.out)
+    got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
     if got.scene.agents < 2:
         raise CommandError(
             f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people"
@@ -76,8 +61,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     refined = apart(got.scene, got.body, options.apart, options.keep)
     for title, scene in (("before", got.scene), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
-    for path in formats.write(refined, out, got.body, progress=True):
-        print(f"written: {path}")
+    scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     return 0
 
 

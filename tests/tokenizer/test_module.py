@@ -2,65 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import lightning as L
 import pytest
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.core.mixins.hparams_mixin import _given_hyperparameters_context
-from torch.utils.data import DataLoader
 
 from magnet.body import load_body
 from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene, concatenate
-from magnet.motion.tokens import by_token, scene_deltas
+from magnet.motion.tokens import scene_deltas
 from magnet.testing import random_scene, tiny_denoiser, without_absent
-from magnet.tokenizer import RawPose, Tokenizer
+from magnet.tokenizer import RawPose
 from magnet.tokenizer.features import features
+
+from .small import Scenes, conditions, tiny, trainer
 
 CLOSE = {"rtol": 0.0, "atol": 2e-5}
 """Products of other sizes add in another order: not the same bits."""
-
-
-def tiny(scene: Scene | None = None, **fields: Any) -> Tokenizer:
-    torch.manual_seed(0)
-    small = {"network": {"width": 24, "depth": 2}, "quantizer": {"codebook_dim": 16, "codebook_size": 32}}
-    groups = {key: {**small[key], **value} if key in small else value for key, value in fields.items()}
-    tokenizer = Tokenizer(**{**small, **groups})
-    if scene is not None:
-        tokenizer.init_codebook([scene])
-    return tokenizer
-
-
-def conditions(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
-    return scene.betas, by_token(scene_deltas(scene))
-
-
-class Scenes(L.LightningDataModule):
-    """Four fixed batches, in order."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.batches = [random_scene(3, 32, 2, torch.Generator().manual_seed(seed)) for seed in range(4)]
-
-    def statistics_batches(self) -> Iterator[Scene]:
-        yield from self.batches
-
-    def train_dataloader(self) -> DataLoader[Scene]:
-        return DataLoader(self.batches, batch_size=None)  # type: ignore[arg-type]
-
-    val_dataloader = test_dataloader = predict_dataloader = train_dataloader
-
-    def transfer_batch_to_device(self, batch: Scene, device: torch.device, dataloader_idx: int) -> Scene:
-        return batch.to(device)
-
-
-def trainer(folder: Path, **options: Any) -> L.Trainer:
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-    return L.Trainer(default_root_dir=folder, **{**quiet, **options})
 
 
 # -- encoding and decoding ---------------------------------------------------------------------
@@ -252,119 +210,6 @@ def test_training_reports_what_it_should(tmp_path: Path) -> None:
         joints, truth = tokenizer.body.joints(decoded), tokenizer.body.joints(batch)
         errors.append(float((joints - truth)[..., 1:, :].norm(dim=-1).mean()))
     assert logged["val/mpjpe_cm"] == pytest.approx(100 * sum(errors) / len(errors), rel=1e-4)
-
-
-# -- checkpoints -------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tokenizer, Path]:
-    """A trained tokenizer and the folder with the checkpoint of each of its four epochs."""
-    folder = tmp_path_factory.mktemp("run")
-    tokenizer = tiny(optimizer={"warmup_steps": 2})
-    keep = ModelCheckpoint(folder, filename="{epoch}", save_top_k=-1)
-    trainer(folder, max_epochs=4, callbacks=[keep]).fit(tokenizer, datamodule=Scenes())
-    return tokenizer, folder
-
-
-def test_a_loaded_tokenizer_is_bit_identical(run: tuple[Tokenizer, Path], scene: Scene) -> None:
-    tokenizer, folder = run
-    loaded = Tokenizer.load(folder / "epoch=3.ckpt")
-    state = tokenizer.state_dict()
-    assert not loaded.training and dict(loaded.hparams) == dict(tokenizer.hparams)
-    assert all(torch.equal(state[name], value) for name, value in loaded.state_dict().items())
-    assert torch.equal(loaded.encode_scene(scene), tokenizer.eval().encode_scene(scene))
-
-
-def test_resumed_training_ends_bit_identical(
-    run: tuple[Tokenizer, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tokenizer, folder = run
-    again = tiny(optimizer={"warmup_steps": 2})
-    monkeypatch.setattr(again.quantizer, "kmeans_init", None)  # must not start a second time
-    resume = {"ckpt_path": folder / "epoch=1.ckpt", "weights_only": True}
-    trainer(tmp_path, max_epochs=4, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
-    state = tokenizer.state_dict()
-    assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
-
-
-def test_training_the_decoder_alone_leaves_the_meaning_of_codes(
-    run: tuple[Tokenizer, Path], tmp_path: Path, scene: Scene
-) -> None:
-    before, folder = run
-    start = str(folder / "epoch=3.ckpt")
-    after = tiny(
-        start_from=start,
-        decoder_only=True,
-        loss={"joint": 0.1, "foot_velocity": 0.1},
-        quantizer={"dead_code_threshold": 5.0},
-    )
-    trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(after, datamodule=Scenes())
-    changed = [name for name, value in after.state_dict().items() if not torch.equal(before.state_dict()[name], value)]
-    assert changed and all(name.startswith("vqvae.decoder.") for name in changed)
-    assert torch.equal(before.eval().encode_scene(scene), after.eval().encode_scene(scene))
-
-
-def test_there_is_no_decoder_alone_without_codes(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="give start_from a trained tokenizer"):
-        trainer(tmp_path, enable_checkpointing=False).fit(tiny(decoder_only=True), datamodule=Scenes())
-
-
-def test_the_learning_rate_falls_to_zero_on_a_cosine(run: tuple[Tokenizer, Path]) -> None:
-    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
-    assert checkpoint["lr_schedulers"][0]["_last_lr"] == [pytest.approx(0.0, abs=1e-12)]
-
-
-def test_resuming_with_another_size_names_the_field(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
-    said = r"quantizer.codebook_size: the checkpoint's tokenizer has 32, this one 64.*--model.quantizer.codebook_size"
-    with pytest.raises(ValueError, match=said):
-        trainer(tmp_path, enable_checkpointing=False).fit(
-            tiny(quantizer={"codebook_size": 64}),
-            datamodule=Scenes(),
-            ckpt_path=run[1] / "epoch=1.ckpt",
-            weights_only=True,
-        )
-
-
-def test_what_is_no_tokenizer_is_refused(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such tokenizer checkpoint"):
-        Tokenizer.load(tmp_path / "missing.ckpt")
-    text = tmp_path / "text.ckpt"
-    text.write_text("not a checkpoint")
-    whole = (run[1] / "epoch=3.ckpt").read_bytes()
-    cut = tmp_path / "cut.ckpt"
-    cut.write_bytes(whole[: len(whole) // 2])
-    weights = tmp_path / "weights.ckpt"
-    torch.save({"state_dict": {}, "hyper_parameters": {}}, weights)
-    for path in (text, cut, weights):
-        with pytest.raises(ValueError, match=f"{path.name}: not a tokenizer's checkpoint"):
-            Tokenizer.load(path)
-    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
-    checkpoint["hyper_parameters"]["quantizer"]["codebook_size"] = 64
-    torch.save(checkpoint, tmp_path / "shape.ckpt")
-    with pytest.raises(
-        ValueError, match=r"quantizer.codes is \(1, 32, 16\), expected \(1, 64, 16\).*'quantizer.codebook_size': 64"
-    ):
-        Tokenizer.load(tmp_path / "shape.ckpt")
-
-
-def test_a_denoisers_checkpoint_gives_its_tokenizer(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
-    checkpoint = torch.load(run[1] / "epoch=3.ckpt", weights_only=True)
-    state = {f"tokenizer.{name}": value for name, value in checkpoint["state_dict"].items()}
-    outer = {
-        "state_dict": state,
-        "hyper_parameters": {"width": 3},
-        "tokenizer_hyper_parameters": checkpoint["hyper_parameters"],
-    }
-    torch.save(outer, tmp_path / "denoiser.ckpt")
-    loaded = Tokenizer.load(tmp_path / "denoiser.ckpt")
-    assert all(torch.equal(state[f"tokenizer.{name}"], value) for name, value in loaded.state_dict().items())
-
-
-def test_a_tokenizer_inside_another_module_keeps_its_own_fields() -> None:
-    with _given_hyperparameters_context({"width": 99}, "anything"):
-        tokenizer = tiny()
-    assert "layers" not in tokenizer.hparams and tokenizer.hparams["quantizer"]["codebook_size"] == 32
 
 
 # -- without a codebook ------------------------------------------------------------------------

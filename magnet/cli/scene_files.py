@@ -1,0 +1,70 @@
+"""What commands that read scenes from files and write them to one have in common."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from magnet.export.formats import Read, Reading
+
+FBX = "; for .fbx write .glb and let Blender convert it (docs/export.md)"
+
+
+def parser_of(command: str, description: str | None, epilog: str) -> argparse.ArgumentParser:
+    """A parser that knows IN, OUT, --body and --trim."""
+    options = argparse.ArgumentParser(
+        f"magnet {command}",
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
+    options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
+    options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
+    options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
+    return options
+
+
+def path_to_write(out: str) -> Path:
+    """OUT, whose suffix is one that can be written.
+
+    Raises:
+        CommandError: it is not.
+    """
+    from magnet.cli.errors import CommandError
+    from magnet.export import formats
+
+    path = Path(out)
+    if path.suffix.lower() not in formats.WRITTEN:
+        raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use "
+                           f"{', '.join(formats.WRITTEN)}{FBX if path.suffix.lower() == '.fbx' else ''}")  # fmt: skip
+    return path
+
+
+def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
+    """The scenes of all IN; what was noted on the way is printed.
+
+    Raises:
+        CommandError: there are no scenes.
+        ValueError: files that cannot be read; says what to do.
+    """
+    from magnet.cli.errors import CommandError
+    from magnet.export import formats
+
+    got = formats.read(options.inputs, options.body, reading)
+    for note in got.notes:
+        print(note)
+    if not got.scene.scenes:
+        raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
+    return got
+
+
+def say_written(paths: Iterable[Path]) -> None:
+    """Name the files that were written, with their sizes."""
+    for path in paths:
+        count = path.stat().st_size
+        print(f"written: {path} ({f'{count / 1e6:.1f} MB' if count >= 1e5 else f'{count / 1e3:.1f} kB'})")
