@@ -36,6 +36,7 @@ $(READY): pyproject.toml constraints.txt | $(PY)
 	@echo "setup: installing magnet and the pinned packages, a few minutes the first time (PIP_ARGS=-vvv shows how)"
 	@$(PY) -m pip install -qq --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[dev]'
 	@$(PY) -c 'import torch; print("setup: done, torch", torch.__version__)'
+	@$(PY) -m magnet.cli.all_answers  # so that the first --help is quick
 	@touch $(READY)
 
 setup: $(READY)  ## make the virtual environment with the pinned packages

@@ -10,17 +10,13 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import yaml
-
 from magnet.cli.config_files import Layer
+from magnet.cli.flags import Options, class_in_flags, spec_of, valued
 
-Options = dict[str, Any]
 KEYS = ("model", "data", "task")
 """Options under which one of several classes stands."""
 
@@ -59,26 +55,6 @@ def settle(layers: Sequence[Layer], flags: Sequence[str]) -> Settled:
     return Settled(tuple(layers), classes, tuple(notes))
 
 
-def spec_of(value: Any) -> Options:
-    """A class and its options from what stands under a key: a mapping, or the class's name alone."""
-    if isinstance(value, str):
-        return {"class_path": value}
-    return value if isinstance(value, dict) else {}
-
-
-def class_in_flags(flags: Sequence[str], key: str) -> str | None:
-    """The class that the last flag to name one names under a key; by a mapping or in a file, too."""
-    named = [value for name, value in valued(flags) if name in (f"--{key}", f"--{key}.class_path")]
-    value: Any = named[-1] if named else None
-    if value and (value.startswith("{") or value.endswith((".yaml", ".yml"))):
-        try:
-            text = value if value.startswith("{") else Path(value).read_text(encoding="utf-8")
-            return spec_of(yaml.safe_load(text)).get("class_path")
-        except (OSError, yaml.YAMLError):
-            return None  # the parser says what is wrong with it
-    return None if value in ("", "null") else value
-
-
 def one_class(flags: Sequence[str]) -> list[str]:
     """The flags with the last of several that name a class under one key, and no other."""
     kept = list(flags)
@@ -88,14 +64,6 @@ def one_class(flags: Sequence[str]) -> list[str]:
         for i in reversed(places[:-1]):
             del kept[i : i + (1 if "=" in kept[i] else 2)]
     return kept
-
-
-def valued(flags: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Each flag's name and value."""
-    for argument, after in pairwise([*flags, ""]):
-        name, equals, value = argument.partition("=")
-        if name.startswith("--"):
-            yield name, value if equals else after
 
 
 def same_class(one: str, other: str) -> bool:

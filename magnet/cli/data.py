@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magnet.cli import answers
 from magnet.cli.data_list import add_list, run_list
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
@@ -89,13 +90,18 @@ def command_parser(command: str) -> argparse.ArgumentParser:
 
 def show_help(given: argparse.Namespace) -> int:
     """Help of a command, with a data set's own options where one is named."""
+    given.parser.print_help()
+    if given.run in (run_prepare, run_check) and given.name:
+        print(answers.kept(f"data prepare {given.name} help", lambda: reader_help(given.name)), end="")
+    return 0
+
+
+def reader_help(name: str) -> str:
+    """Options of a data set's own; nothing where there is no such data set."""
     from magnet.datamodules import registry
 
-    given.parser.print_help()
-    if given.run in (run_prepare, run_check) and (kind := registry.readers().get(given.name)) is not None:
-        print(f"\noptions of {kind.title}:\n")
-        reader_parser(kind).print_help()
-    return 0
+    kind = registry.readers().get(name)
+    return "" if kind is None else f"\noptions of {kind.title}:\n\n{reader_parser(kind).format_help()}"
 
 
 # -- options -----------------------------------------------------------------------------------

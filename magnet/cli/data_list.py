@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from magnet.cli import answers
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -27,23 +29,26 @@ def add_list(one: argparse.ArgumentParser) -> None:
 
 
 def run_list(given: argparse.Namespace) -> int:
-    from rich.console import Console
+    answers.show(f"data list {given.name or ''}", lambda console: draw_list(console, given.name))
+    return 0
 
+
+def draw_list(console: Console, name: str | None) -> bool:
+    """Everything that there is to tell, or of one data set. -> whether it will be the same the next time"""
     from magnet.datamodules import registry
 
-    console = Console(highlight=False)
-    if given.name:
-        show_reader(console, registry.reader(given.name))
-        return 0
+    if name:
+        show_reader(console, registry.reader(name))
+        return True
     for kind in registry.readers().values():
         show_reader(console, kind)
     for entry in registry.entries():
         if entry.reader is None and not entry.combines:
             show_data(console, entry)
-    for name, error in registry.failures().items():
-        console.print(f"[bold red]{name}[/]", soft_wrap=True)
+    for plugin, error in registry.failures().items():
+        console.print(f"[bold red]{plugin}[/]", soft_wrap=True)
         show(console, "failed to load", f"{type(error).__name__}: {error}")
-    return 0
+    return not registry.failures()
 
 
 def show_reader(console: Console, kind: type[Reader]) -> None:

@@ -89,16 +89,37 @@ def run(command: str, arguments: list[str]) -> int:
         CommandError: no such command.
     """
     if command in TRAINER_COMMANDS:
+        if (code := quick_answer(command, arguments)) is not None:
+            return code
         from magnet.cli.train import run_trainer
 
         return run_trainer(command, arguments)
     if command == "tasks":
-        from magnet.cli.tasks import list_tasks
+        from magnet.cli import task_list
 
-        return list_tasks(arguments)
+        return task_list.main(arguments)
     if command in LIGHT_COMMANDS:
         return int(importlib.import_module(f"magnet.cli.{command}").main(arguments) or 0)
     raise CommandError(no_such("command", command, COMMANDS, "magnet --help"))
+
+
+def quick_answer(command: str, arguments: list[str]) -> int | None:
+    """Answer for help, or for an option that there is not, out of what was kept; None where nothing is known of it."""
+    from magnet.cli import answers, flags
+
+    topic = flags.help_topic(arguments)
+    if topic is not None:
+        text = answers.recall(f"{command} help {topic} {answers.width()}")
+        if text is None:
+            return None
+        print(text, end="")
+        return 0
+    known = answers.recall(f"{command} flags")
+    said = flags.unknown_flag(arguments, known) if known else None
+    if said is None:
+        return None
+    print(flags.refused(command, said), file=sys.stderr)
+    return 2
 
 
 def usage() -> str:

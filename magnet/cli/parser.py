@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import inspect
 import re
 import sys
@@ -14,6 +13,7 @@ from jsonargparse import ActionConfigFile, Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import wrong_value
+from magnet.cli.flags import chosen_flags, closest, refused
 
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
@@ -154,8 +154,7 @@ class Parser(LightningArgumentParser):
         """Say what is wrong, and the closest thing that would be right."""
         told = self if self.command or Parser.root is None else Parser.root
         said = told.clearer(message)
-        stop = "" if said.endswith("?") else "."
-        print(f"magnet {told.command}: error: {said}{stop} See magnet {told.command} --help", file=sys.stderr)
+        print(refused(told.command, said), file=sys.stderr)
         sys.exit(2)
 
     def clearer(self, message: str) -> str:
@@ -171,7 +170,7 @@ class Parser(LightningArgumentParser):
         if unknown or refused:
             field = refused[1] if refused else ""
             name = unknown[1].partition("=")[0] if unknown else self._written(field, field)
-            return f"no option {name}{self._had_by_others(name) or _closest(name, self._flags())}"
+            return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:
             key = required[1]
@@ -200,7 +199,7 @@ class Parser(LightningArgumentParser):
         """That another class has the option which the chosen one lacks; empty where none has."""
         key, _, field = name.lstrip("-").partition(".")
         classes = self.classes.get(key, {})
-        having = [each for each, kind in classes.items() if f"--{key}.{field}" in _flags_of(key, kind)] if field else []
+        having = [each for each, kind in classes.items() if f"{key}.{field}" in _options(key, kind)] if field else []
         chosen = self.chosen.get(key, "").rpartition(".")[2]
         if not having or chosen in having:
             return ""
@@ -208,13 +207,19 @@ class Parser(LightningArgumentParser):
         return f" of {chosen or f'this {key}'}; it belongs to another: --{key} {having[0]}{others}"
 
     def _flags(self) -> list[str]:
-        flags = [flag for action in self._actions for flag in action.option_strings]
-        for key, classes in self.classes.items():
-            chosen = self.chosen.get(key)
-            for name, kind in classes.items():
-                if chosen is None or chosen.rpartition(".")[2] == name:
-                    flags.extend(_flags_of(key, kind))
-        return flags
+        return chosen_flags(self.own_flags(), self.options(self.chosen), self.chosen)
+
+    def own_flags(self) -> list[str]:
+        """The command's own options."""
+        return [flag for action in self._actions for flag in action.option_strings]
+
+    def options(self, chosen: Mapping[str, str] | None = None) -> dict[str, dict[str, list[str]]]:
+        """Options of each class, or of those that are chosen where one is, by key and short name."""
+        wanted = {key: name.rpartition(".")[2] for key, name in (chosen or {}).items()}
+        return {
+            key: {name: _options(key, kind) for name, kind in classes.items() if wanted.get(key, name) == name}
+            for key, classes in self.classes.items()
+        }
 
 
 def _topic_of(group: Any) -> str:
@@ -223,30 +228,8 @@ def _topic_of(group: Any) -> str:
     return next((name for name in ("trainer", "sampler") if any(flag.startswith(f"--{name}") for flag in flags)), "")
 
 
-def _closest(name: str, known: list[str]) -> str:
-    """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
-    group, _, leaf = name.rpartition(".")
-    flags = [flag for flag in known if not flag.endswith((".help", "+")) and flag != name]
-    fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
-    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
-    leaf = leaf.lstrip("-")
-    near = [by_leaf[leaf]] if leaf in by_leaf else []
-    near = near or [flag for each, flag in by_leaf.items() if leaf in _words(each)][:-5:-1]
-    near = near or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
-    near = near or difflib.get_close_matches(name, [] if fields else flags, n=1)
-    if near:
-        return f"; did you mean {' or '.join(near)}?"
-    return f"; there are {', '.join(dict.fromkeys(fields))}" if group and fields else ""
-
-
-def _words(name: str) -> tuple[str, ...]:
-    """What a field may be called in short: each of its words, and their first letters, as `lr`."""
-    words = name.split("_")
-    return (*words, "".join(word[:1] for word in words))
-
-
-def _flags_of(key: str, kind: type) -> list[str]:
-    return [f"--{field}" for field in LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False)]
+def _options(key: str, kind: type) -> list[str]:
+    return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
 
 
 def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:

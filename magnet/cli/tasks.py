@@ -8,7 +8,7 @@ import itertools
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from jsonargparse import ArgumentError, ArgumentParser
 
@@ -17,7 +17,8 @@ from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.tasks import Task, registry
 from magnet.version import __version__
 
-SHOW_USAGE = "magnet tasks show NAME [--out FILE.png] [--people 2] [--task.FIELD VALUE]"
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,22 +150,11 @@ def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
     return no_such("option", flag, known, more)
 
 
-def list_tasks(arguments: list[str]) -> int:
-    """`magnet tasks`: all tasks, and the plug-ins that failed to load; `magnet tasks show NAME`: its schedule.
-
-    Raises:
-        CommandError: neither of these.
-    """
-    from rich.console import Console
+def draw_tasks(console: Console) -> bool:
+    """All tasks, and the plug-ins that failed to load. -> whether it will be the same the next time"""
     from rich.padding import Padding
     from rich.text import Text
 
-    if arguments[:1] == ["show"]:
-        return show_task(arguments[1:])
-    arguments = arguments[1:] if arguments[:1] == ["list"] else arguments
-    if arguments and arguments[0] not in ("-h", "--help"):
-        raise CommandError(f"magnet tasks {arguments[0]}: give nothing, or {SHOW_USAGE}")
-    console = Console(highlight=False)
     for entry in registry.entries():
         console.print(Text.assemble((entry.name, "bold cyan"), "  ", (origin(entry), "dim")))
         first = (inspect.getdoc(entry.task) or "").split("\n\n")[0].replace("\n", " ")
@@ -177,7 +167,7 @@ def list_tasks(arguments: list[str]) -> int:
         console.print(Padding(Text(f"{type(error).__name__}: {error}", "red"), (0, 0, 1, 4), expand=False))
     console.print("magnet tasks show NAME      draw in what order a task removes noise", style="dim")
     console.print("magnet test --task NAME     sample it and measure; magnet predict --task NAME", style="dim")
-    return 0
+    return not registry.failures()
 
 
 def origin(entry: registry.Registered) -> str:
@@ -254,10 +244,7 @@ def show_task(arguments: list[str]) -> int:
     from magnet.sampling.grid import Grid
 
     if not arguments or arguments[0].startswith("-"):
-        if set(arguments) & {"-h", "--help"}:
-            show_parser(None).print_help()
-            return 0
-        raise CommandError(f"say which task: {SHOW_USAGE}; there are {', '.join(registry.names())}")
+        raise CommandError(f"say which task: magnet tasks show NAME; there are {', '.join(registry.names())}")
     name, *rest = arguments
     task, shown = parse_shown(name, rest)
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)

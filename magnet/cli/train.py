@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import itertools
 import logging
 import os
@@ -16,8 +18,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import checkpoints
-from magnet.cli import checkpoint_config, class_options, outputs, run_folder
+from magnet.cli import answers, checkpoint_config, class_options, outputs, run_folder
 from magnet.cli.errors import CommandError, no_such
+from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request
 from magnet.cli.tasks import TaskChoice
@@ -26,6 +29,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
 from magnet.motion.scene import Scene
+from magnet.old_names import OPTIONS
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
@@ -56,7 +60,9 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     """
     quiet()
     if (topic := help_topic(arguments)) is not None:
-        MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {}), topic=topic))
+        print(answers.kept(f"{command} help {topic}", lambda: help_parser(command, topic).format_help()), end="")
+        if topic == "":
+            answers.keep(flag_answers(help_parser(command)))
         return 0
     named_classes()
     request = read_request(command, arguments, MODELS)
@@ -66,13 +72,36 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     return 0
 
 
-def help_topic(arguments: list[str]) -> str | None:
-    """What help is asked for: `--help TOPIC`, empty for `--help` alone; None where none is."""
-    for argument, after in itertools.pairwise([*arguments, "-"]):
-        name, equals, value = argument.partition("=")
-        if name in ("-h", "--help"):
-            return value if equals else "" if after.startswith("-") else after
-    return None
+def help_parser(command: str, topic: str = "") -> Parser:
+    """The parser that tells a command's help.
+
+    Raises:
+        CommandError: no such topic.
+    """
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {}), topic=topic))
+    assert Parser.root is not None
+    return Parser.root
+
+
+def help_answers(command: str) -> dict[str, Any]:
+    """A command's help of every topic but `all`, and what options it takes, for calls that import nothing."""
+    parser = help_parser(command)
+    found = flag_answers(parser)
+    for columns, topic in itertools.product(answers.WIDTHS, ["", *parser.topics()]):
+        parser.topic = topic
+        if topic != "all":
+            with answers.columns(columns):
+                found[f"{command} help {topic} {columns}"] = parser.format_help()
+    return found
+
+
+def flag_answers(parser: Parser) -> dict[str, Any]:
+    """What a command takes, as `flags.unknown_flag` reads it."""
+    chosen = {} if parser.command == "fit" else {"model": path_of(MODELS), "data": registry.default_path()}
+    old = {key: sorted(names) for key, names in OPTIONS.items()}
+    known = {"actions": parser.own_flags(), "classes": parser.options(), "chosen": chosen, "old": old}
+    return {f"{parser.command} flags": known}
 
 
 def named_classes() -> tuple[dict[str, type], dict[str, type]]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from magnet.cli import demo
+from magnet.cli import demo_shows as demo
 from magnet.datamodules.synthetic import Synthetic
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions

@@ -1,0 +1,131 @@
+"""Flags as they are written, and what may be meant by one that there is not; nothing heavy is imported to say so."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+Options = dict[str, Any]
+CLASS_WORDS = ("help", "class_path", "init_args", "dict_kwargs")
+
+
+def valued(flags: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Each flag's name and value."""
+    for argument, after in pairwise([*flags, ""]):
+        name, equals, value = argument.partition("=")
+        if name.startswith("--"):
+            yield name, value if equals else after
+
+
+def spec_of(value: Any) -> Options:
+    """A class and its options from what stands under a key: a mapping, or the class's name alone."""
+    if isinstance(value, str):
+        return {"class_path": value}
+    return value if isinstance(value, dict) else {}
+
+
+def class_in_flags(flags: Sequence[str], key: str) -> str | None:
+    """The class that the last flag to name one names under a key; by a mapping or in a file, too."""
+    named = [value for name, value in valued(flags) if name in (f"--{key}", f"--{key}.class_path")]
+    value: Any = named[-1] if named else None
+    if value and (value.startswith("{") or value.endswith((".yaml", ".yml"))):
+        try:
+            text = value if value.startswith("{") else Path(value).read_text(encoding="utf-8")
+            return spec_of(yaml.safe_load(text)).get("class_path")
+        except (OSError, yaml.YAMLError):
+            return None  # the parser says what is wrong with it
+    return None if value in ("", "null") else value
+
+
+def refused(command: str, said: str) -> str:
+    """A mistake in a command line, as it is printed."""
+    stop = "" if said.endswith("?") else "."
+    return f"magnet {command}: error: {said}{stop} See magnet {command} --help"
+
+
+def closest(name: str, known: Sequence[str]) -> str:
+    """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
+    group, _, leaf = name.rpartition(".")
+    flags = [flag for flag in known if not flag.endswith((".help", "+")) and flag != name]
+    fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
+    by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
+    leaf = leaf.lstrip("-")
+    near = [by_leaf[leaf]] if leaf in by_leaf else []
+    near = near or [flag for each, flag in by_leaf.items() if leaf in words(each)][:-5:-1]
+    near = near or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
+    near = near or difflib.get_close_matches(name, [] if fields else flags, n=1)
+    if near:
+        return f"; did you mean {' or '.join(near)}?"
+    return f"; there are {', '.join(dict.fromkeys(fields))}" if group and fields else ""
+
+
+def words(name: str) -> tuple[str, ...]:
+    """What a field may be called in short: each of its words, and their first letters, as `lr`."""
+    parts = name.split("_")
+    return (*parts, "".join(part[:1] for part in parts))
+
+
+def help_topic(arguments: Sequence[str]) -> str | None:
+    """What help is asked for: `--help TOPIC`, empty for `--help` alone; None where none is."""
+    for argument, after in pairwise([*arguments, "-"]):
+        name, equals, value = argument.partition("=")
+        if name in ("-h", "--help"):
+            return value if equals else "" if after.startswith("-") else after
+    return None
+
+
+def chosen_flags(
+    actions: Sequence[str], classes: Mapping[str, Mapping[str, Sequence[str]]], chosen: Mapping[str, str]
+) -> list[str]:
+    """All options that may be meant: the command's, and those of the classes that are chosen, or may be.
+
+    Args:
+        actions: the command's own.
+        classes: options of each class, without dashes, by key and short name.
+        chosen: the class under a key, short or dotted, where one is.
+    """
+    flags = list(actions)
+    for key, kinds in classes.items():
+        wanted = chosen.get(key)
+        for name, options in kinds.items():
+            if wanted is None or wanted.rpartition(".")[2] == name:
+                flags.extend(f"--{option}" for option in options)
+    return flags
+
+
+def unknown_flag(arguments: Sequence[str], known: Mapping[str, Any]) -> str | None:
+    """What is wrong with the first option that nothing here has; None where there is none, or where only the parser
+    can tell: with files, checkpoints and classes of the user's own, and for tasks.
+
+    Args:
+        arguments: after the command.
+        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, and `old` names by key.
+    """
+    if any(argument.partition("=")[0] in ("-c", "--config", "--ckpt_path") for argument in arguments):
+        return None
+    named = {key: name for key in known["classes"] if (name := class_in_flags(arguments, key))}
+    if any(name not in known["classes"][key] for key, name in named.items()):
+        return None
+    for argument in arguments:
+        name = argument.partition("=")[0].rstrip("+")
+        if name[:2] == "--" and name[2:3].isalpha() and not _accepted(name, known):
+            flags = chosen_flags(known["actions"], known["classes"], {**known["chosen"], **named})
+            return f"no option {name}{closest(name, flags)}"
+    return None
+
+
+def _accepted(name: str, known: Mapping[str, Any]) -> bool:
+    """Whether something takes an option, or may."""
+    key, _, rest = name[2:].partition(".")
+    if key == "task" or name.endswith("."):
+        return True
+    if key in known["classes"] and rest:
+        field = rest.removeprefix("init_args.").partition(".")[0]
+        fields = {option.split(".")[1] for options in known["classes"][key].values() for option in options}
+        return field in fields or field in CLASS_WORDS or field in known["old"].get(key, ())
+    return any(flag == name or name.startswith(f"{flag}.") or flag.startswith(name) for flag in known["actions"])

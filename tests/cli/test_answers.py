@@ -1,0 +1,96 @@
+"""Help, lists and mistyped flags: answered without importing Torch or Lightning, and with the same words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnet.cli import answers, flags
+from magnet.cli.main import LIGHT_COMMANDS, TRAINER_COMMANDS
+
+HEAVY = {"torch", "lightning", "jsonargparse", "numpy"}
+RUN = "import sys; from magnet.cli import main; code = main(sys.argv[1:]); print('\\n#', code, *sys.modules)"
+ASKED = [[command, "--help"] for command in {**TRAINER_COMMANDS, **LIGHT_COMMANDS}] + [
+    ["tasks"],
+    ["data", "list"],
+    ["data", "prepare", "--help"],
+    ["tasks", "show", "--help"],
+    ["test", "--help", "sampler"],
+    ["test", "--tsak", "joint_future"],
+    ["fit", "--model", "Denoiser", "--model.widht", "3"],
+    ["predict", "--data.max_agent", "2"],
+]
+COMPARED = [["test", "--help"], ["tasks"], ["data", "list"], ["test", "--tsak", "joint_future"]]
+"""Those that are also asked with nothing kept, which takes seconds each."""
+
+
+def answered(words: list[str], cache: Path) -> tuple[str, str, str, set[str]]:
+    """What a command prints, what it complains of, its exit code, and the modules that it imports."""
+    place = {"XDG_CACHE_HOME": str(cache), "COLUMNS": "90", "PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", RUN, *words], capture_output=True, text=True, env=place, timeout=120)
+    text, _, rest = done.stdout.rpartition("\n# ")
+    code, *modules = rest.split()
+    return text, done.stderr, code, set(modules)
+
+
+@pytest.mark.slow
+def test_what_is_kept_is_what_would_be_said_and_imports_nothing_heavy(tmp_path: Path) -> None:
+    place = {"XDG_CACHE_HOME": str(tmp_path / "kept"), "PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
+    subprocess.run([sys.executable, "-m", "magnet.cli.all_answers"], check=True, env=place, timeout=300)
+    for words in ASKED:
+        said = answered(words, tmp_path / "kept")
+        assert not said[3] & HEAVY, words
+        if words in COMPARED:
+            assert said[:3] == answered(words, tmp_path / "empty" / "_".join(words))[:3], words
+
+
+def test_answers_are_forgotten_with_the_code_that_they_were_made_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(answers.VARIABLE, raising=False)
+    monkeypatch.setattr(answers, "FRESH", True)
+    assert [answers.kept("a", lambda text=text: text) for text in ("one", "two")] == ["one", "one"]
+    for number in range(2 * answers.KEPT):
+        monkeypatch.setattr(answers, "code_digest", lambda number=number: f"changed{number}")
+        assert answers.kept("a", lambda number=number: f"three {number}") == f"three {number}"
+    assert len(list(tmp_path.glob("magnet/*"))) == answers.KEPT
+    monkeypatch.setenv(answers.VARIABLE, "my_tasks")  # which may change from call to call
+    assert answers.kept("a", lambda: "four") == "four"
+
+
+def test_a_place_that_cannot_be_written_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    monkeypatch.setattr(answers, "FRESH", True)
+    assert answers.kept("a", lambda: "one") == "one"
+
+
+KNOWN = {
+    "actions": ["--help", "--out", "--data", "--model", "--trainer.max_steps", "--trainer.logger", "--sampler.steps"],
+    "classes": {"model": {"Net": ["model.width", "model.loss.latent"]}, "data": {"Walks": ["data.root"]}},
+    "chosen": {"model": "Net"},
+    "old": {"model": ["size"]},
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--otu runs", "no option --otu; did you mean --out?"),
+        ("--width 3", "no option --width; did you mean --model.width?"),
+        ("--model.wdith 3", "no option --model.wdith; did you mean --model.width?"),
+        ("--trainer.max_step 3", None),  # the parser may take it as short for another
+        ("--trainer.maxsteps 3", "no option --trainer.maxsteps; did you mean --trainer.max_steps?"),
+        ("--model.width=3 --model.init_args.width 4 --model.loss.latent 1 --trainer.logger.save_dir x", None),
+        ("--model.size 3", None),
+        ("--task.anything 3", None),
+        ("--model my.Net --model.depth 3", None),
+        ("--config my.yaml --otu runs", None),
+        ("--ckpt_path last --otu runs", None),
+    ],
+)
+def test_only_what_nothing_can_take_is_refused_at_once(words: str, said: str | None) -> None:
+    assert flags.unknown_flag(words.split(), KNOWN) == said
