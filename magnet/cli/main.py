@@ -24,6 +24,7 @@ LIGHT_COMMANDS = {
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
+    "export-model": "write a model as ONNX files, for programs without torch",
     "doctor": "what is installed, what is missing and what to do about it",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS
@@ -99,7 +100,7 @@ def run(command: str, arguments: list[str]) -> int:
 
         return task_list.main(arguments)
     if command in LIGHT_COMMANDS:
-        return int(importlib.import_module(f"magnet.cli.{command}").main(arguments) or 0)
+        return int(importlib.import_module(f"magnet.cli.{command.replace('-', '_')}").main(arguments) or 0)
     raise CommandError(no_such("command", command, COMMANDS, "magnet --help"))
 
 

@@ -1,0 +1,50 @@
+"""`magnet export-model OUT.onnx`: a denoiser and its tokenizer as ONNX files, for programs without torch."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+EPILOG = """\
+OUT.onnx is the denoiser; OUT_decoder.onnx makes poses of its tokens, OUT_encoder.onnx tokens of poses. Each is run by
+onnxruntime before it is written and must give torch's numbers. What they take and give: docs/onnx.md.
+
+for example:
+  magnet export-model duet.onnx
+  magnet export-model mine.onnx --ckpt_path runs/duet_denoiser/latest/checkpoints/last.ckpt
+  python examples/sample_without_torch.py duet.onnx dance.npz
+"""
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: another suffix, or no such checkpoint.
+        ImportError: a package is missing; says which.
+        ValueError: a model that cannot be exported.
+    """
+    parser = argparse.ArgumentParser(
+        "magnet export-model",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
+    parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")
+    options = parser.parse_args(list(arguments))
+    from magnet.cli.errors import CommandError
+
+    out = Path(options.out)
+    if out.suffix.lower() != ".onnx":
+        raise CommandError(f"{out.name}: got {out.suffix or 'no suffix'}, expected .onnx")
+    from magnet import checkpoints
+    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.portable import OPSET, save_onnx
+
+    path = checkpoints.resolve(options.ckpt_path)
+    for file, off in save_onnx(Denoiser.load(path), out, path.stem).items():
+        print(f"written: {file} ({file.stat().st_size / 1e6:.1f} MB, opset {OPSET}, off by {off:.1g} from torch)")
+    return 0

@@ -1,0 +1,212 @@
+"""A denoiser and its tokenizer as ONNX files, for programs without torch.
+
+Three files, whose inputs and outputs are named as here and whose first axis B is free:
+
+    NAME.onnx          noisy (B, N, P, D), levels (B, N, P) int64, present (B, P) bool -> clean (B, N, P, D)
+    NAME_decoder.onnx  tokens (B, N, P, D), betas (B, P, 10) -> pose (B, T, P, 135), deltas (B, T, P, 9),
+                       pairs (B, T, P, P - 1, 9)
+    NAME_encoder.onnx  pose, betas, deltas, pairs as above -> tokens
+
+N is the model's window and T = 4 N; tokens are normalized, everything else is in real units. The files' metadata holds
+what a sampler needs beside them: `alpha_bar`, the share of the signal's variance left at levels 0 to K; `groups`, which
+of a token's D numbers share a noise level; fps, the version and the model's name.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import io
+import json
+import logging
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from magnet.denoiser.transformer import Transformer, block_causal, rotate
+from magnet.files import write_whole
+from magnet.motion.frames import POSE_FEATURES
+from magnet.motion.scene import FPS
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.sampling.noise import LEVELS, alpha_bar
+from magnet.tokenizer.module import Tokenizer
+from magnet.version import __version__
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+OPSET = 18
+"""Of the files: ONNX 1.13 of December 2022 and later read it."""
+NEEDS = 'ONNX files need onnx, onnxruntime and onnxscript: pip install "magnet-motion[onnx]"'
+MOST_OFF = 1e-4
+"""Largest difference between a file's numbers, by onnxruntime, and the model's that is let pass."""
+
+
+def all_at_once(transformer: Transformer, x: Tensor, present: Tensor) -> Tensor:
+    """`Transformer`'s blocks on all slots together, of which nobody looks at absent ones: no loop over the data.
+
+    x (B, N, P, d), present (B, P) bool -> (B, N, P, d), meaningless where somebody is absent
+    """
+    B, N, P, _ = x.shape
+    time = torch.arange(N, device=x.device).repeat_interleave(P)
+    there = present[:, None].expand(B, N, P).reshape(B, 1, 1, N * P)
+    # Who is absent sees itself at least: a softmax over nothing is not a number.
+    sees = there | torch.eye(N * P, dtype=torch.bool, device=x.device)
+    if transformer.options.causal_block:
+        sees = sees & block_causal(time, transformer.options.causal_block)
+    y = x.flatten(1, 2)
+    if transformer.options.rope == "hidden":
+        y = y + rotate(y, time)
+    for block in transformer.blocks:
+        y = block(y, time, sees)
+    return y.unflatten(1, (N, P))
+
+
+class PortableDenoiser(nn.Module):
+    """What `Denoiser.denoise` computes without a condition, in a form that can be traced.
+
+    Raises:
+        ValueError: a model with a part that ONNX has no operator for.
+    """
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        super().__init__()
+        if denoiser.posterior is not None:
+            raise ValueError(
+                "network.pairwise_posterior: it solves linear systems, which ONNX has no operator for; export a model "
+                "that was trained without it"
+            )
+        self.denoiser = [denoiser]  # in a list: only the transformer's weights belong to the file
+        self.transformer = copy.copy(denoiser.transformer)
+        self.transformer._blocks = functools.partial(all_at_once, denoiser.transformer)  # type: ignore[method-assign]
+
+    def forward(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        return self.transformer(self.denoiser[0]._without_lead(noisy), levels, present)
+
+
+class PortableDecoder(nn.Module):
+    """Normalized tokens to poses and transforms in real units."""
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        super().__init__()
+        self.layout, self.normalizer, self.tokenizer = denoiser.layout, denoiser.normalizer, denoiser.tokenizer
+
+    def forward(self, tokens: Tensor, betas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        latent, deltas, pairs = self.layout.unpack(self.normalizer.denormalize(tokens))
+        return self.tokenizer.decode(latent, betas, deltas), by_frame(deltas), pairwise_by_frame(pairs)
+
+
+class PortableEncoder(nn.Module):
+    """Inverse of `PortableDecoder`; first and last poses are held for a token each, as in `Denoiser.encode`."""
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        super().__init__()
+        self.layout, self.normalizer, self.tokenizer = denoiser.layout, denoiser.normalizer, denoiser.tokenizer
+        self.quantized = denoiser.quantized
+
+    def forward(self, pose: Tensor, betas: Tensor, deltas: Tensor, pairs: Tensor) -> Tensor:
+        still = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0]).expand(deltas.shape[0], TOKEN_FRAMES, deltas.shape[2], 9)
+        first = pose[:, :1].expand(-1, TOKEN_FRAMES, -1, -1)
+        last = pose[:, -1:].expand(-1, TOKEN_FRAMES, -1, -1)
+        held = torch.cat([first, pose, last], dim=1)
+        latent = self.tokenizer.encode(held, betas, torch.cat([still, deltas, still], dim=1), None, self.quantized)
+        tokens = self.layout.pack(latent[:, 1:-1], by_token(deltas), pairwise_by_token(pairs))
+        return self.normalizer.normalize(tokens)
+
+
+def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path, float]:
+    """Write a denoiser and its tokenizer as three ONNX files; see this module for what they take and give.
+
+    Args:
+        denoiser: trained, on the CPU.
+        path: of the denoiser; the others lie beside it.
+        name: of the model, for the files' metadata.
+
+    Returns:
+        The paths written (denoiser, decoder, encoder), and by how much onnxruntime's numbers differ from the model's.
+
+    Raises:
+        ImportError: onnx, onnxruntime or onnxscript is missing.
+        ValueError: a model that cannot be exported, or whose file computes something else.
+    """
+    path = Path(path).with_suffix(".onnx")
+    if not isinstance(denoiser.tokenizer, Tokenizer):
+        raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
+    layout, N, P = denoiser.layout, denoiser.window, denoiser.layout.agents
+    B, T = 2, TOKEN_FRAMES * N
+    tokens, betas = torch.randn(B, N, P, layout.width), torch.zeros(B, P, 10)
+    levels, present = torch.randint(0, LEVELS + 1, (B, N, P)), torch.ones(B, P, dtype=torch.bool)
+    deltas, pairs = torch.randn(B, T, P, 9), torch.randn(B, T, P, layout.slots, 9)
+    pose = torch.randn(B, T, P, POSE_FEATURES)
+    metadata = {
+        "alpha_bar": json.dumps([round(share, 9) for share in alpha_bar(torch.arange(LEVELS + 1)).tolist()]),
+        "groups": json.dumps(layout.groups().tolist()),
+        "model": name,
+        "fps": f"{FPS:g}",
+        "version": __version__,
+    }
+    of_poses = {"pose": pose, "betas": betas, "deltas": deltas, "pairs": pairs}
+    parts: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
+        "": (PortableDenoiser(denoiser), {"noisy": tokens, "levels": levels, "present": present}, ["clean"]),
+        "_decoder": (PortableDecoder(denoiser), {"tokens": tokens, "betas": betas}, ["pose", "deltas", "pairs"]),
+        "_encoder": (PortableEncoder(denoiser), of_poses, ["tokens"]),
+    }
+    written = {}
+    for suffix, (network, inputs, outputs) in parts.items():
+        content = _traced(network.eval(), inputs, outputs, metadata)
+        off = _difference(network, inputs, content)
+        file = path.with_name(f"{path.stem}{suffix}.onnx")
+        if not off <= MOST_OFF:
+            raise ValueError(f"{file.name}: onnxruntime's numbers differ from torch's by {off:.2g}; nothing is written")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file.parent, lambda _, name=file.name: name, lambda out, data=content: out.write(data))
+        written[file] = off
+    return written
+
+
+@torch.no_grad()
+def _difference(network: nn.Module, inputs: Mapping[str, Tensor], content: bytes) -> float:
+    """The largest difference between what onnxruntime and torch compute."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    got = session.run(None, {name: value.numpy() for name, value in inputs.items()})
+    told = network(*inputs.values())
+    wanted = told if isinstance(told, tuple) else (told,)
+    return max(float((torch.as_tensor(a) - b).abs().max()) for a, b in zip(got, wanted, strict=True))
+
+
+@torch.no_grad()
+def _traced(network: nn.Module, inputs: Mapping[str, Tensor], outputs: list[str], metadata: Mapping[str, str]) -> bytes:
+    """A network as the bytes of an ONNX file, checked by onnx itself."""
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401  torch's exporter is written in it
+    except ImportError as error:
+        raise ImportError(NEEDS) from error
+    free = torch.export.Dim("B", min=1)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells of operators that no part of this has
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program: Any = torch.onnx.export(
+            network,
+            tuple(inputs.values()),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=[{0: free} for _ in inputs],
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+        )
+    buffer = io.BytesIO()
+    program.save(buffer)
+    model = onnx.load_model_from_string(buffer.getvalue())
+    onnx.helper.set_model_props(model, dict(metadata))
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString())
