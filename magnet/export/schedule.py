@@ -61,13 +61,13 @@ def moments(schedule: MaskSchedule, count: int = 16) -> list[Moment]:
     for stage in schedule.stages:
         steps, inside = stage.levels.shape[0] - 1, slice(stage.start, stage.stop)
         rows = stage.levels.numpy()
-        hidden = None if stage.hidden is None else stage.hidden.numpy()
+        visibility = None if stage.visibility is None else stage.visibility.numpy()
         for step in sorted(number - done for number in wanted if done <= number < done + steps):
             level[inside] = rows[step]
             updated = (rows[step] != rows[step + 1]).any(axis=0)
             unseen = np.zeros((agents, schedule.tokens, agents), dtype=bool)
-            if hidden is not None:
-                unseen[:, inside] = hidden & updated[:, None, None]
+            if visibility is not None:
+                unseen[:, inside] = ~visibility & updated[:, None, None]
             empty = never | unseen[updated].all(axis=0)
             empty[: stage.start] = empty[stage.stop :] = True
             found.append(Moment(done + step, level.copy(), unseen, empty, (stage.start, stage.stop)))

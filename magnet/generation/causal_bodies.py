@@ -79,9 +79,9 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
     A step's views and the branches of guidance run as one batch, scenes first, then views; the first branch is the
     unguided one.
     """
-    if stage.hidden is None:
+    if stage.visibility is None:
         return clean.unflatten(0, (scenes, -1))[:, 0]
-    views, view_of = stage.hidden.unique(dim=0, return_inverse=True)
+    views, view_of = (~stage.visibility).unique(dim=0, return_inverse=True)
     each = clean.unflatten(0, (scenes, len(views), -1))[:, :, 0]  # (B, V, W, P, D)
     agent = torch.arange(clean.shape[2])
     return each[:, view_of, :, agent].permute(1, 2, 0, 3)

@@ -100,9 +100,9 @@ def lookahead_limit(schedule: MaskSchedule) -> Tensor:
         return limits
     done = [0] * schedule.agents
     for stage in schedule.stages:
-        if stage.hidden is None:
+        if stage.visibility is None:
             continue
-        gone = stage.hidden.all(dim=0) & schedule.known[stage.start : stage.stop]  # (W, P)
+        gone = ~stage.visibility.any(dim=0) & schedule.known[stage.start : stage.stop]  # (W, P)
         for agent in gone.any(dim=0).nonzero()[:, 0].tolist():
             limit = stage.start + int(gone[:, agent].int().argmax())
             limits[done[agent] : limit, agent] = limit

@@ -119,8 +119,8 @@ def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Pla
 def _moved(a: Stage, b: Stage) -> int | None:
     """By how many rows `b` is later than `a`, if it is the same stage otherwise; else None."""
     alike = a.ahead == b.ahead and a.levels.shape == b.levels.shape and torch.equal(a.levels, b.levels)
-    if a.hidden is None or b.hidden is None:
-        alike = alike and a.hidden is b.hidden
+    if a.visibility is None or b.visibility is None:
+        alike = alike and a.visibility is b.visibility
     else:
-        alike = alike and torch.equal(a.hidden, b.hidden)
+        alike = alike and torch.equal(a.visibility, b.visibility)
     return b.start - a.start if alike else None

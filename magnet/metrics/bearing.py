@@ -66,7 +66,7 @@ class PartnerBearing(ClipMeans):
 
 
 class TurnRate(MotionMetric):
-    """`turn_rate` in degrees/s: mean over samples, steps and people; `turn_rate@agent0` and so on are each slot's own.
+    """`turn_rate` in degrees/s: mean over samples, frames and people; `turn_rate@agent0` etc. are each slot's own.
 
     In recordings of leader and follower slot 0 leads.
     """

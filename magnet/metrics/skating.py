@@ -33,7 +33,7 @@ def toe_steps(joints: Tensor, fps: float = FPS, height: float = 0.05) -> tuple[T
 class FootSkating(ClipMeans):
     """`fs` in m/s: mean speed of standing toes that slide; 0 where none does.
 
-    Beside it `fs_ratio`, the share of all toe steps that slide, `fs_contact`, the share that stands, and
+    Beside it `fs_ratio`, the share of all toe frames that slide, `fs_contact`, the share that stands, and
     `fs_contacts`, how many stand: where that is 0, an `fs` of 0 says nothing.
 
     Args:
@@ -45,9 +45,9 @@ class FootSkating(ClipMeans):
     higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
         "fs": Column("FS", "m/s", "low", "speed of standing toes that slide", main=True),
-        "fs_ratio": Column("FS ratio", "", "low", "share of toe steps that slide"),
-        "fs_contact": Column("contact", "", "real", "share of toe steps that stand"),
-        "fs_contacts": Column("contacts", "", "", "number of toe steps that stand"),
+        "fs_ratio": Column("FS ratio", "", "low", "share of toe frames that slide"),
+        "fs_contact": Column("contact", "", "real", "share of toe frames that stand"),
+        "fs_contacts": Column("contacts", "", "", "number of toe frames that stand"),
     }
 
     def __init__(

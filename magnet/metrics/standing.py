@@ -16,14 +16,14 @@ from magnet.motion.scene import FPS
 
 
 class StandingToes(ClipMeans):
-    """`toe_still`: share of standing toes' steps slower than `still` m/s; `toe_speed`: median speed of all, m/s.
+    """`toe_still`: share of standing toe frames slower than `still` m/s; `toe_speed`: median speed of all, m/s.
 
-    A toe stands in a step where it is under `height` metres in both frames, as for FS, which measures the speed of
+    A toe stands in a frame where it is under `height` metres in both frames, as for FS, which measures the speed of
     the others. The median is read off a histogram and within `BIN` m/s.
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
-        "toe_still": Column("toes still", "", "real", "share of standing toes' steps under 5 cm/s"),
+        "toe_still": Column("toes still", "", "real", "share of standing toe frames under 5 cm/s"),
         "toe_speed": Column("toe speed", "m/s", "real", "median speed of standing toes"),
     }
 

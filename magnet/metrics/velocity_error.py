@@ -15,7 +15,7 @@ from magnet.motion.scene import FPS
 
 
 def velocity_error(generated: Tensor, truth: Tensor) -> Tensor:
-    """Mean distance of the 21 joints' steps from frame to frame. (..., T, P, 22, 3) x 2 -> (..., T - 1, P) metres
+    """Mean distance of the 21 joints' displacements a frame. (..., T, P, 22, 3) x 2 -> (..., T - 1, P) metres
 
     >>> import torch
     >>> truth = torch.zeros(1, 10, 2, 22, 3)
@@ -26,7 +26,7 @@ def velocity_error(generated: Tensor, truth: Tensor) -> Tensor:
 
 
 class VelocityError(ClipMeans):
-    """`mpjve`: mean over samples, steps, agents and 21 joints.
+    """`mpjve`: mean over samples, frame pairs, agents and 21 joints.
 
     Args:
         per_second: m/s. The default is metres a *frame* at the given fps, which is what the paper's

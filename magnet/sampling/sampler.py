@@ -144,7 +144,7 @@ def run_stage(
     """
     device = tokens.device
     levels = stage.levels.to(device).long()
-    hidden = None if stage.hidden is None else stage.hidden.to(device)
+    hidden = None if stage.visibility is None else ~stage.visibility.to(device)
     for now, after in pairwise(levels):
         group, group_after = (layout.spread(layout.group_levels(x)) for x in (now, after))
         moves = group != group_after

@@ -29,9 +29,9 @@ class Stage:
         start: token step at which the window begins.
         levels: (S + 1, W, P) int16 in 0..K. Row s holds the levels before denoising step s, the last row those after
             the last step. 0 is clean.
-        hidden: (P, W, P) bool or None. hidden[p, i, q]: while agent p's tokens are updated, the model must
-            not see agent q's token i. None: everybody sees everything. Agents that see different things are updated
-            from views of their own, which run as one batch.
+        visibility: (P, W, P) bool or None. visibility[p, i, q]: the model sees agent q's token i while agent p's tokens
+            are updated. None: every agent sees every token. Agents that see different tokens are updated from separate
+            views, which run as one batch.
         ahead: token steps of pure noise that the model is shown after the window, beyond the scene's end if need be.
             The model was trained on full windows and slows people down where a shorter window ends. What it predicts
             for these steps is decoded with the last block of a causal plan.
@@ -39,7 +39,7 @@ class Stage:
 
     start: int
     levels: Tensor
-    hidden: Tensor | None = None
+    visibility: Tensor | None = None
     ahead: int = 0
 
     @property
@@ -56,17 +56,17 @@ class Stage:
     def decentralized(self) -> bool:
         """Whether some agent does not see what this stage generates of another."""
         generated = (self.levels[0] > 0) & (self.levels[0] != self.levels[-1])
-        return self.hidden is not None and bool((self.hidden & generated).any())
+        return self.visibility is not None and bool((~self.visibility & generated).any())
 
     def padded(self, agents: int) -> Stage:
         """The same with free slots added, of which nothing is known and nothing is generated."""
         extra = agents - self.levels.shape[2]
         levels = torch.nn.functional.pad(self.levels, (0, extra), value=LEVELS)
-        hidden = self.hidden
-        if hidden is not None and extra:
-            hidden = torch.nn.functional.pad(hidden, (0, extra))
-            hidden = torch.cat([hidden, hidden[:1].expand(extra, -1, -1)])  # nobody's view: one that is there already
-        return dataclasses.replace(self, levels=levels, hidden=hidden)
+        visibility = self.visibility
+        if visibility is not None and extra:
+            visibility = torch.nn.functional.pad(visibility, (0, extra), value=True)
+            visibility = torch.cat([visibility, visibility[:1].expand(extra, -1, -1)])  # adds no new view
+        return dataclasses.replace(self, levels=levels, visibility=visibility)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class MaskSchedule:
     causal: bool = False
 
     def __post_init__(self) -> None:
-        hides = not self.lookahead or any(stage.hidden is not None for stage in self.stages)
+        hides = not self.lookahead or any(stage.visibility is not None for stage in self.stages)
         object.__setattr__(self, "causal", self.causal or hides)
         if tuple(self.known.shape) != (self.tokens, self.agents):
             raise ValueError(f"known: got {tuple(self.known.shape)}, expected {(self.tokens, self.agents)}")
@@ -310,6 +310,6 @@ class MaskSchedule:
                 hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
                 hidden |= active & (rows[-1] == LEVELS)
                 ahead = start + grid.window - stop
-                stages.append(Stage(start, rows.short(), hidden if hidden.any() else None, ahead))
+                stages.append(Stage(start, rows.short(), ~hidden if hidden.any() else None, ahead))
                 level[start:stop] = rows[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known, lookahead, causal)

@@ -141,11 +141,11 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
         width = stage.levels.shape[1] + stage.ahead
         _require(width <= grid.window, f"{place}: stage {number} is {width} tokens wide, the window {grid.window}")
         shape = (grid.agents, width - stage.ahead, grid.agents)
-        fits = stage.hidden is None or tuple(stage.hidden.shape) == shape
-        _require(fits, f"{place}: stage {number}: hidden is not of shape {shape}")
-        if stage.hidden is not None:
+        fits = stage.visibility is None or tuple(stage.visibility.shape) == shape
+        _require(fits, f"{place}: stage {number}: visibility is not of shape {shape}")
+        if stage.visibility is not None:
             agent = torch.arange(grid.agents)
-            blind = stage.hidden[agent, :, agent].T & (stage.levels[0] != stage.levels[-1])
+            blind = ~stage.visibility[agent, :, agent].T & (stage.levels[0] != stage.levels[-1])
             _require(not blind.any(), f"{place}: stage {number}: hides from an agent what it generates of itself")
     again = task.schedule(grid)
     same = torch.equal(again.known, known) and len(again.stages) == len(schedule.stages)
@@ -155,10 +155,10 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 
 def _same_stage(a: Stage, b: Stage) -> bool:
-    if (a.hidden is None) != (b.hidden is None) or (a.start, a.ahead) != (b.start, b.ahead):
+    if (a.visibility is None) != (b.visibility is None) or (a.start, a.ahead) != (b.start, b.ahead):
         return False
-    hidden = a.hidden is None or b.hidden is None or torch.equal(a.hidden, b.hidden)
-    return hidden and torch.equal(a.levels, b.levels)
+    alike = a.visibility is None or b.visibility is None or torch.equal(a.visibility, b.visibility)
+    return alike and torch.equal(a.levels, b.levels)
 
 
 def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
@@ -194,14 +194,15 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     tokens = begin(tokens, noise, schedule.known, layout)
     history = History.empty(tokens)
-    last = max((n for n, stage in enumerate(schedule.stages) if stage.hidden is not None), default=-1)
+    last = max((n for n, stage in enumerate(schedule.stages) if stage.visibility is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
         before, past = tokens, history.copy()
         tokens = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
-        if stage.hidden is None:
+        if stage.visibility is None:
             continue
         window = slice(stage.start, stage.stop)
-        for hidden in stage.hidden.unique(dim=0):
+        every = ~stage.visibility
+        for hidden in every.unique(dim=0):
             secret = layout.spread(layout.group_levels(hidden.long()) > 0)  # (W, P, D)
             changed = before.clone()
             changed[:, window] = torch.where(secret, 10 * other[:, window], before[:, window])
@@ -218,7 +219,7 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
                 model, [stage], changed, mask_noise, present, layout, guidance=guidance, history=remembered
             )
             same = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
-            for agent in (stage.hidden == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
+            for agent in (every == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
                 _require(same[agent], f"{_place(task, grid)}: {message}")
 
@@ -240,8 +241,8 @@ def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
     same = len(first.stages) == len(second.stages) and torch.equal(first.known[:, order], second.known)
     _require(same, f"{place}: knows or generates other things for the slots they are in")
     for number, (stage, other) in enumerate(zip(first.stages, second.stages, strict=True)):
-        hidden = None if stage.hidden is None else stage.hidden[order][:, :, order]
-        alike = _same_stage(other, dataclasses.replace(stage, levels=stage.levels[:, :, order], hidden=hidden))
+        seen = None if stage.visibility is None else stage.visibility[order][:, :, order]
+        alike = _same_stage(other, dataclasses.replace(stage, levels=stage.levels[:, :, order], visibility=seen))
         _require(alike, f"{place}: stage {number} treats agents differently for the slots they are in")
     generator = torch.Generator().manual_seed(1)
     shape = (1, grid.tokens, grid.agents, layout.width)

@@ -110,7 +110,7 @@ def never_shown(schedule: MaskSchedule, stages: Sequence[Stage]) -> Tensor:
     for stage in stages:
         window, made = slice(stage.start, stage.stop), stage.levels[0] != stage.levels[-1]
         shown = torch.zeros_like(seen)
-        shown[:, window] = True if stage.hidden is None else ~stage.hidden
+        shown[:, window] = True if stage.visibility is None else stage.visibility
         told = seen.clone()
         for agent in made.any(dim=0).nonzero()[:, 0].tolist():
             heard = shown[agent, first:].any(dim=0) & done

@@ -58,9 +58,9 @@ class Quantized:
     """What a quantizer makes of vectors (..., D)."""
 
     latent: Tensor  # (..., C) the code; gradients pass straight to the vectors
-    index: Tensor  # (..., levels) int, the code chosen at each level; -1 where masked out
+    index: Tensor  # (..., quantizers) int, the code chosen in each codebook; -1 where masked out
     commitment: Tensor  # () mean squared distance from a vector to its code, gradient to the vectors only
-    counts: Tensor  # (levels, codes) how often each code was chosen, over all processes in training
+    counts: Tensor  # (quantizers, codes) how often each code was chosen, over all processes in training
 
 
 class Quantizer(Protocol):

@@ -28,7 +28,7 @@ from magnet.tokenizer.losses import JOINT_LOSSES, masked_mean, matrices, orthono
 from magnet.tokenizer.options import AugmentOptions, AutoencoderOptions, QuantizerOptions, TokenizerLoss
 from magnet.tokenizer.quantizer import KMEANS_VECTORS, ResidualVQ
 from magnet.tokenizer.raw import RawPose
-from magnet.tokenizer.usage import CodeUse, by_level
+from magnet.tokenizer.usage import CodeUse, by_quantizer
 from magnet.tokenizer.vqvae import VQVAE
 from magnet.training.optim import adamw_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
@@ -109,7 +109,7 @@ class Tokenizer(L.LightningModule):
     def encode(
         self, pose: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
-        """Quantized latents, summed over levels.
+        """Quantized latents, summed over quantizers.
 
         Args:
             pose: (B, T, P, 135), T a multiple of 4.
@@ -147,7 +147,7 @@ class Tokenizer(L.LightningModule):
         return self.vqvae.decoder.receptive_field  # the encoder's is no larger
 
     def requantize(self, latent: Tensor) -> Tensor:
-        """The code nearest to each latent; with several levels, their sum. (..., C) -> same"""
+        """The code nearest to each latent; with several quantizers, their sum. (..., C) -> same"""
         return self.quantizer.nearest(latent)
 
     def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
@@ -274,7 +274,7 @@ class Tokenizer(L.LightningModule):
             self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
             if self.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-                logged |= {f"train/{name}": value for name, value in by_level(quantized.counts).items()}
+                logged |= {f"train/{name}": value for name, value in by_quantizer(quantized.counts).items()}
                 scenes = slice(0, GLANCE)
                 error, _ = self._joint_errors(pose.detach()[scenes], batch.select(scenes))
                 logged["train/mpjpe_cm"] = 100 * masked_mean(error, seen.counts[scenes])

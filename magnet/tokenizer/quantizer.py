@@ -19,27 +19,27 @@ CROWD = 4.0
 
 
 class ResidualVQ(Float32):
-    """Residual vector quantizer: each level holds codes for what the levels before it left over.
+    """Residual vector quantizer: each codebook quantizes the residual of the codebooks before it.
 
-    Codes are buffers: no gradient moves them. In training mode they follow the vectors that chose them, by an
-    exponential moving average; in evaluation, or when `frozen`, nothing moves. Whether to sum over processes
-    is asked at every call, because Lightning makes its process group after its modules; every process then
-    holds the same bits.
+    Codes are buffers and get no gradient. In training mode an exponential moving average of the vectors assigned to
+    a code updates it. In evaluation, or when `frozen`, codes stay. Counts and sums are reduced over processes, so every
+    process holds the same bits. Whether there are several is asked at each call, because Lightning makes its process
+    group after its modules.
 
     Args:
-        codebook_size: codes a level, paper Table A.2.
+        codebook_size: codes in each codebook, paper Table A.2.
         codebook_dim: numbers in a code, paper Table A.2.
-        num_quantizers: levels; 1 is the paper's single codebook.
-        ema_decay: of the moving averages.
-        dead_code_threshold: a code whose average count a batch falls below this is moved to a vector of the batch. With
-            fewer than 4 vectors a code in a batch the bar is lowered in proportion, or small batches would
-            keep throwing good codes away (ours).
+        num_quantizers: codebooks; 1 is the paper's single codebook.
+        ema_decay: decay of the moving averages.
+        dead_code_threshold: a code whose average count per batch falls below this is replaced by a vector of the batch.
+            With fewer than 4 vectors per code in a batch the threshold is lowered in proportion; otherwise small
+            batches would replace good codes (ours).
     """
 
     unit_input = True
-    codes: Tensor  # (levels, codes, D)
-    ema_count: Tensor  # (levels, codes)
-    ema_sum: Tensor  # (levels, codes, D)
+    codes: Tensor  # (quantizers, codes, D)
+    ema_count: Tensor  # (quantizers, codes)
+    ema_sum: Tensor  # (quantizers, codes, D)
     initialized: Tensor  # () bool
 
     def __init__(
@@ -79,12 +79,12 @@ class ResidualVQ(Float32):
                 self.kmeans_init(flat.detach()[keep], generator)
             residual, latent = flat, torch.zeros_like(flat)
             index, commitment, counts = [], flat.new_zeros(()), []
-            for level in range(self.num_quantizers):
-                chosen = self._nearest(residual.detach(), level)
-                code = self.codes[level][chosen]
+            for book in range(self.num_quantizers):
+                chosen = self._nearest(residual.detach(), book)
+                code = self.codes[book][chosen]
                 distance = (residual - code).square().mean(-1)
                 commitment = commitment + torch.where(keep, distance, 0.0).sum() / keep.sum().clamp(min=1)
-                counts.append(self.ema_update(residual.detach(), chosen, keep, level, generator, update))
+                counts.append(self.ema_update(residual.detach(), chosen, keep, book, generator, update))
                 index.append(torch.where(keep, chosen, -1))
                 latent, residual = latent + code, residual - code
             if flat.requires_grad:
@@ -102,17 +102,17 @@ class ResidualVQ(Float32):
 
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
-        """The sum of codes nearest to each vector, level by level; nothing moves. (..., D) -> (..., D) float32"""
+        """The sum of codes nearest to each vector, codebook by codebook; nothing moves. (..., D) -> (..., D) float32"""
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
             latent = torch.zeros_like(residual)
-            for level in range(self.num_quantizers):
-                code = self.codes[level][self._nearest(residual, level)]
+            for book in range(self.num_quantizers):
+                code = self.codes[book][self._nearest(residual, book)]
                 latent, residual = latent + code, residual - code
             return latent.view(vectors.shape)
 
-    def _nearest(self, vectors: Tensor, level: int) -> Tensor:
-        return _nearest(vectors, self.codes[level])
+    def _nearest(self, vectors: Tensor, book: int) -> Tensor:
+        return _nearest(vectors, self.codes[book])
 
     # -- following -----------------------------------------------------------------------------
 
@@ -122,7 +122,7 @@ class ResidualVQ(Float32):
         vectors: Tensor,
         chosen: Tensor,
         keep: Tensor,
-        level: int,
+        book: int,
         generator: torch.Generator | None,
         update: bool,
     ) -> Tensor:
@@ -137,8 +137,8 @@ class ResidualVQ(Float32):
         count, total = summed[:, 0], summed[:, 1:]
         several = count.sum()
         decay = torch.where(several > 0, self.ema_decay, 1.0)
-        ema_count = decay * self.ema_count[level] + (1 - decay) * count
-        ema_sum = decay * self.ema_sum[level] + (1 - decay) * total
+        ema_count = decay * self.ema_count[book] + (1 - decay) * count
+        ema_sum = decay * self.ema_sum[book] + (1 - decay) * total
 
         least = self.dead_code_threshold * (several / (CROWD * self.size)).clamp(max=1.0)
         dead = ema_count < least
@@ -147,9 +147,9 @@ class ResidualVQ(Float32):
         ema_count = torch.where(dead, least, ema_count)
         ema_sum = torch.where(dead[:, None], least * fresh, ema_sum)
         # A code that nobody chose stays where it is to the bit.
-        codes = torch.where((count > 0)[:, None], ema_sum / ema_count[:, None], self.codes[level])
+        codes = torch.where((count > 0)[:, None], ema_sum / ema_count[:, None], self.codes[book])
         codes = torch.where(dead[:, None], fresh, codes)
-        self.ema_count[level], self.ema_sum[level], self.codes[level] = ema_count, ema_sum, codes
+        self.ema_count[book], self.ema_sum[book], self.codes[book] = ema_count, ema_sum, codes
         return count
 
     def _picks(self, vectors: Tensor, keep: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -176,9 +176,9 @@ class ResidualVQ(Float32):
         if not len(pool):
             return
         pool = _some(pool, KMEANS_VECTORS * self.size, generator)
-        for level in range(self.num_quantizers):
+        for book in range(self.num_quantizers):
             codes = _broadcast(_kmeans(pool, self.size, generator))
-            self.codes[level] = codes
+            self.codes[book] = codes
             pool = pool - codes[_nearest(pool, codes)]
         self.ema_count.fill_(1.0)
         self.ema_sum.copy_(self.codes)

@@ -18,11 +18,11 @@ def perplexity(counts: Tensor) -> Tensor:
     return torch.special.entr(share).sum(-1).exp().float()
 
 
-def by_level(counts: Tensor) -> dict[str, Tensor]:
-    """Usage and perplexity of each level, numbered when there are several. counts: (levels, codes)"""
+def by_quantizer(counts: Tensor) -> dict[str, Tensor]:
+    """Usage and perplexity of each quantizer, numbered when there are several. counts: (quantizers, codes)"""
     named = {}
-    for level, count in enumerate(counts):
-        suffix = f"_{level}" if len(counts) > 1 else ""
+    for number, count in enumerate(counts):
+        suffix = f"_{number}" if len(counts) > 1 else ""
         named[f"usage{suffix}"] = usage(count)
         named[f"perplexity{suffix}"] = perplexity(count)
     return named
@@ -32,20 +32,21 @@ class CodeUse(Metric):
     """Usage and perplexity over an epoch, exact over processes.
 
     Args:
-        levels: codebooks in a row.
-        codes: codes in each.
+        num_quantizers: residual quantizers in a row.
+        codebook_size: codes of each.
     """
 
     higher_is_better = True
     full_state_update = False
-    counts: Tensor  # (levels, codes)
+    counts: Tensor  # (quantizers, codes)
 
-    def __init__(self, levels: int, codes: int) -> None:
+    def __init__(self, num_quantizers: int, codebook_size: int) -> None:
         super().__init__()
-        self.add_state("counts", torch.zeros(levels, codes, dtype=torch.long), dist_reduce_fx="sum")
+        counts = torch.zeros(num_quantizers, codebook_size, dtype=torch.long)
+        self.add_state("counts", counts, dist_reduce_fx="sum")
 
     def update(self, counts: Tensor) -> None:
         self.counts += counts.long()
 
     def compute(self) -> dict[str, Tensor]:
-        return by_level(self.counts)
+        return by_quantizer(self.counts)

@@ -112,7 +112,7 @@ def test_every_agent_is_read_from_its_own_view_without_guidance():
     hidden = torch.zeros(3, 2, 3, dtype=torch.bool)
     hidden[0, 1, 1] = hidden[2, 1, 0] = True
     views, of = hidden.unique(dim=0, return_inverse=True)
-    stage = Stage(0, torch.zeros(2, 2, 3, dtype=torch.long), hidden)
+    stage = Stage(0, torch.zeros(2, 2, 3, dtype=torch.long), ~hidden)
     clean = torch.zeros(2, len(views), 4, 2, 3, 1)
     clean += 100 * torch.arange(2).view(2, 1, 1, 1, 1, 1) + 10 * torch.arange(len(views)).view(1, -1, 1, 1, 1, 1)
     clean += torch.arange(4).view(1, 1, 4, 1, 1, 1)
@@ -120,5 +120,5 @@ def test_every_agent_is_read_from_its_own_view_without_guidance():
     for scene in range(2):
         for agent in range(3):
             assert (seen[scene, :, agent] == 100 * scene + 10 * int(of[agent])).all()
-    plain = own_view(clean[:, 0].flatten(0, 1), dataclasses.replace(stage, hidden=None), 2)
+    plain = own_view(clean[:, 0].flatten(0, 1), dataclasses.replace(stage, visibility=None), 2)
     assert plain.shape == (2, 2, 3, 1) and (plain[1] == 100).all()

@@ -50,7 +50,7 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
     made = run(model, scene, task, context, stats)
     schedule = task.schedule(planning_grid(10, 2, context // 4, 8, FAST))
     assert stats.calls == schedule.evaluations
-    views = {len(stage.hidden.unique(dim=0)) if stage.hidden is not None else 1 for stage in schedule.stages}
+    views = {len(stage.visibility.unique(dim=0)) if stage.visibility is not None else 1 for stage in schedule.stages}
     assert stats.evaluations <= schedule.evaluations * max(views)
     assert made.agents == 4 and torch.equal(made.present, torch.tensor([[True, True, False, False]]))
     if schedule.causal:  # shown block by block, see test_showing

@@ -132,7 +132,7 @@ def hiding_stage(grid: Grid) -> Stage:
     levels[:, -1] = torch.tensor([1000, 500, 0])[:, None]
     hidden = torch.zeros(grid.agents, grid.tokens, grid.agents, dtype=torch.bool)
     hidden[:, -1] = ~torch.eye(grid.agents, dtype=torch.bool)
-    return Stage(0, levels, hidden)
+    return Stage(0, levels, ~hidden)
 
 
 def test_what_a_view_hides_cannot_influence_it(generator):

@@ -136,17 +136,17 @@ def test_rolling_over_what_is_known_in_between():
 @pytest.mark.parametrize("name", ["agentic_async", "agentic_sync"])
 def test_padded_plans_know_and_generate_nothing_in_free_slots_and_add_no_view(name):
     plan = registry.get(name)().schedule(Grid(12, 2, 4, steps=4, window=8))
-    assert any(stage.hidden is not None for stage in plan.stages)
+    assert any(stage.visibility is not None for stage in plan.stages)
     wide = plan.padded(4)
     assert (wide.tokens, wide.agents) == (12, 4)
     assert not wide.known[:, 2:].any()
     assert (wide.final_levels()[:, 2:] == LEVELS).all()
     assert torch.equal(wide.final_levels()[:, :2], plan.final_levels())
     for stage, narrow in zip(wide.stages, plan.stages, strict=True):
-        assert (stage.hidden is None) == (narrow.hidden is None)
-        if narrow.hidden is not None:
-            assert len(stage.hidden.unique(dim=0)) == len(narrow.hidden.unique(dim=0))
-            assert torch.equal(stage.hidden[:2, :, :2], narrow.hidden)
+        assert (stage.visibility is None) == (narrow.visibility is None)
+        if narrow.visibility is not None:
+            assert len(stage.visibility.unique(dim=0)) == len(narrow.visibility.unique(dim=0))
+            assert torch.equal(stage.visibility[:2, :, :2], narrow.visibility)
         assert stage.decentralized == narrow.decentralized
 
 

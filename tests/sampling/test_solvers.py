@@ -233,7 +233,7 @@ def test_rows_may_come_and_go_between_stages(name):
         held, history, first = held[:, gone:], history.release(gone), first + gone
         more = start[:, first + held.shape[1] : stage.stop]
         held, history = torch.cat([held, more], dim=1), history.extend(more)
-        moved = type(stage)(stage.start - first, stage.levels, stage.hidden)
+        moved = type(stage)(stage.start - first, stage.levels, stage.visibility)
         held = run_stages(mixing, [moved], held, mask_noise[:, first:], present, layout, history=history)
         out[:, first : first + held.shape[1]] = held
     assert torch.equal(out, whole)

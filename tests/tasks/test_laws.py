@@ -92,7 +92,7 @@ HIDING = ("agentic_async", "agentic_sync")
 def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, guidance: Guidance):
     task, grid = registry.get(name)(), Grid(8, 3, 3, steps=4, window=6, stride=2)
     schedule = task.schedule(grid)
-    assert any(stage.hidden is not None for stage in schedule.stages)
+    assert any(stage.visibility is not None for stage in schedule.stages)
     check_hidden(task, grid, schedule, guidance)
 
 
@@ -101,7 +101,7 @@ def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypat
     honest = sampler.run_stage
 
     def open_to_all(denoise: Any, stage: Stage, *rest: Any) -> Tensor:
-        return honest(denoise, dataclasses.replace(stage, hidden=None), *rest)
+        return honest(denoise, dataclasses.replace(stage, visibility=None), *rest)
 
     monkeypatch.setattr(sampler, "run_stage", open_to_all)
     task = registry.get(name)(**({"offset": 0.25} if name == "agentic_async" else {}))  # at 1 there is nothing to see

@@ -35,9 +35,9 @@ def test_motion_control_sees_the_others_up_to_now_and_no_further():
     assert len(schedule.stages) == 22
     for number, stage in enumerate(schedule.stages):
         now = 8 + number - stage.start
-        assert stage.hidden is not None or now == stage.levels.shape[1] - 1
-        if stage.hidden is not None:
-            shown = stage.levels[0].masked_fill(stage.hidden[0], LEVELS)
+        assert stage.visibility is not None or now == stage.levels.shape[1] - 1
+        if stage.visibility is not None:
+            shown = stage.levels[0].masked_fill(~stage.visibility[0], LEVELS)
             assert (shown[: now + 1, 1:] == 0).all()
             assert (shown[now + 1 :] == LEVELS).all()
 
@@ -46,7 +46,7 @@ def test_agents_in_step_do_not_see_each_others_current_tokens():
     for stage in AgenticSync().schedule(GRID).stages:
         current = (stage.levels[0] == LEVELS) & (stage.levels[-1] == 0)
         for agent in range(3):
-            hidden = stage.hidden[agent]
+            hidden = ~stage.visibility[agent]
             assert torch.equal(hidden, current & (torch.arange(3) != agent))
 
 
@@ -66,9 +66,9 @@ def test_whoever_has_not_started_is_hidden_and_nobody_else(offset):
     for stage in AgenticAsync(offset, order=(2, 0), block=2).schedule(grid).stages:
         waiting = (stage.levels[-1] == LEVELS) & (stage.levels[0] == LEVELS)
         waiting[int((stage.levels[-1] < LEVELS).any(dim=1).nonzero()[-1]) + 1 :] = False  # beyond the block
-        assert (stage.hidden is not None) == bool(waiting.any())
-        if stage.hidden is not None:
-            assert torch.equal(stage.hidden, waiting.expand_as(stage.hidden))
+        assert (stage.visibility is not None) == bool(waiting.any())
+        if stage.visibility is not None:
+            assert torch.equal(stage.visibility, ~waiting.expand_as(stage.visibility))
         assert not stage.decentralized, "what is denoised beside each other is placed together"
 
 

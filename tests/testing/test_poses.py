@@ -109,7 +109,7 @@ class Hiding:
         plan = AgenticSync().schedule(grid)
         stages = [dataclasses.replace(stage, ahead=0) for stage in plan.stages]
         if not self.hides:
-            stages[:-1] = [dataclasses.replace(stage, hidden=None) for stage in stages[:-1]]
+            stages[:-1] = [dataclasses.replace(stage, visibility=None) for stage in stages[:-1]]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), plan.known)
 
 

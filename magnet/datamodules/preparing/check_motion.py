@@ -37,7 +37,7 @@ FALL = 21.0
 """m/s2 of a pelvis downwards, over 0.1 s, for 2 % of the time: nothing but gravity pulls, and leaping dancers, who
 fold their legs, reach 18. Whoever leaps at twice the rate exceeds it."""
 STEP, STEPS = (0.14, 1.1), 4
-"""Seconds that a foot is on its way in a step, by the median of at least so many steps."""
+"""Seconds that a foot is on its way in a step, by the median of at least so many footsteps."""
 STROLL, SLOWLY = 0.9, 0.7
 """m/s of a foot on its way, and of a pelvis, that somebody with long steps stays below if time runs too slowly."""
 
@@ -234,11 +234,11 @@ def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
 def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None:
     """People move as fast as people do, so that the declared frame rate is the true one. joints of `WALKING`, y up
 
-    Too fast shows in what a pelvis does, in leaps that are steeper than falling, and in short steps; too slow only in
-    long steps, where anybody walks.
+    A rate that is too high shows in the pelvis, in drops faster than falling, and in short footsteps; one that is too
+    low shows in long footsteps alone, where somebody walks.
 
     Raises:
-        DataError: speeds, accelerations or the duration of steps are nobody's; or nothing moves at all.
+        DataError: speeds, accelerations or the duration of footsteps are nobody's; or nothing moves at all.
     """
     together: Bools = np.logical_and.reduce(valid, axis=1)
     if together.sum() < 2 * fps:
@@ -257,7 +257,7 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
     over = sure[2:] & sure[1:-1] & sure[:-2]
     down = -(pull[2:, :, 1] + pull[1:-1, :, 1] + pull[:-2, :, 1])[over] / 3
     fall = float(np.percentile(down, 98)) if over.any() else 0.0
-    durations, pace = steps(joints, together, fps)
+    durations, pace = footsteps(joints, together, fps)
     seen = f"at the declared {declared:g} frames a second pelvises move at {speed:.1f} m/s with {push95:.0f} m/s2"
     median = float(np.median(durations)) if len(durations) >= STEPS else None
     if median is not None:
@@ -274,10 +274,10 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
         )
 
 
-def steps(joints: Array, together: Bools, fps: float) -> tuple[Array, Array]:
-    """Seconds and mean speed of every step, a foot's way from one place to another. (T, P, 5, 3) -> two (number,)
+def footsteps(joints: Array, together: Bools, fps: float) -> tuple[Array, Array]:
+    """Seconds and mean speed of every footstep, a foot's way from one place to another. (T, P, 5, 3) -> two (number,)
 
-    What counts as moving is a share of the foot's own speed, so that steps are found whatever the frame rate.
+    What counts as moving is a share of the foot's own speed, so that footsteps are found whatever the frame rate.
     """
     durations, pace = [], []
     for person in range(joints.shape[1]):
