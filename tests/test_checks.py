@@ -19,7 +19,7 @@ from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 
 GRID = Grid(24, 3, 4, steps=4, window=8)
-TASKS = {entry.name: entry.task for entry in registry.entries() if entry.task.__module__.startswith("magnet.")}
+TASKS = {entry.name: entry.kind for entry in registry.entries() if entry.kind.__module__.startswith("magnet.")}
 OPTIONS: dict[str, type] = {"SamplerOptions": SamplerOptions, "Guidance": Guidance, "Grid": Grid, **TASKS}
 NO_NUMBER = (math.nan, math.inf, -math.inf, True, "3")
 FAR = -1e9  # below whatever an option may mean

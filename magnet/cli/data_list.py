@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from magnet.datamodules.reading.recording import Reader
-    from magnet.datamodules.registry import RegisteredData
+    from magnet.plugins import Registered
 
 BODIES = {
     "smplx": "--body SMPLX_NEUTRAL.npz",
@@ -42,9 +42,8 @@ def draw_list(console: Console, name: str | None) -> bool:
         return True
     for kind in registry.readers().values():
         show_reader(console, kind)
-    for entry in registry.entries():
-        if entry.reader is None and not entry.combines:
-            show_data(console, entry)
+    for entry in registry.unprepared():
+        show_data(console, entry)
     for plugin, error in registry.failures().items():
         console.print(f"[bold red]{plugin}[/]", soft_wrap=True)
         show(console, "failed to load", f"{type(error).__name__}: {error}")
@@ -73,12 +72,12 @@ def show_reader(console: Console, kind: type[Reader]) -> None:
         show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
 
 
-def show_data(console: Console, entry: RegisteredData) -> None:
+def show_data(console: Console, entry: Registered) -> None:
     """A data set that trains without being prepared."""
     from magnet.datamodules import registry
 
     console.print(f"[bold cyan]{entry.name}[/]  of {entry.origin}", soft_wrap=True)
-    show(console, "what it is", (entry.data.__doc__ or "").strip().partition("\n")[0])
+    show(console, "what it is", (entry.kind.__doc__ or "").strip().partition("\n")[0])
     show(console, "then", registry.fit_command(entry.name))
 
 

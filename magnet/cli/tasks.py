@@ -14,6 +14,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
+from magnet.plugins import Registered
 from magnet.tasks import Task, registry
 from magnet.version import __version__
 
@@ -157,8 +158,8 @@ def draw_tasks(console: Console) -> bool:
 
     for entry in registry.entries():
         console.print(Text.assemble((entry.name, "bold cyan"), "  ", (origin(entry), "dim")))
-        first = (inspect.getdoc(entry.task) or "").split("\n\n")[0].replace("\n", " ")
-        lines = [(str(getattr(entry.task, "formula", "")), "magenta"), (first, ""), (options(entry.task), "green")]
+        first = (inspect.getdoc(entry.kind) or "").split("\n\n")[0].replace("\n", " ")
+        lines = [(str(getattr(entry.kind, "formula", "")), "magenta"), (first, ""), (options(entry.kind), "green")]
         for line, style in lines:
             console.print(Padding(Text(line, style), (0, 0, 0, 4), expand=False))
         console.print()
@@ -170,9 +171,9 @@ def draw_tasks(console: Console) -> bool:
     return not registry.failures()
 
 
-def origin(entry: registry.Registered) -> str:
+def origin(entry: Registered) -> str:
     """Where a task comes from, with its version."""
-    package = entry.task.__module__.partition(".")[0]
+    package = entry.kind.__module__.partition(".")[0]
     if entry.origin != "magnet":
         return entry.origin
     return f"magnet {__version__}" if package == "magnet" else package  # a stranger's decorator says magnet, too

@@ -174,7 +174,7 @@ class MagnetCLI(LightningCLI):
         self._default_class(parser, "model", None if self.command == "fit" else path_of(MODELS))
         if self.command in SAMPLING:
             assert self.request.task is not None
-            parser.classes["task"] = {entry.name: entry.task for entry in task_registry.entries()}
+            parser.classes["task"] = {entry.name: entry.kind for entry in task_registry.entries()}
             tasks = parser.add_argument_group("task")
             tasks.add_argument("--task", type=dict[str, Any], default=self.request.task.spec)
             parser.add_class_arguments(SamplerOptions, "sampler")

@@ -8,16 +8,14 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Reader
+from magnet.plugins import Registered, Registry
 
-GROUP = "magnet.datamodules"
 BUILT_IN = (
     "synthetic",
     "cmu",
@@ -42,32 +40,26 @@ D = TypeVar("D", bound=type[LightningDataModule])
 R = TypeVar("R", bound=type[Reader])
 
 
-@dataclass(frozen=True)
-class RegisteredData:
-    """A data set and where it came from.
-
-    Args:
-        name: the class's own, which `--data` takes, such as "InterX".
-        data: the LightningDataModule.
-        origin: "magnet", or the package that brings it and its version.
-        combines: it is no data set of its own, but trains on others.
-    """
-
-    name: str
-    data: type[LightningDataModule]
-    origin: str
-    combines: bool = False
-
-    @property
-    def reader(self) -> type[Reader] | None:
-        """How its download is read; None: there is nothing to prepare."""
-        return getattr(self.data, "reader", None)
+def _check(name: str, data: type) -> None:
+    if not _is_data(data):
+        raise TypeError(f"{data!r} is no LightningDataModule; see docs/own.md")
+    if data.__name__ != name:
+        raise ValueError(f"it names the class {data.__name__}: call the entry point {data.__name__}, too")
+    if (kind := reader_of(data)) is not None:
+        _check_reader(kind)
 
 
-_data: dict[str, RegisteredData] = {}
-_readers: dict[str, type[Reader]] = {}
-_failures: dict[str, Exception] = {}
-_discovered = False
+def _check_reader(kind: type) -> None:
+    if not (isinstance(kind, type) and issubclass(kind, Reader)):
+        raise TypeError(f"{kind!r} is no Reader; see docs/own.md")
+    for known in _known_readers():
+        if known.name == kind.name and known is not kind:
+            raise ValueError(f"reader name {kind.name} is taken by {known.__module__}.{known.__qualname__}")
+
+
+DATA = Registry("data set", "magnet.datamodules", [f"magnet.datamodules.{module}" for module in BUILT_IN], _check)
+_readers: list[type[Reader]] = []  # of no data set of their own
+_combining: set[type] = set()  # that train on other data sets
 
 
 def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D], D]:
@@ -79,7 +71,9 @@ def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D
     """
 
     def register(data: D) -> D:
-        _add(data, origin, combines)
+        DATA.add(data.__name__, data, origin)
+        if combines:
+            _combining.add(data)
         return data
 
     return register
@@ -92,77 +86,50 @@ def register_reader(kind: R) -> R:
         TypeError: no Reader.
         ValueError: the name is taken by another class.
     """
-    if not (isinstance(kind, type) and issubclass(kind, Reader)):
-        raise TypeError(f"{kind!r} is no Reader; see docs/own.md")
-    known = _readers.get(kind.name)
-    if known is not None and known is not kind:
-        raise ValueError(f"reader name {kind.name} is taken by {known.__module__}.{known.__qualname__}")
-    _readers[kind.name] = kind
+    _check_reader(kind)
+    _readers.append(kind)
     return kind
 
 
-def _add(data: type[LightningDataModule], origin: str, combines: bool = False) -> None:
-    if not (isinstance(data, type) and issubclass(data, LightningDataModule)):
-        raise TypeError(f"{data!r} is no LightningDataModule; see docs/own.md")
-    known = _data.get(data.__name__)
-    if known is not None and known.data is not data:
-        raise ValueError(f"data set name {data.__name__} is taken by {known.data.__module__}.{data.__name__}")
-    entry = RegisteredData(data.__name__, data, origin, combines)
-    if entry.reader is not None:
-        register_reader(entry.reader)
-    _data[entry.name] = entry
+def reader_of(data: type) -> type[Reader] | None:
+    """How the download of a data set is read; None: there is nothing to prepare."""
+    return getattr(data, "reader", None)
+
+
+def _known_readers() -> list[type[Reader]]:
+    own = [reader_of(entry.kind) for entry in DATA.known.values()]
+    return [*_readers, *(kind for kind in own if kind is not None)]
 
 
 def unregister(data: type[LightningDataModule]) -> None:
     """Take a data set and its reader back, such as one that a test has registered."""
-    entry = _data.pop(data.__name__)
-    if entry.reader is not None:
-        del _readers[entry.reader.name]
+    del DATA.known[data.__name__]
 
 
 def discover(again: bool = False) -> None:
-    """Load all data sets once. A plug-in that fails is kept in `failures` and hides no other."""
-    global _discovered
-    if _discovered and not again:
-        return
-    _discovered = True
-    _failures.clear()
-    for module in BUILT_IN:
-        importlib.import_module(f"magnet.datamodules.{module}")
-    for point in entry_points(group=GROUP):
-        origin = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
-        try:
-            _load(point.load(), point.name, origin)
-        except Exception as error:  # a stranger's import may raise anything
-            _failures[point.name] = error
+    """Load all data sets, once."""
+    DATA.discover(again)
 
 
-def _load(data: Any, name: str, origin: str) -> None:
-    """A plug-in's class; it may have registered itself with the decorator, which does not know where from."""
-    if isinstance(data, type) and data.__name__ != name and issubclass(data, LightningDataModule):
-        raise ValueError(f"it names the class {data.__name__}: call the entry point {data.__name__}, too")
-    known = _data.get(name)
-    if known is not None and known.data is data:
-        _data[name] = replace(known, origin=origin)
-    else:
-        _add(data, origin)
-
-
-def entries() -> list[RegisteredData]:
+def entries() -> list[Registered]:
     """All data sets, ours first."""
     discover()
-    return sorted(_data.values(), key=lambda entry: _rank(entry.data))
+    return sorted(DATA.known.values(), key=lambda entry: _rank(entry.kind))
+
+
+def unprepared() -> list[Registered]:
+    """Data sets of their own that train without being prepared, ours first."""
+    return [entry for entry in entries() if reader_of(entry.kind) is None and entry.kind not in _combining]
 
 
 def _rank(kind: type) -> int:
     """Ours in the order of `BUILT_IN`, whatever was imported first; others after them."""
-    ours = [f"magnet.datamodules.{module}" for module in BUILT_IN]
-    return ours.index(kind.__module__) if kind.__module__ in ours else len(ours)
+    return DATA.modules.index(kind.__module__) if kind.__module__ in DATA.modules else len(DATA.modules)
 
 
 def classes() -> dict[str, type[LightningDataModule]]:
     """Every data set's class by its name; the first is the default."""
-    return {entry.name: entry.data for entry in entries()}
+    return {entry.name: entry.kind for entry in entries()}
 
 
 def default_path() -> str:
@@ -174,13 +141,13 @@ def default_path() -> str:
 def failures() -> dict[str, Exception]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
-    return dict(_failures)
+    return dict(DATA.failed)
 
 
 def readers() -> dict[str, type[Reader]]:
     """Every reader of downloads by its name, ours first."""
     discover()
-    return dict(sorted(_readers.items(), key=lambda item: _rank(item[1])))
+    return {kind.name: kind for kind in sorted(_known_readers(), key=_rank)}
 
 
 def reader(name: str) -> type[Reader]:
@@ -193,10 +160,9 @@ def reader(name: str) -> type[Reader]:
     if name in known:
         return known[name]
     for entry in entries():
-        if entry.name.lower() == name.lower() and entry.reader is None:
+        if entry.name.lower() == name.lower() and reader_of(entry.kind) is None:
             raise ValueError(f"{name} has no files to prepare: {fit_command(entry.name)} trains on it")
-    if name in _failures:
-        raise ValueError(f"data set {name} failed to load: {_failures[name]!r}") from _failures[name]
+    DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
     raise ValueError(f"no data set {name!r}; {hint}")
@@ -204,7 +170,7 @@ def reader(name: str) -> type[Reader]:
 
 def data_of(kind: type[Reader]) -> str:
     """Name of the data set that trains on a reader's stores; `Prepared`, which trains on any, where it has none."""
-    return next((entry.name for entry in entries() if entry.reader is kind), "Prepared")
+    return next((entry.name for entry in entries() if reader_of(entry.kind) is kind), "Prepared")
 
 
 def fit_command(data: str) -> str:

@@ -7,29 +7,29 @@ import importlib
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
-from importlib.metadata import entry_points
+from dataclasses import is_dataclass
 from typing import TypeVar
 
-GROUP = "magnet.tasks"
+from magnet.plugins import Registered, Registry
+
 VARIABLE = "MAGNET_TASKS"
-BUILT_IN = ("magnet.tasks.joint", "magnet.tasks.partner", "magnet.tasks.agentic", "magnet.tasks.inbetweening")
 
 T = TypeVar("T", bound=type)
 
 
-@dataclass(frozen=True)
-class Registered:
-    """A task and where it came from."""
-
-    name: str
-    task: type
-    origin: str
+def _check(name: str, task: type) -> None:
+    missing = [part for part in ("schedule", "formula") if not hasattr(task, part)]
+    if not is_dataclass(task) or missing:
+        what = f"has no {' and no '.join(missing)}" if missing else "is not a dataclass"
+        raise TypeError(f"task {name}: {task!r} {what}; see docs/tasks.md")
 
 
-known_tasks: dict[str, Registered] = {}
-failed_plugins: dict[str, Exception] = {}
-_discovered = False
+TASKS = Registry(
+    "task",
+    "magnet.tasks",
+    ("magnet.tasks.joint", "magnet.tasks.partner", "magnet.tasks.agentic", "magnet.tasks.inbetweening"),
+    _check,
+)
 
 
 def register_task(name: str, origin: str = "magnet") -> Callable[[T], T]:
@@ -41,36 +41,17 @@ def register_task(name: str, origin: str = "magnet") -> Callable[[T], T]:
     """
 
     def register(task: T) -> T:
-        _add(name, task, origin)
+        TASKS.add(name, task, origin)
         return task
 
     return register
 
 
-def _add(name: str, task: type, origin: str) -> None:
-    missing = [part for part in ("schedule", "formula") if not hasattr(task, part)]
-    if not is_dataclass(task) or missing:
-        what = f"has no {' and no '.join(missing)}" if missing else "is not a dataclass"
-        raise TypeError(f"task {name}: {task!r} {what}; see docs/tasks.md")
-    known = known_tasks.get(name)
-    if known is not None and known.task is not task:
-        raise ValueError(f"task name {name} is taken by {known.task.__module__}.{known.task.__qualname__}")
-    known_tasks[name] = Registered(name, task, origin)
-
-
 def discover(again: bool = False) -> None:
-    """Load all tasks once. A plug-in that fails is kept in `failures` and hides no other."""
-    global _discovered
-    if _discovered and not again:
-        return
-    _discovered = True
-    for module in BUILT_IN:
-        importlib.import_module(module)
-    for point in entry_points(group=GROUP):
-        origin = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
-        _load(point.name, point.load, origin)
-    for value in filter(None, os.environ.get(VARIABLE, "").split(",")):
-        _load_variable(value.strip())
+    """Load all tasks, once: ours, those of packages, and those that the variable MAGNET_TASKS names."""
+    if TASKS.discover(again):
+        for value in filter(None, os.environ.get(VARIABLE, "").split(",")):
+            _load_variable(value.strip())
 
 
 def _load_variable(value: str) -> None:
@@ -78,19 +59,19 @@ def _load_variable(value: str) -> None:
     module, _, name = value.partition(":")
     origin = f"{VARIABLE}={value}"
     if name:
-        _load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)
+        TASKS.load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)
         return
-    before = set(known_tasks)
+    before = set(TASKS.known)
     try:
         importlib.import_module(module)
-        own = [entry.name for entry in known_tasks.values() if entry.task.__module__.startswith(module)]
+        own = [entry.name for entry in TASKS.known.values() if entry.kind.__module__.startswith(module)]
         if not own:
             raise ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
     except Exception as error:  # a stranger's import may raise anything
-        failed_plugins[module] = error
+        TASKS.failed[module] = error
         return
-    for name in {*own, *(set(known_tasks) - before)}:
-        known_tasks[name] = Registered(name, known_tasks[name].task, origin)
+    for name in {*own, *(set(TASKS.known) - before)}:
+        TASKS.add(name, TASKS.known[name].kind, origin)
 
 
 def snake_case(name: str) -> str:
@@ -98,28 +79,16 @@ def snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
-def _load(name: str, load: Callable[[], type], origin: str) -> None:
-    try:
-        task = load()
-        own = [entry.name for entry in known_tasks.values() if entry.task is task]
-        for known in own:  # it has registered itself with the decorator, which does not know where from
-            known_tasks[known] = Registered(known, task, origin)
-        if not own:
-            _add(name, task, origin)
-    except Exception as error:  # a stranger's import may raise anything
-        failed_plugins[name] = error
-
-
 def names() -> list[str]:
     """Names of all tasks."""
     discover()
-    return sorted(known_tasks)
+    return sorted(TASKS.known)
 
 
 def entries() -> list[Registered]:
     """All tasks with their origins, by name."""
     discover()
-    return [known_tasks[name] for name in sorted(known_tasks)]
+    return [TASKS.known[name] for name in sorted(TASKS.known)]
 
 
 def get(name: str) -> type:
@@ -137,17 +106,16 @@ def get(name: str) -> type:
     """
     discover()
     if not isinstance(name, str):
-        raise ValueError(f"task: got {name!r}, expected a name: {', '.join(sorted(known_tasks))}")
-    if name in known_tasks:
-        return known_tasks[name].task
-    if name in failed_plugins:
-        raise ValueError(f"task {name} failed to load: {failed_plugins[name]!r}") from failed_plugins[name]
-    close = difflib.get_close_matches(name, known_tasks, n=1)
+        raise ValueError(f"task: got {name!r}, expected a name: {', '.join(sorted(TASKS.known))}")
+    if name in TASKS.known:
+        return TASKS.known[name].kind
+    TASKS.require_loaded(name)
+    close = difflib.get_close_matches(name, TASKS.known, n=1)
     hint = f"; did you mean {close[0]}?" if close else "."
-    raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(known_tasks))}.")
+    raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(TASKS.known))}.")
 
 
 def failures() -> dict[str, Exception]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
-    return dict(failed_plugins)
+    return dict(TASKS.failed)

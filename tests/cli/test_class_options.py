@@ -28,7 +28,7 @@ from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 MODELS, DATA = train.named_classes()
-TASKS = {entry.name: entry.task for entry in task_registry.entries()}
+TASKS = {entry.name: entry.kind for entry in task_registry.entries()}
 
 
 def told(config: Path) -> dict[str, Any]:

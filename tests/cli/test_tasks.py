@@ -16,6 +16,7 @@ from PIL import Image
 
 from magnet import __version__, cli
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.plugins import Registered
 from magnet.tasks import registry
 
 
@@ -40,9 +41,9 @@ class Foreign:
 @pytest.fixture
 def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
     registry.discover()
-    entry = registry.Registered("foreign", Foreign, "strange-tasks 3.1")
-    monkeypatch.setitem(registry.known_tasks, "foreign", entry)
-    monkeypatch.setitem(registry.failed_plugins, "broken", ImportError("no module named [nowhere]"))
+    entry = Registered("foreign", Foreign, "strange-tasks 3.1")
+    monkeypatch.setitem(registry.TASKS.known, "foreign", entry)
+    monkeypatch.setitem(registry.TASKS.failed, "broken", ImportError("no module named [nowhere]"))
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -61,7 +62,7 @@ def test_the_list_names_formula_origin_version_and_fields(capsys: pytest.Capture
     text = printed(capsys)
     for entry in registry.entries():
         assert entry.name in text
-        assert entry.task.formula in text
+        assert entry.kind.formula in text
     assert f"joint_future  magnet {__version__}" in text
     assert "foreign  strange-tasks 3.1" in text
     assert "--task.keep 1  --task.who [0,1]" in text
@@ -112,9 +113,9 @@ def test_help_of_a_command_explains_every_field_of_every_task(capsys: pytest.Cap
     assert list(sections) == registry.names()
     for entry in registry.entries():
         section = " ".join(sections[entry.name].split())
-        names = [each.name for each in dataclasses.fields(entry.task)]
+        names = [each.name for each in dataclasses.fields(entry.kind)]
         assert re.findall(r"--task\.(\w+) ", section) == names
-        explained = " ".join((inspect.getdoc(entry.task) or "").split())
+        explained = " ".join((inspect.getdoc(entry.kind) or "").split())
         for name in names:
             found = re.search(rf"\b{name}: (.*?)(?: \w+: |$)", explained)
             assert found

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from magnet import cli
+from magnet import cli, plugins
 from magnet.datamodules import Synthetic, registry
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.recording import Reader, Recording, Take
@@ -52,11 +52,11 @@ class Point:
 def offered(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Point]]:
     points: list[Point] = []
     before = {entry.name for entry in registry.entries()}
-    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == registry.GROUP else [])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: points if group == registry.DATA.group else [])
     yield points
     for entry in registry.entries():
         if entry.name not in before:
-            registry.unregister(entry.data)
+            registry.unregister(entry.kind)
     monkeypatch.undo()
     registry.discover(again=True)
 

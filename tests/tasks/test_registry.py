@@ -3,6 +3,7 @@ from typing import ClassVar
 
 import pytest
 
+from magnet import plugins
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
 
@@ -20,8 +21,8 @@ class Foreign:
 @pytest.fixture
 def clean_registry(monkeypatch):
     registry.discover()
-    monkeypatch.setattr(registry, "known_tasks", dict(registry.known_tasks))
-    monkeypatch.setattr(registry, "failed_plugins", {})
+    monkeypatch.setattr(registry.TASKS, "known", dict(registry.TASKS.known))
+    monkeypatch.setattr(registry.TASKS, "failed", {})
 
 
 class FakePoint:
@@ -43,7 +44,7 @@ def test_an_unknown_name_suggests_the_closest():
 
 
 def test_an_installed_package_adds_its_task(clean_registry, monkeypatch):
-    monkeypatch.setattr(registry, "entry_points", lambda group: [FakePoint("duel", lambda: Foreign)])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [FakePoint("duel", lambda: Foreign)])
     registry.discover(again=True)
     assert registry.get("duel") is Foreign
 
@@ -53,7 +54,7 @@ def test_a_plug_in_that_fails_is_listed_and_hides_no_other(clean_registry, monke
         raise ImportError("No module named nope")
 
     points = [FakePoint("broken", broken), FakePoint("duel", lambda: Foreign)]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: points)
     registry.discover(again=True)
     assert registry.get("duel") is Foreign
     assert "nope" in str(registry.failures()["broken"])

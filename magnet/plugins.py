@@ -1,0 +1,85 @@
+"""Classes that are known by name: ours, and those of installed packages, found through an entry-point group."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A class and where it came from.
+
+    Args:
+        name: by which options name it.
+        kind: the class.
+        origin: "magnet", or the package that brings it and its version.
+    """
+
+    name: str
+    kind: type
+    origin: str
+
+
+class Registry:
+    """Classes of one sort by name. A plug-in that fails to load is kept in `failed` and hides no other.
+
+    Args:
+        what: the sort, for messages, such as "task".
+        group: entry-point group of other packages.
+        modules: ours; importing them registers their classes.
+        check: called with a name and a class; raises TypeError or ValueError where they do not fit the sort.
+    """
+
+    def __init__(self, what: str, group: str, modules: Sequence[str], check: Callable[[str, type], None]) -> None:
+        self.what, self.group, self.modules, self.check = what, group, modules, check
+        self.known: dict[str, Registered] = {}
+        self.failed: dict[str, Exception] = {}
+        self.discovered = False
+
+    def add(self, name: str, kind: type, origin: str) -> None:
+        """Make a class known.
+
+        Raises:
+            TypeError: it is not of the sort.
+            ValueError: the name is taken by another class.
+        """
+        self.check(name, kind)
+        known = self.known.get(name)
+        if known is not None and known.kind is not kind:
+            raise ValueError(f"{self.what} name {name} is taken by {known.kind.__module__}.{known.kind.__qualname__}")
+        self.known[name] = Registered(name, kind, origin)
+
+    def discover(self, again: bool = False) -> bool:
+        """Load all classes, once. -> whether anything was loaded"""
+        if self.discovered and not again:
+            return False
+        self.discovered = True
+        self.failed.clear()
+        for module in self.modules:
+            importlib.import_module(module)
+        for point in entry_points(group=self.group):
+            self.load(point.name, point.load, f"{point.dist.name} {point.dist.version}" if point.dist else point.value)
+        return True
+
+    def load(self, name: str, load: Callable[[], type], origin: str) -> None:
+        """Load a plug-in. Its class may have registered itself with a decorator, which does not know the origin."""
+        try:
+            kind = load()
+            self.check(name, kind)
+            own = [entry.name for entry in self.known.values() if entry.kind is kind]
+            for each in own or [name]:
+                self.add(each, kind, origin)
+        except Exception as error:  # a stranger's import may raise anything
+            self.failed[name] = error
+
+    def require_loaded(self, name: str) -> None:
+        """Say why a plug-in is not there.
+
+        Raises:
+            ValueError: a plug-in of that name failed to load.
+        """
+        if name in self.failed:
+            raise ValueError(f"{self.what} {name} failed to load: {self.failed[name]!r}") from self.failed[name]
