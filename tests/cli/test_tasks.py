@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 from magnet import __version__, cli
-from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.plugins import Registered
+from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
 
 
