@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from magnet.cli import predict_files
 from magnet.cli.errors import CommandError, explain, no_such
 from magnet.version import __version__
 
@@ -14,7 +15,7 @@ TRAINER_COMMANDS = {
     "fit": "train a tokenizer or a denoiser",
     "validate": "measure a checkpoint on validation windows",
     "test": "sample a task on test scenes, measure it beside baselines",
-    "predict": "sample a task, write the scenes and a moving picture of them",
+    "predict": "sample a task on files of your own or on a data set; write scenes and moving pictures",
 }
 LIGHT_COMMANDS = {
     "tasks": "list the tasks that are installed, with their options; `tasks show NAME` draws one",
@@ -47,6 +48,7 @@ options of every command:
 for example:
   magnet demo
   magnet test --task joint_future
+  magnet predict A.bvh B.bvh --task partner_inpainting --out out.glb
   magnet fit --config configs/synthetic_tokenizer.yaml
 """
 
@@ -89,6 +91,8 @@ def run(command: str, arguments: list[str]) -> int:
     Raises:
         CommandError: no such command.
     """
+    if command == "predict" and predict_files.meant(arguments):
+        return predict_files.main(arguments)
     if command in TRAINER_COMMANDS:
         if (code := quick_answer(command, arguments)) is not None:
             return code

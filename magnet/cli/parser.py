@@ -105,7 +105,8 @@ class Parser(LightningArgumentParser):
 
     def _topics(self) -> str:
         width = max(map(len, self.topics()))
-        lines = [f"  magnet {self.command} --help {name:<{width}}  {what}" for name, what in self.topics().items()]
+        told = self.topics() | ({"files": "FILE...: motion of your own"} if self.command == "predict" else {})
+        lines = [f"  magnet {self.command} --help {name:<{width}}  {what}" for name, what in told.items()]
         names = ", ".join(name for classes in self.classes.values() for name in list(classes)[:2])
         return "\n".join(["more help:", *lines, f"  magnet {self.command} --help NAME, such as {names}", ""])
 
@@ -166,6 +167,7 @@ class Parser(LightningArgumentParser):
         if unknown and not unknown[1].startswith("-"):
             meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
             hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
+            hint = "files come first" if unknown[1].endswith((".bvh", ".npz")) and self.command == "predict" else hint
             return f"got {unknown[1]}, expected an option; {hint}"
         if unknown or refused:
             field = refused[1] if refused else ""

@@ -147,7 +147,11 @@ def read_fields(
 def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
     """What is said of an option that there is not."""
     flags = [each for action in parser._actions for each in action.option_strings if each.startswith("--")]
-    known = [each for each in flags if not each.startswith(("--print", "--task.help")) and each != "--task"]
+    known = [
+        each
+        for each in flags
+        if each not in ("--help", "--task", "--sampler") and not each.startswith(("--print", "--task.help"))
+    ]
     return no_such("option", flag, known, more)
 
 

@@ -1,0 +1,261 @@
+"""`magnet predict FILE...`: a task on motion of one's own, from files to a file; without files, from nothing."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magnet.cli import scene_files
+from magnet.cli.errors import CommandError
+
+if TYPE_CHECKING:
+    from magnet.api import Model
+    from magnet.cli.tasks import TaskChoice
+    from magnet.motion.scene import Scene
+    from magnet.sampling.options import SamplerOptions
+
+READ = (".npz", ".bvh")
+CONTEXT = 32
+"""Frames that are given of everybody where nothing is said, as in the tests of tasks: a second."""
+FUTURE = 150
+"""Frames that are sampled where nothing is said and nothing recorded is read: five seconds."""
+HELP = "magnet predict --help files"
+
+EPILOG = """\
+IN is a .bvh of any skeleton, an SMPL-X .npz or a scene of ours; several are several people of one world, in the order
+in which they are named: A.bvh is person 0. Everything is brought to 30 frames a second and, where other programs wrote
+it, onto the floor. The suffix of OUT says what is written, as for `magnet export`; several OUT are several kinds.
+
+for example:
+  magnet predict A.bvh B.bvh --out out.glb                               how it goes on for both
+  magnet predict A.bvh B.bvh --task partner_inpainting --out out.glb     A anew, to fit the recorded B
+  magnet predict A.bvh --people 2 --task partner_inpainting --out out.glb    a partner for A
+  magnet predict A.bvh B.bvh --task inbetweening --task.every 16 --out out.bvh
+  magnet predict scene.npz --task motion_control --task.target [1] --context 60 --seed 7 --out out.npz out.mp4
+  magnet predict --people 2 --frames 300 --out duet.glb                  from nothing
+
+tasks and their options: magnet tasks;  --sampler.FIELD: magnet predict --help sampler
+without files, people or this help's name, magnet predict samples a data set: magnet predict --help
+"""
+
+
+def meant(arguments: Sequence[str]) -> bool:
+    """Whether a command line after `predict` is about files, or about people from nothing, and not about a data set."""
+    first = arguments[0] if arguments else ""
+    about_help = list(arguments[:2]) == ["--help", "files"] or first == "--help=files"
+    people = any(argument.partition("=")[0] == "--people" for argument in arguments)
+    return about_help or people or (not first.startswith("-") and Path(first).suffix.lower() in READ)
+
+
+def parser() -> argparse.ArgumentParser:
+    options = argparse.ArgumentParser(
+        "magnet predict",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    options.add_argument("inputs", nargs="*", metavar="IN", help="a .npz or .bvh file; several are several people")
+    options.add_argument("--out", nargs="+", metavar="OUT", help="file to write; its suffix says what")
+    what = options.add_argument_group("what is sampled")
+    what.add_argument("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
+    what.add_argument("--task.FIELD", metavar="VALUE", help="an option of the task")
+    what.add_argument(
+        "--people", type=int, metavar="P", help="how many in all; those without a file are made from nothing"
+    )
+    what.add_argument(
+        "--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)"
+    )
+    what.add_argument(
+        "--frames",
+        type=int,
+        metavar="T",
+        help=f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})",
+    )
+    what.add_argument("--samples", type=int, default=1, metavar="S", help="so many answers (default: %(default)s)")
+    how = options.add_argument_group("how")
+    how.add_argument("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
+    how.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
+    how.add_argument("--sampler", metavar="PRESET", default="default", help="default, steady or paper")
+    how.add_argument("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
+    files = options.add_argument_group("files")
+    files.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
+    files.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
+    files.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
+    files.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
+    files.add_argument("--keep_floor", action="store_true", help="leave people at the height they were recorded at")
+    return options
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: files that cannot be read or written, or on which the task makes no sense; says what to do.
+    """
+    if meant(arguments) and arguments[0].startswith("--help"):
+        parser().print_help()
+        return 0
+    groups, words = split_groups(arguments)
+    options = parser().parse_args(words)
+    if not options.out:
+        raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
+    outs = [scene_files.path_to_write(out) for out in options.out]
+    scene, body, added = read_people(options)
+    task = task_of(options, groups["task"], added)
+    model = load_model(options, sampler_of(options.sampler, groups["sampler"]))
+    context, frames = lengths(options, task, scene, added, model)
+    began = time.perf_counter()
+    made = model.predict(
+        scene,
+        task.name,
+        context=context,
+        frames=frames,
+        seed=options.seed,
+        samples=options.samples,
+        **task.fields,
+    )
+    took = time.perf_counter() - began
+    print(f"{task.name}: {made.scenes * made.frames} frames in {took:.1f} s, seed {options.seed}")
+    from magnet.export import formats
+
+    for out in outs:
+        scene_files.say_written(formats.write(made.plain(), out, body, context_frames=made.context, progress=True))
+    return 0
+
+
+def split_groups(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
+    """Flags with their values of the groups `task` and `sampler`, and all other words."""
+    groups: dict[str, list[str]] = {"task": [], "sampler": []}
+    others: list[str] = []
+    rest = iter(arguments)
+    for word in rest:
+        group = next((name for name in groups if word.startswith(f"--{name}.")), None)
+        if group is None:
+            others.append(word)
+        else:
+            groups[group] += [word] if "=" in word else [word, *itertools.islice(rest, 1)]
+    return groups, others
+
+
+def read_people(options: argparse.Namespace) -> tuple[Scene, Any, tuple[int, ...]]:
+    """The scene of all files with room for those who are made from nothing. -> scene, body, slots of these
+
+    Raises:
+        CommandError: no files and no people, or fewer people than files hold.
+        ValueError: as `formats.read`.
+    """
+    import torch
+
+    from magnet.body import load_body
+    from magnet.export import formats
+    from magnet.motion.scene import FPS, empty_scene
+    from magnet.motion.tokens import TOKEN_FRAMES
+
+    if options.inputs:
+        reading = formats.Reading(FPS, options.trim, options.in_unit, options.up, keep_floor=options.keep_floor)
+        got = scene_files.read_inputs(options, reading)
+        scene, body = got.scene, got.body
+    else:
+        body = load_body(options.body or "open")
+        scene = empty_scene(1, TOKEN_FRAMES, 0, torch.zeros(())).replace(body=body.id)
+    people = scene.agents if options.people is None else options.people
+    if people < max(scene.agents, 1):
+        raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
+    added = tuple(range(scene.agents, people))
+    scene = scene.pad_agents(people)
+    present = scene.present.clone()
+    present[:, list(added)] = True
+    return scene.replace(present=present), body, added
+
+
+def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:
+    """The task; where people are added and it is for some of the people, it is for these.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
+    """
+    from magnet.cli.tasks import parse_task, task_class
+
+    name = options.task or ("joint_future" if options.inputs else "generation")
+    fields = {each.name for each in dataclasses.fields(task_class(name))}
+    below = [{"target": list(added)}] if added and "target" in fields else []
+    return parse_task(name, flags, below, "predict")
+
+
+def sampler_of(preset: str, flags: list[str]) -> SamplerOptions:
+    """How to sample.
+
+    Raises:
+        CommandError: no such preset or option, or a value that does not fit.
+    """
+    from jsonargparse import ArgumentParser
+
+    from magnet.cli.config_files import sampler_preset
+    from magnet.cli.tasks import read_fields
+    from magnet.sampling.guidance import Guidance
+    from magnet.sampling.options import SamplerOptions
+
+    known = ArgumentParser(exit_on_error=False)
+    known.add_class_arguments(SamplerOptions, "sampler")
+    known.set_defaults(flat({"sampler": sampler_preset(preset)}))
+    fields = read_fields(known, flags, (), "magnet predict --help sampler")["sampler"]
+    return SamplerOptions(**{**fields, "guidance": Guidance(**fields["guidance"])})
+
+
+def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
+    """Options of groups as `group.option`."""
+    found: dict[str, Any] = {}
+    for key, value in options.items():
+        found |= flat(value, f"{within}{key}.") if isinstance(value, dict) else {f"{within}{key}": value}
+    return found
+
+
+def load_model(options: argparse.Namespace, sampler: SamplerOptions) -> Model:
+    """The model that samples.
+
+    Raises:
+        CommandError: there is none of that name.
+    """
+    from magnet.api import Model
+    from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.denoiser.module import Denoiser
+
+    return Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
+
+
+def lengths(
+    options: argparse.Namespace, choice: TaskChoice, scene: Scene, added: tuple[int, ...], model: Model
+) -> tuple[int, int]:
+    """Frames that are given of everybody, and frames after them.
+
+    Raises:
+        CommandError: the task reads motion that was not recorded.
+        ValueError: the task makes no sense at these sizes.
+    """
+    from magnet.motion.tokens import TOKEN_FRAMES
+    from magnet.sampling.grid import Grid
+
+    nothing = bool(added) or not options.inputs
+    context = options.context if options.context is not None else 0 if nothing else CONTEXT
+    recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs else 0
+    if context > recorded:
+        raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
+    rest = options.frames or (recorded - context) or FUTURE
+    tokens, steps = -(-(context + rest) // TOKEN_FRAMES), model.sampler.steps
+    if added:  # planned with a past, for tasks that need one refuse to be planned without
+        planned = choice.task.schedule(Grid(tokens + 1, scene.agents, max(context // TOKEN_FRAMES, 1), steps)).known
+        if bool(planned[:, list(added)].any()):
+            raise CommandError(
+                f"{choice.name} reads motion of person {added[0]}, of whom no file tells; partner_inpainting adds "
+                "people to those that are there, generation makes everybody"
+            )
+    known = choice.task.schedule(Grid(tokens, scene.agents, context // TOKEN_FRAMES, steps)).known
+    reads = bool(known[context // TOKEN_FRAMES :].any())
+    return context, rest if options.frames or (reads and recorded > context) else FUTURE

@@ -1,0 +1,117 @@
+"""`magnet predict FILE...` as a person with recordings would use it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from magnet import cli
+from magnet.body import load_body
+from magnet.checkpoints import FOLDER
+from magnet.export import save_bvh
+from magnet.export.npz import save_smplx
+from magnet.motion.scene import Scene
+from magnet.tasks import registry
+
+QUICK = ["--sampler.steps", "2"]
+
+
+@pytest.fixture(scope="module")
+def duet(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """One duet as a scene of ours, as SMPL-X files and as BVH files of another rate."""
+    folder, body = tmp_path_factory.mktemp("recorded"), load_body()
+    scene = Scene.load(FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 48)
+    return {
+        "ours": [str(scene.save(folder / "duet.npz"))],
+        "smplx": [str(path) for path in save_smplx(scene, folder / "smplx.npz", body)],
+        "bvh": [str(path) for path in save_bvh(scene, folder / "a.bvh", body, unit="cm")],
+    }
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """What is printed by a command that must not fail."""
+    assert cli.main(["predict", *words]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("task", registry.names())
+def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> None:
+    out = tmp_path / "out.npz"
+    said(capsys, *duet["bvh"], "--task", task, "--frames", "16", "--out", str(out), *QUICK)
+    made, recorded = Scene.load(out), Scene.load(duet["ours"][0])
+    assert (made.frames, made.present.tolist()) == (48, [[True, True]])
+    assert made.given is not None
+    joints, truth = load_body().joints(made), load_body().joints(recorded)
+    given = made.given[0]
+    assert torch.isfinite(joints).all()
+    assert given.any() == (task != "generation")
+    assert (joints - truth)[0][given].abs().max() < 1e-3 if given.any() else True
+
+
+@pytest.mark.parametrize("kind", ["ours", "smplx", "bvh"])
+def test_whoever_wrote_the_files_the_given_people_are_as_recorded(kind, duet, tmp_path, capsys) -> None:
+    out = tmp_path / "out.npz"
+    said(capsys, *duet[kind], "--task", "partner_inpainting", "--context", "0", "--out", str(out), *QUICK)
+    made, recorded, body = Scene.load(out), Scene.load(duet["ours"][0]), load_body()
+    assert made.frames == recorded.frames
+    assert (body.joints(made) - body.joints(recorded))[0, :, 1].abs().max() < 1e-3
+    assert (body.joints(made) - body.joints(recorded))[0, :, 0].abs().max() > 0.05
+
+
+def test_a_person_alone_gets_a_partner(duet, tmp_path, capsys) -> None:
+    out = tmp_path / "out.npz"
+    said(capsys, duet["bvh"][1], "--people", "2", "--task", "partner_inpainting", "--out", str(out), *QUICK)
+    made, recorded, body = Scene.load(out), Scene.load(duet["ours"][0]), load_body()
+    assert made.present.tolist() == [[True, True]]
+    assert (body.joints(made)[0, :, 0] - body.joints(recorded)[0, :, 1]).abs().max() < 1e-3
+
+
+def test_the_seed_decides_and_several_kinds_are_written(duet, tmp_path, capsys) -> None:
+    made = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        outs = [str(tmp_path / f"{name}.npz"), str(tmp_path / f"{name}.glb")]
+        text = said(capsys, *duet["ours"], "--frames", "8", "--seed", str(seed), "--out", *outs, *QUICK)
+        assert f"seed {seed}" in text and all(f"written: {out}" in text for out in outs)
+        made.append(Scene.load(outs[0]).body_rot)
+    assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
+
+
+def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
+    said(capsys, "--people", "3", "--frames", "8", "--out", str(tmp_path / "trio.npz"), *QUICK)
+    assert Scene.load(tmp_path / "trio.npz").present.tolist() == [[True] * 3]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("BVH", "say where to: --out FILE"),
+        ("BVH --out a.fbx", "nothing writes .fbx"),
+        ("BVH --out a.npz --context 400", "the files hold 48 frames"),
+        ("BVH --out a.npz --people 1", "expected at least 2, as many as IN holds"),
+        ("BVH --out a.npz --people 3", "joint_future reads motion of person 2, of whom no file tells"),
+        ("BVH --out a.npz --sampler.stps 3", "no option --sampler.stps; did you mean --sampler.steps?"),
+        ("BVH --out a.npz --sampler steddy", "did you mean steady?"),
+        ("BVH --out a.npz --task partner_inpaintin", "did you mean partner_inpainting?"),
+        ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
+        ("none.bvh --out a.npz", "none.bvh"),
+        ("--task joint_future a.bvh", "files come first"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_would_be_right(
+    words: str, message: str, duet, tmp_path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert (
+        cli.main(["predict", *[part for word in words.split() for part in (duet["bvh"] if word == "BVH" else [word])]])
+        == 2
+    )
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_a_data_set_is_still_sampled_without_files() -> None:
+    from magnet.cli.predict_files import meant
+
+    assert not meant(["--task", "joint_future"]) and not meant([]) and not meant(["--data.path", "store.npz"])
+    assert not meant(["generation"]) and not meant(["--help"]) and meant(["--help", "files"])
