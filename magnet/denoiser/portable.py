@@ -19,8 +19,9 @@ import functools
 import io
 import json
 import logging
+import operator
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +106,8 @@ class PortableEncoder(nn.Module):
 
     def __init__(self, denoiser: Denoiser) -> None:
         super().__init__()
+        if not isinstance(denoiser.tokenizer, Tokenizer):
+            raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
         self.layout, self.normalizer, self.tokenizer = denoiser.layout, denoiser.normalizer, denoiser.tokenizer
         self.quantized = denoiser.quantized
 
@@ -134,8 +137,6 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
         ValueError: a model that cannot be exported, or whose file computes something else.
     """
     path = Path(path).with_suffix(".onnx")
-    if not isinstance(denoiser.tokenizer, Tokenizer):
-        raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
     layout, N, P = denoiser.layout, denoiser.window, denoiser.layout.agents
     B, T = 2, TOKEN_FRAMES * N
     tokens, betas = torch.randn(B, N, P, layout.width), torch.zeros(B, P, 10)
@@ -163,9 +164,13 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
         if not off <= MOST_OFF:
             raise ValueError(f"{file.name}: onnxruntime's numbers differ from torch's by {off:.2g}; nothing is written")
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file.parent, lambda _, name=file.name: name, lambda out, data=content: out.write(data))
+        write_whole(file.parent, _always(file.name), operator.methodcaller("write", content))
         written[file] = off
     return written
+
+
+def _always(name: str) -> Callable[[str], str]:
+    return lambda _: name
 
 
 @torch.no_grad()
