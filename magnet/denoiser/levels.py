@@ -12,6 +12,13 @@ PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
 MIXTURE = (0.2, 0.1, 0.05, 0.65)
 """Shares of the four kinds in `mixture`."""
 
+RAMPED = 0.6
+"""Share of roll-outs in which each token is noisier than the one before it, as samplers roll by default; in the others
+the tokens of a block share one level."""
+
+IN_FLIGHT = 3.0, 12.0
+"""Fewest and most token steps of such a ramp."""
+
 MIXED = 0.6
 """Share of roll-outs in which agents have roles of their own; in the others everybody is generated."""
 
@@ -59,7 +66,7 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
 
 
 def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
-    """Clean past, one block at a shared level, unknown future; agents may be given or hidden. -> (B, N, P) int
+    """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
     In some of the scenes every agent is generated. In the others each agent is, by chance (`ROLES`), generated,
     given as far as the block reaches, given to the end, or hidden from the block on: partner
@@ -80,6 +87,12 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: fl
     stop = integers(past + 1, zero + N)
     level = shifted(integers(zero + 1, zero + LEVELS), shift)
     time = torch.arange(N, device=device)[None, :, None]
+    ramped = torch.rand(B, 1, 1, generator=generator, device=device) < RAMPED
+    in_flight, begun = torch.rand(2, B, 1, 1, generator=generator, device=device)
+    in_flight = IN_FLIGHT[0] + (IN_FLIGHT[1] - IN_FLIGHT[0]) * in_flight
+    ramp = ((time - past + begun) / in_flight).clamp(0, 1) * LEVELS
+    level = torch.where(ramped, shifted(ramp.long().clamp_min(1), shift), level)
+    stop = torch.where(ramped, past + in_flight.long().clamp_min(1), stop).clamp_max(N)
     generated = torch.where(time < past, 0, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, 0, LEVELS).expand(B, N, P)

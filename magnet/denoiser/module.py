@@ -201,7 +201,15 @@ class Denoiser(L.LightningModule):
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        clean = self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
+        clean = self.predict_tokens(noisy, levels, present, cond)
+        return self.fused(clean, noisy, levels, present)
+
+    def predict_tokens(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+        """What the transformer itself predicts, before `fused`; as `denoise`."""
+        return self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
+
+    def fused(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """Predicted tokens with their deltas and pairwise transforms as one posterior, if the model has one."""
         if self.posterior is None:
             return clean
         with torch.autocast(noisy.device.type, enabled=False):  # half precision would blur the transforms
@@ -292,7 +300,8 @@ class Denoiser(L.LightningModule):
             cond = self.shown_condition(scene, generator)
             shown = self._self_forced(truth, levels, scene, cond, generator)
             noisy = add_noise(shown, noise, layout.spread(group_levels))
-        clean = self.denoise(noisy, levels, scene.present, cond).float()
+        own = self.predict_tokens(noisy, levels, scene.present, cond)
+        clean = self.fused(own, noisy, levels, scene.present).float()
         snr = snr_weights(group_levels, weight.snr_gamma) if weight.weighting == "min_snr" else None
         losses = token_losses(clean, truth, layout, there, snr)
         total = weight.latent * losses["latent"] + weight.delta * losses["delta"]
@@ -305,12 +314,24 @@ class Denoiser(L.LightningModule):
             if weight.near:
                 losses["near"] = near_loss(predicted, tokens, layout, there, group_levels)
                 total = total + weight.near * losses["near"]
+            if self.posterior is not None and weight.unfused:
+                # Through its posterior alone the network's own guess is hardly trained, and gets lost.
+                losses["unfused"] = self._unfused(own.float(), tokens, truth, there, group_levels, snr)
+                total = total + weight.unfused * losses["unfused"]
         if any(getattr(weight, name) for name in BODY_LOSSES):
             parts = (self.tokenizer, self.normalizer, layout, self.require_body())
             bodies = decoded_losses(*parts, clean, tokens, levels, scene, there, weight.decoded_share)
             total = total + sum(getattr(weight, name) * value for name, value in bodies.items())
             losses |= bodies
         return {"loss": total, **losses}
+
+    def _unfused(
+        self, own: Tensor, tokens: Tensor, truth: Tensor, there: Tensor, levels: Tensor, snr: Tensor | None
+    ) -> Tensor:
+        """Errors of the network's own deltas and pairwise transforms, weighted as those of their posterior."""
+        weight, losses = self.loss, token_losses(own, truth, self.layout, there, snr)
+        near = near_loss(self.normalizer.denormalize(own), tokens, self.layout, there, levels)
+        return weight.delta * losses["delta"] + weight.pairwise * losses["pairwise"] + weight.near * near
 
     def shown_condition(self, scene: Scene, generator: torch.Generator) -> Tensor | None:
         """The condition of a batch, hidden from some of its scenes in training."""

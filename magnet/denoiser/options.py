@@ -104,6 +104,8 @@ class DenoiserLoss:
         consistency_warmup: training steps over which lambda_3 grows from 0.
         near: error of pairwise transforms in which centimetres near a partner count (ours); see
             `magnet.denoiser.losses.near_loss`.
+        unfused: weight of the same three terms on the network's own deltas and pairwise transforms, where
+            `network.pairwise_posterior` replaces them (ours).
         joint: distance of the decoded joints, in metres (ours); see `magnet.denoiser.body_losses`.
         velocity: error of the decoded joints' velocities, in m/s (ours).
         partner: distance of the partners' decoded joints, as each sees them, in metres (ours).
@@ -120,6 +122,7 @@ class DenoiserLoss:
     consistency: float = 0.1
     consistency_warmup: int = 1000
     near: float = 0.0
+    unfused: float = 0.5
     joint: float = 0.0
     velocity: float = 0.0
     partner: float = 0.0

@@ -6,7 +6,9 @@ from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
+from magnet.motion.frames import from_9d, propagate_pairwise
 from magnet.motion.planar import yaw_ground
+from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.testing import random_scene, reordered, tiny_denoiser
 
@@ -60,14 +62,37 @@ def test_what_is_shown_clean_stays(model: Denoiser):
     assert error(model, better, truth, present) < 2e-3
 
 
-def test_nothing_but_pairs_of_people_changes(model: Denoiser):
-    _, guess, noisy, levels, present = shown(model, 100, people=2)
+@pytest.mark.parametrize("people", [1, 2])
+def test_only_deltas_and_pairs_of_people_who_meet_change(model: Denoiser, people: int):
+    _, guess, noisy, levels, present = shown(model, 100, people)
     better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
-    pairs = model.layout.group_present(present)[:, None, :, :].expand(-1, guess.shape[1], -1, -1).clone()
-    pairs[..., 0] = False
-    touched = model.layout.spread(pairs)
+    latents = torch.arange(model.layout.width) < model.layout.latent
+    pairs = model.layout.group_present(present)
+    met = pairs[..., 1:].any(dim=-1, keepdim=True)
+    touched = model.layout.spread(torch.cat([met, pairs[..., 1:]], dim=-1))[:, None] & ~latents
+    touched = touched.expand(guess.shape)
     assert torch.equal(better[~touched], guess[~touched])
-    assert not torch.allclose(better[touched], guess[touched])
+    assert bool(touched.any()) == (people > 1)
+    assert people == 1 or not torch.allclose(better[touched], guess[touched])
+
+
+def test_deltas_lead_where_pairwise_transforms_say(model: Denoiser):
+    """What comes out is one motion: each frame's pairwise transforms follow from those before and the deltas."""
+    _, guess, noisy, levels, present = shown(model, 100)
+    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
+    _, deltas, pairs = model.layout.unpack(model.normalizer.denormalize(better))
+    T_self_partner = from_9d(pairwise_by_frame(pairs))
+    T_next = propagate_pairwise(T_self_partner, from_9d(by_frame(deltas)))
+    assert torch.allclose(T_next, T_self_partner[:, 1:], atol=1e-4)
+
+
+def test_corrections_of_deltas_are_smooth(model: Denoiser):
+    """The deltas of the guess are right and its pairs are noise from frame to frame, which must not shake people."""
+    truth, guess, noisy, levels, present = shown(model, 300)
+    better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
+    moves = [by_frame(model.layout.unpack(model.normalizer.denormalize(x))[1])[..., [6, 8]] for x in (better, truth)]
+    change = (moves[0] - moves[1])[:, 1:].diff(dim=1)
+    assert float(change.norm(dim=-1).mean()) < 0.002  # metres; the guess's pairs jump by 0.1
 
 
 def test_what_is_at_pure_noise_tells_nothing(model: Denoiser):

@@ -1,5 +1,7 @@
 """The closed-form solve against a general least-squares solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -97,6 +99,44 @@ def test_the_solve_is_the_least_squares_answer(P: int):
 
     best = least_squares(positions, walked.flatten().numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-14).x.reshape(6, P, 2)
     assert np.allclose(found[0].numpy(), best, atol=1e-6)
+
+
+@pytest.mark.parametrize("T", [1, 2, 3, 6, 7])
+def test_smooth_corrections_are_where_the_sum_of_squares_is_least(T: int):
+    """Its gradient, by autograd, vanishes at the solution; a little off it does not."""
+    yaw, ground = paths(2, T, 3)
+    deltas, pairs = observed(yaw, ground, noise=0.1)
+    generator = torch.Generator().manual_seed(5)
+    smooth = 500 * torch.rand(2, 2, T, 3, generator=generator, dtype=torch.float64)
+    deltas = replace(deltas, yaw_smoothness=smooth[0], ground_smoothness=smooth[1])
+    theta, found = solve_pose_graph(deltas, pairs, yaw[:, 0], ground[:, 0])
+    partner = partners(3)
+    stepped = yaw[:, :1] + deltas.yaw.cumsum(dim=1)
+    before = torch.cat([yaw[:, :1], theta[:, :-1]], dim=1)
+    walked = ground[:, :1] + rotate_ground(before, deltas.ground).cumsum(dim=1)
+
+    def total(x: torch.Tensor, integrated: torch.Tensor, off: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
+        own, bend, pair = weights
+        correction = torch.nn.functional.pad((x - integrated).movedim(-1, 0), (0, 0, 1, 0)).movedim(0, -1)
+        change = correction.diff(dim=1)
+        cost = GAUGE * (x - integrated).square().sum() + (own[..., None] * change.square()).sum()
+        if T > 2:
+            cost = cost + (bend[:, 2:, :, None] * change[:, 1:].diff(dim=1).square()).sum()
+        return cost + (pair[..., None] * (x[:, :, partner] - x[:, :, :, None] - off).square()).sum()
+
+    around = pairs.yaw - (theta[:, :, partner] - theta[..., None])
+    nearest = theta[:, :, partner] - theta[..., None] + torch.atan2(around.sin(), around.cos())
+    turned = (theta[..., None], stepped[..., None], nearest[..., None])
+    gone = (found, walked, rotate_ground(theta[..., None], pairs.ground))
+    cases = (
+        (*turned, deltas.yaw_precision, smooth[0], pairs.yaw_precision),
+        (*gone, deltas.ground_precision, smooth[1], pairs.ground_precision),
+    )
+    for x, *rest in cases:
+        for moved, flat in ((x, True), (x + 0.01 * torch.rand(x.shape, generator=generator).double(), False)):
+            at = moved.clone().requires_grad_()
+            (slope,) = torch.autograd.grad(total(at, *rest), at)
+            assert (float(slope.abs().max()) < 1e-8) == flat
 
 
 def test_exact_steps_and_pairs_give_the_paths_back():
