@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from magnet.body.capsules import CAPSULES, capsule_segments
+from magnet.body.capsules import CAPSULES, capsule_segments, nearest_points
 from magnet.body.joints import PELVIS
 from magnet.motion.scene import FPS
 
@@ -53,25 +53,6 @@ APART: dict[str, Apart] = {
     "firm": Apart(),
 }
 """By name: `light` lets people lean on each other, `firm` leaves them touch."""
-
-
-def nearest_points(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    """The points of the segments a-b and c-d that are nearest to each other. (..., 3) x 4 -> (..., 3) x 2
-
-    >>> a, b = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
-    >>> c, d = torch.tensor([2.0, 1.0, 0.0]), torch.tensor([2.0, 3.0, 0.0])
-    >>> nearest_points(a, b, c, d)
-    (tensor([1., 0., 0.]), tensor([2., 1., 0.]))
-    """
-    u, v, w = b - a, d - c, a - c
-    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
-    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
-    determinant = uu * vv - uv * uv
-    crossing = determinant > 1e-9 * uu * vv
-    s = torch.where(crossing, (uv * vw - vv * uw) / torch.where(crossing, determinant, 1.0), 0.0).clamp(0, 1)
-    t = ((uv * s + vw) / vv.clamp_min(1e-12)).clamp(0, 1)
-    s = ((uv * t - uw) / uu.clamp_min(1e-12)).clamp(0, 1)
-    return a + s[..., None] * u, c + t[..., None] * v
 
 
 def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:

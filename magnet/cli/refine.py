@@ -1,4 +1,4 @@
-"""`magnet refine IN... OUT`: people of a scene are moved out of each other's bodies; any scene, made or recorded."""
+"""`magnet refine IN... OUT`: people out of each other's bodies, on the floor, with feet that stand; any scene."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 IN is a scene (.npz of magnet or of SMPL-X) or a .bvh file; several are several people of one world. OUT's suffix says
-what is written, as for `magnet export`. People are moved over the ground alone, smoothly, half of the way each: poses
-stay, so feet slide a little while somebody makes way; the table says how much.
+what is written, as for `magnet export`. Roots, legs and arms are corrected, smoothly and as little as they can be:
+nobody is in anybody's body or in their own, hands that were together stay together, low toes stand still, whoever is in
+the air without falling comes down, and soles are not under the floor. The table says how it was and how it is.
 
 for example:
   magnet refine demo/quartet.npz apart.npz
   magnet refine leader.bvh follower.bvh couple.glb --keep 0
+  magnet refine smplx.npz apart.npz --poses keep   # people are moved over the ground as a whole, and that is all
 """
 
 
@@ -35,6 +37,19 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--keep", type=int, action="append", default=[], metavar="N", help="this person does not move; may be repeated"
     )
+    options.add_argument(
+        "--poses",
+        choices=("correct", "keep"),
+        default="correct",
+        help="keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)",
+    )
+    options.add_argument(
+        "--slides",
+        type=float,
+        default=0.6,
+        metavar="SPEED",
+        help="low toes slower than so many m/s are to stand still; 0: feet may slide (default: %(default)s)",
+    )
     return options
 
 
@@ -46,63 +61,55 @@ def main(arguments: Sequence[str] = ()) -> int:
         ValueError: files that cannot be read or written; says what to do.
     """
     options = parser().parse_args(list(arguments))
+    from magnet.body.apart import APART
+    from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 
     out = scene_files.path_to_write(options.out)
     got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
-    if got.scene.agents < 2:
+    if got.scene.agents < 2 and options.poses == "keep":
         raise CommandError(
-            f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people"
+            f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people, or let "
+            "poses be corrected with --poses correct"
         )
     wrong = [agent for agent in options.keep if not 0 <= agent < got.scene.agents]
     if wrong:
         raise CommandError(f"--keep {wrong[0]}: the scene has people 0 to {got.scene.agents - 1}")
-    refined = apart(got.scene, got.body, options.apart, options.keep)
+    fixed = fixed_agents(got.scene, options.keep)
+    if options.poses == "keep":
+        refined = moved_apart(got.scene, got.body, APART[options.apart], fixed)
+    else:
+        refined = repaired(got.scene, got.body, options.apart, fixed, slides=options.slides)
     for title, scene in (("before", got.scene), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     return 0
 
 
-def apart(scene: Scene, body: Body, how: str, keep: Sequence[int] = ()) -> Scene:
-    """A scene whose people are out of each other's bodies as far as moving them over the ground can do it.
-
-    Args:
-        scene: of any people.
-        body: that its shapes belong to.
-        how: `light` or `firm`.
-        keep: agents who must not be moved.
-    """
-    import torch
-
-    from magnet.body.apart import APART, kept_apart
-    from magnet.motion.frames import from_planar
-
-    fixed = torch.zeros(scene.agents, dtype=torch.bool)
-    fixed[list(keep)] = True
-    offsets = kept_apart(body.joints(scene), scene.present, fixed, APART[how], fps=scene.fps)
-    return scene.transformed(from_planar(torch.zeros_like(offsets[..., 0]), offsets))
-
-
 def told(scene: Scene, body: Body) -> str:
-    """How deep people are in each other, and how fast their low toes slide."""
+    """How deep people are in each other, how fast their low toes slide, and how many feet are off the floor."""
     import torch
 
-    from magnet.body.joints import TOES
+    from magnet.body.joints import FEET, TOES
     from magnet.metrics.body_depth import deepest
 
     joints = body.joints(scene)
-    depths = []
+    worst = joints.new_zeros(joints.shape[:2])
     for one, other in combinations(range(scene.agents), 2):
         both = (scene.present[:, one] & scene.present[:, other])[:, None]
         depth = deepest(joints[:, :, one].flatten(0, 1), joints[:, :, other].flatten(0, 1))[:, 0]
-        depths.append(depth.view(scene.scenes, scene.frames) * both)
-    worst = torch.stack(depths).amax(dim=0)
+        worst = torch.maximum(worst, depth.view(scene.scenes, scene.frames) * both)
     toes = joints[..., TOES, :]
     slide = scene.fps * toes[..., [0, 2]].diff(dim=1).norm(dim=-1)
     low = (toes[:, 1:, ..., 1] < 0.05) & scene.present[:, None, :, None]
     speed = float(slide[low].mean()) if bool(low.any()) else 0.0
+    there = scene.present[:, None].expand(joints.shape[:3])
+    foot = joints[..., FEET, 1].amin(dim=-1)[there]
     over = [(limit, 100 * float((worst > limit / 100).float().mean())) for limit in (5, 10)]
     shares = ", ".join(f"{share:.1f} % over {limit} cm" for limit, share in over)
-    return f"deepest {100 * float(worst.max()):.1f} cm, frames {shares}; low toes slide at {speed:.2f} m/s"
+    air, under = (100 * float(share.float().mean()) for share in (foot > 0.06, foot < -0.02))
+    return (
+        f"deepest {100 * float(worst.max()):.1f} cm, frames {shares}; low toes slide at {speed:.2f} m/s; feet in the "
+        f"air {air:.1f} %, in the floor {under:.1f} %"
+    )

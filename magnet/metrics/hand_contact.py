@@ -8,23 +8,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from magnet.body.joints import ELBOWS, WRISTS
+from magnet.body.energy import BEYOND, hand_points
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.motion.scene import FPS
 
-BEYOND = 0.08
-"""Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""
-
 WITHIN = 0.20
 """Metres between the middles of two hands under which they are in contact."""
-
-
-def hand_points(joints: Tensor, beyond: float = BEYOND) -> Tensor:
-    """The middle of each hand, left and right. (..., 22, 3) -> (..., 2, 3) metres"""
-    wrist = joints[..., WRISTS, :]
-    return wrist + beyond * torch.nn.functional.normalize(wrist - joints[..., ELBOWS, :], dim=-1)
 
 
 def hand_distance(joints: Tensor, partner: Tensor, beyond: float = BEYOND) -> Tensor:

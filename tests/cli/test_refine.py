@@ -38,7 +38,7 @@ def numbers(line: str) -> tuple[float, float]:
 
 def test_people_are_out_of_each_other_afterwards_and_the_table_says_so(crowded: Scene, tmp_path: Path, capsys) -> None:
     scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "apart.npz"
-    assert cli.main(["refine", str(scene), str(out)]) == 0
+    assert cli.main(["refine", str(scene), str(out), "--poses", "keep"]) == 0
     lines = capsys.readouterr().out.splitlines()
     before, after = (next(line for line in lines if line.startswith(word)) for word in ("before", "after"))
     assert numbers(before)[0] > 10 and numbers(before)[1] > 50
@@ -52,8 +52,16 @@ def test_who_is_kept_does_not_move(crowded: Scene, tmp_path: Path) -> None:
     scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "apart.npz"
     assert cli.main(["refine", str(scene), str(out), "--keep", "1", "--apart", "light"]) == 0
     made = Scene.load(out)
-    assert torch.allclose(made.T_world_root[:, :, 1], crowded.T_world_root[:, :, 1], atol=1e-6)
+    assert torch.equal(made.T_world_root[:, :, 1], crowded.T_world_root[:, :, 1])
+    assert torch.equal(made.body_rot[:, :, 1], crowded.body_rot[:, :, 1])
     assert not torch.allclose(made.T_world_root[:, :, 0], crowded.T_world_root[:, :, 0], atol=0.02)
+
+
+def test_poses_are_corrected_too_unless_they_are_to_be_kept(crowded: Scene, tmp_path: Path, capsys) -> None:
+    scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "corrected.npz"
+    assert cli.main(["refine", str(scene), str(out)]) == 0
+    assert numbers(next(x for x in capsys.readouterr().out.splitlines() if x.startswith("after")))[1] == 0
+    assert not torch.equal(Scene.load(out).body_rot, crowded.body_rot)
 
 
 def test_skeleton_files_of_several_people_are_refined_as_well(crowded: Scene, tmp_path: Path, capsys) -> None:
@@ -79,7 +87,7 @@ def test_wrong_wishes_are_told_what_was_expected(crowded: Scene, tmp_path: Path,
 
 def test_one_person_and_unknown_formats_are_refused(crowded: Scene, tmp_path: Path, capsys) -> None:
     alone = crowded.permute_agents(torch.tensor([0])).save(tmp_path / "alone.npz")
-    assert cli.main(["refine", str(alone), str(tmp_path / "out.npz")]) == 2
+    assert cli.main(["refine", str(alone), str(tmp_path / "out.npz"), "--poses", "keep"]) == 2
     assert "one person" in capsys.readouterr().err
     assert cli.main(["refine", str(alone), str(tmp_path / "out.xyz")]) == 2
     assert "nothing writes .xyz" in capsys.readouterr().err

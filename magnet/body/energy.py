@@ -1,0 +1,224 @@
+"""The energy of bodies together: depth, held hands, standing feet, floor, limits of joints, balance.
+
+Each term is a function of points or rotations, batched, differentiable and in metres or radians; `body_energy` adds
+their squares up. What counts as contact and what as penetration is told by the parts that meet (`Contact`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.body.capsules import nearest_points
+from magnet.body.fitted_capsules import (
+    FOREARMS,
+    HANDS,
+    LEGS,
+    PARTS,
+    TRUNK,
+    UPPER_ARMS,
+)
+
+from magnet.body.joints import (  # isort: skip
+    ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
+)  # fmt: skip
+from magnet.motion.scene import BODY_JOINTS, FPS
+
+GRAVITY = 9.81
+BEYOND = 0.08
+"""Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""
+SOLE = 0.10
+"""Metres around the line between the feet over which somebody can be in balance: about half a foot's length."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How deep parts of bodies may be in each other before it is penetration, in metres.
+
+    Hands and forearms of two people, or one's own, may be in each other as deep as they like: they hold.
+
+    Args:
+        body: trunks, heads and legs of two people.
+        arms: the same where an arm or a hand is one of the two.
+        own: parts of one body, apart from neighbours, which always overlap.
+    """
+
+    body: float = 0.02
+    arms: float = 0.03
+    own: float = 0.04
+
+
+CONTACT: dict[str, Contact] = {"light": Contact(body=0.05, arms=0.06, own=0.06), "firm": Contact()}
+"""By name: `light` lets people lean on each other, `firm` leaves them touch."""
+
+
+def allowed_between(contact: Contact) -> Tensor:
+    """Depth that capsules of two people may have. -> (K, K) metres, infinite where it is never penetration"""
+    K = len(PARTS)
+    arm, hold = torch.zeros(K, dtype=torch.bool), torch.zeros(K, dtype=torch.bool)
+    arm[list(UPPER_ARMS + FOREARMS + HANDS)], hold[list(FOREARMS + HANDS)] = True, True
+    allowed = torch.where(arm[:, None] | arm, contact.arms, contact.body)
+    return torch.where(hold[:, None] & hold, torch.inf, allowed)
+
+
+def allowed_within(contact: Contact) -> Tensor:
+    """The same of one body: an upper triangle, infinite on the diagonal, below it and for neighbours. -> (K, K)"""
+    K = len(PARTS)
+    allowed = torch.full((K, K), torch.inf)
+    free = list(FOREARMS + HANDS)
+    for part in free:
+        allowed[list(TRUNK + LEGS), part] = contact.own
+        allowed[UPPER_ARMS[1 - free.index(part) % 2], part] = contact.own  # of the other side
+    left, right = LEGS[::2], LEGS[1::2]  # thigh, shin, foot
+    for i, one in enumerate(left):
+        for j, other in enumerate(right):
+            if i + j:  # thighs touch in everybody
+                allowed[one, other] = contact.own
+    allowed = torch.minimum(allowed, allowed.T)
+    return torch.where(torch.ones(K, K, dtype=torch.bool).triu(1), allowed, torch.inf)
+
+
+def capsule_depth(ends: Tensor, radius: Tensor, others: Tensor, other_radius: Tensor) -> Tensor:
+    """How deep capsules are in others; below 0 what is between them. (..., K, 2, 3), (..., K) x 2 -> (..., K, K) m"""
+    a, b = ends[..., :, None, 0, :], ends[..., :, None, 1, :]
+    c, d = others[..., None, :, 0, :], others[..., None, :, 1, :]
+    first, second = nearest_points(a, b, c, d)
+    gap = (first - second).square().sum(dim=-1).clamp_min(1e-12).sqrt()  # its slope is finite where axes cross
+    return radius[..., :, None] + other_radius[..., None, :] - gap
+
+
+def excess(depth: Tensor, allowed: Tensor) -> Tensor:
+    """Depth beyond what is allowed. (..., K, K) metres, 0 where there is none"""
+    return (depth - allowed.to(depth)).clamp_min(0)
+
+
+def hand_points(joints: Tensor, beyond: float = BEYOND) -> Tensor:
+    """The middle of each hand, left and right. (..., 22, 3) -> (..., 2, 3) metres"""
+    wrist = joints[..., WRISTS, :]
+    return wrist + beyond * torch.nn.functional.normalize(wrist - joints[..., ELBOWS, :], dim=-1)
+
+
+def hold_error(joints: Tensor, partner: Tensor, between: Tensor, held: Tensor) -> Tensor:
+    """How far hands that hold have left each other. -> (..., 2, 2) metres
+
+    Args:
+        joints, partner: (..., 22, 3) in the world.
+        between: (..., 2, 2, 3) from each hand of the partner to each hand of one's own, as it was.
+        held: (..., 2, 2) bool, which of them hold.
+    """
+    now = hand_points(joints)[..., :, None, :] - hand_points(partner)[..., None, :, :]
+    return torch.where(held, (now - between).square().sum(dim=-1).clamp_min(1e-12).sqrt(), 0.0)
+
+
+def slide(joints: Tensor, stands: Tensor, still: float = 0.05, fps: float = FPS) -> Tensor:
+    """How much farther than standing allows toes move over the floor in a frame.
+
+    joints (..., T, P, 22, 3), stands (..., T - 1, P, 2) bool; still: speed in m/s that is standing
+    -> (..., T - 1, P, 2) metres
+    """
+    moved = joints[..., TOES, :][..., [0, 2]].diff(dim=-4).square().sum(dim=-1).clamp_min(1e-12).sqrt()
+    return torch.where(stands, (moved - still / fps).clamp_min(0), 0.0)
+
+
+def under_floor(joints: Tensor, clearance: Tensor) -> Tensor:
+    """How deep soles are under y = 0. joints (..., P, 22, 3), clearance (..., P, 4) of `FEET` -> (..., P, 4) metres"""
+    return (clearance - joints[..., ANKLES + TOES, 1]).clamp_min(0)
+
+
+def over_floor(joints: Tensor, clearance: Tensor, floats: Tensor) -> Tensor:
+    """Height of the lower foot of those who float over y = 0. floats (..., P) bool -> (..., P) metres"""
+    height = (joints[..., ANKLES + TOES, 1] - clearance).amin(dim=-1)
+    return torch.where(floats, height.clamp_min(0), 0.0)
+
+
+TURNS: dict[int, float] = {
+    **dict.fromkeys((*SHOULDERS, *HIPS), 2.6),
+    **dict.fromkeys((*ELBOWS, *KNEES), 2.7),
+    **dict.fromkeys(ANKLES, 1.2),
+    **dict.fromkeys((SPINE1, SPINE2, SPINE3), 1.0),
+    **dict.fromkeys((NECK, HEAD), 1.2),
+    **dict.fromkeys(WRISTS, 1.6),
+}
+"""Radians that a joint may be turned from rest, somewhat over the ranges that clinics measure; others 1.2."""
+
+
+def limit_excess(body_rot: Tensor) -> Tensor:
+    """How far joints are turned beyond what bodies do. (..., 21, 3, 3) -> (..., 21) radians, 0 inside the range"""
+    most = torch.tensor([TURNS.get(joint, 1.2) for joint in range(1, BODY_JOINTS)]).to(body_rot)
+    cosine = (body_rot.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
+    return (cosine.clamp(-1 + 1e-6, 1 - 1e-6).acos() - most).clamp_min(0)
+
+
+MASSES: tuple[tuple[int, int, float, float], ...] = (
+    (PELVIS, SPINE3, 0.5, 0.355),
+    (SPINE3, NECK, 0.5, 0.142),
+    (NECK, HEAD, 1.0, 0.081),
+    *((shoulder, elbow, 0.436, 0.028) for shoulder, elbow in zip(SHOULDERS, ELBOWS, strict=True)),
+    *((elbow, wrist, 0.682, 0.022) for elbow, wrist in zip(ELBOWS, WRISTS, strict=True)),
+    *((hip, knee, 0.433, 0.100) for hip, knee in zip(HIPS, KNEES, strict=True)),
+    *((knee, ankle, 0.606, 0.061) for knee, ankle in zip(KNEES, ANKLES, strict=True)),
+)
+"""From joint, to joint, where between them the mass lies, share of the body's mass: Dempster's segments as tabled by
+Winter (Biomechanics and Motor Control of Human Movement, table 4.1), hands with forearms and feet with shins."""
+
+
+def centre_of_mass(joints: Tensor) -> Tensor:
+    """(..., 22, 3) -> (..., 3) metres"""
+    first, second, place, mass = zip(*MASSES, strict=True)
+    share = torch.tensor(place).to(joints)[:, None]
+    points = (1 - share) * joints[..., first, :] + share * joints[..., second, :]
+    weight = torch.tensor(mass).to(joints)[:, None]
+    return (weight * points).sum(dim=-2) / weight.sum()
+
+
+def off_balance(joints: Tensor, fps: float = FPS) -> Tensor:
+    """How far the zero moment point lies outside of the feet. (..., T, P, 22, 3) -> (..., T - 2, P) metres
+
+    The point is where the floor must push so that nobody tips over: under the centre of mass, shifted by its
+    acceleration (Vukobratovic and Borovac 2004). The feet support it on the line between them and `SOLE` around it.
+    """
+    centre = centre_of_mass(joints)
+    pull = (centre[..., 2:, :, :] - 2 * centre[..., 1:-1, :, :] + centre[..., :-2, :, :]) * fps**2
+    now = joints[..., 1:-1, :, :, :]
+    height = centre[..., 1:-1, :, 1:2]
+    weight = (GRAVITY + pull[..., 1:2]).clamp_min(0.2 * GRAVITY)
+    point = centre[..., 1:-1, :, [0, 2]] - height * pull[..., [0, 2]] / weight
+    left, right = (now[..., [ankle, toe], :][..., [0, 2]].mean(dim=-2) for ankle, toe in zip(ANKLES, TOES, strict=True))
+    across = right - left
+    share = ((point - left) * across).sum(-1) / across.square().sum(-1).clamp_min(1e-9)
+    near = left + share.clamp(0, 1)[..., None] * across
+    return ((point - near).square().sum(-1).clamp_min(1e-12).sqrt() - SOLE).clamp_min(0)
+
+
+def pair_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) -> Tensor:
+    """Squared excess of depth between people and of each body with itself, by frame.
+
+    Args:
+        ends: (B, T, P, K, 2, 3) of posed capsules, metres.
+        radius: (B, P, K) metres.
+        seen: (B, T, P) bool, whoever counts.
+        contact: depths that are no penetration.
+
+    Returns:
+        (B, T) m^2
+    """
+    P, radius = ends.shape[2], radius[:, None].expand(ends.shape[:4])
+    total = ends.new_zeros(ends.shape[:2])
+    first, second = torch.triu_indices(P, P, 1, device=ends.device)
+    if len(first):
+        depth = capsule_depth(ends[:, :, first], radius[:, :, first], ends[:, :, second], radius[:, :, second])
+        found = excess(depth, allowed_between(contact)).square().sum(dim=(-1, -2))
+        total = total + torch.where(seen[:, :, first] & seen[:, :, second], found, 0.0).sum(dim=-1)
+    return total + own_energy(ends, radius, seen, contact)
+
+
+def own_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) -> Tensor:
+    """Of each body with itself. (B, T, P, K, 2, 3), (B, T, P, K), (B, T, P) -> (B, T) m^2"""
+    allowed = allowed_within(contact)
+    i, j = allowed.isfinite().nonzero(as_tuple=True)
+    first, second = nearest_points(ends[..., i, 0, :], ends[..., i, 1, :], ends[..., j, 0, :], ends[..., j, 1, :])
+    gap = (first - second).square().sum(dim=-1).clamp_min(1e-12).sqrt()
+    found = (radius[..., i] + radius[..., j] - gap - allowed[i, j].to(ends)).clamp_min(0).square().sum(dim=-1)
+    return torch.where(seen, found, 0.0).sum(dim=-1)

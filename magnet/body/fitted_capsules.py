@@ -1,0 +1,139 @@
+"""Capsules fitted to a body's own mesh: hands, feet and the width of the trunk included, for any shape numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magnet.body.base import Body
+
+from magnet.body.joints import (  # isort: skip
+    HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,
+    R_ELBOW, R_FOOT, R_HIP, R_KNEE, R_SHOULDER, R_WRIST, SPINE1, SPINE2, SPINE3,
+)  # fmt: skip
+
+
+class BodyPart(NamedTuple):
+    """A stretch of the body that one capsule stands for.
+
+    `bone` is the joint that it moves with, `skin` the joints whose vertices belong to it, `axis` the joint that its
+    bone leads to, or -1 where it lies across the body, from the left to the right. `low` and `high` cut its vertices,
+    as shares of their extent upward (across) or along the bone.
+    """
+
+    name: str
+    bone: int
+    skin: tuple[int, ...]
+    axis: int = -1
+    low: float = 0.0
+    high: float = 1.0
+
+
+PARTS: tuple[BodyPart, ...] = (
+    BodyPart("pelvis", PELVIS, (PELVIS, L_HIP, R_HIP), low=0.45, high=1.0),
+    BodyPart("belly", SPINE1, (SPINE1,)),
+    BodyPart("waist", SPINE2, (SPINE2,)),
+    BodyPart("lower chest", SPINE3, (SPINE3,), high=0.5),
+    BodyPart("upper chest", SPINE3, (SPINE3, L_COLLAR, R_COLLAR), low=0.5),
+    BodyPart("neck", NECK, (NECK,), HEAD),
+    BodyPart("head", HEAD, (HEAD,), NECK),
+    BodyPart("left upper arm", L_SHOULDER, (L_SHOULDER,), L_ELBOW),
+    BodyPart("right upper arm", R_SHOULDER, (R_SHOULDER,), R_ELBOW),
+    BodyPart("left forearm", L_ELBOW, (L_ELBOW,), L_WRIST),
+    BodyPart("right forearm", R_ELBOW, (R_ELBOW,), R_WRIST),
+    BodyPart("left hand", L_WRIST, (L_WRIST,), L_ELBOW),
+    BodyPart("right hand", R_WRIST, (R_WRIST,), R_ELBOW),
+    BodyPart("left thigh", L_HIP, (L_HIP,), L_KNEE),
+    BodyPart("right thigh", R_HIP, (R_HIP,), R_KNEE),
+    BodyPart("left shin", L_KNEE, (L_KNEE,), L_ANKLE),
+    BodyPart("right shin", R_KNEE, (R_KNEE,), R_ANKLE),
+    BodyPart("left foot", L_ANKLE, (L_ANKLE, L_FOOT), L_FOOT),
+    BodyPart("right foot", R_ANKLE, (R_ANKLE, R_FOOT), R_FOOT),
+)
+
+HANDS = (11, 12)
+FOREARMS = (9, 10)
+UPPER_ARMS = (7, 8)
+TRUNK = tuple(range(7))
+LEGS = tuple(range(13, 19))
+"""Places in `PARTS`."""
+
+MIDDLE = (0.2, 0.8)
+"""Stretch of a limb, as shares of its length, over which its thickness is taken: joints are thicker."""
+
+
+@dataclass(frozen=True)
+class FittedCapsules:
+    """Capsules of B scenes of P people, each fixed to a bone: K of `PARTS`.
+
+    Attributes:
+        ends: (B, P, K, 2, 3) ends in the frame of the bone at rest, from its joint, metres.
+        radius: (B, P, K) metres.
+    """
+
+    ends: Tensor
+    radius: Tensor
+
+    @property
+    def bones(self) -> list[int]:
+        """The joint that each capsule moves with."""
+        return [part.bone for part in PARTS]
+
+    def posed(self, R_world: Tensor, joints: Tensor) -> Tensor:
+        """Ends in the world. Rotations (B, T, P, 22, 3, 3), joints (B, T, P, 22, 3) -> (B, T, P, K, 2, 3) metres"""
+        R, t = R_world[..., self.bones, :, :], joints[..., self.bones, :]
+        return (R[..., None, :, :] @ self.ends[:, None, ..., None])[..., 0] + t[..., None, :]
+
+
+@torch.no_grad()
+def fit_capsules(body: Body, betas: Tensor) -> FittedCapsules:
+    """Capsules fitted to the mesh at rest. betas (B, P, 10)
+
+    Across the trunk a capsule is as thick as that stretch is deep; elsewhere as thick as the skin is far from the axis
+    on average. Its ends reach to the skin.
+    """
+    flat = betas.flatten(0, 1).to(body.v_template)
+    vertices = body.v_template + (flat @ body.shapedirs.flatten(0, 1).T).unflatten(-1, (-1, 3))  # (M, V, 3)
+    rest = body.rest_joints(flat)
+    owner = body.weights.argmax(dim=1)
+    corners = body.v_template[body.faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1).norm(dim=-1)
+    weight = torch.zeros(len(owner), device=area.device).index_add_(0, body.faces.flatten(), area.repeat_interleave(3))
+    fitted = [_fitted(part, body, vertices, rest, owner, weight) for part in PARTS]
+    ends = torch.stack([each for each, _ in fitted], dim=1).unflatten(0, betas.shape[:2])
+    radius = torch.stack([each for _, each in fitted], dim=1).unflatten(0, betas.shape[:2])
+    return FittedCapsules(ends.to(betas.device), radius.to(betas.device))
+
+
+def _fitted(
+    part: BodyPart, body: Body, vertices: Tensor, rest: Tensor, owner: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Ends (M, 2, 3) from the bone's joint, and radius (M,), of M people's part."""
+    mine = torch.isin(owner, torch.tensor(part.skin, device=owner.device))
+    across = part.axis < 0
+    height = body.v_template[:, 1]
+    if across:
+        low, high = height[mine].min(), height[mine].max()
+        mine &= (height >= low + part.low * (high - low)) & (height <= low + part.high * (high - low))
+    skin, weight = vertices[:, mine] - rest[:, None, part.bone], weight[mine]
+    if across:
+        axis = torch.tensor([1.0, 0.0, 0.0], device=skin.device).expand(len(skin), 3)
+    else:
+        axis = torch.nn.functional.normalize(rest[:, part.axis] - rest[:, part.bone], dim=-1)
+    along = (skin * axis[:, None]).sum(dim=-1)
+    beside = skin - along[..., None] * axis[:, None]
+    first, last = along.amin(dim=1), along.amax(dim=1)
+    if across:
+        centre = (beside.amin(dim=1) + beside.amax(dim=1)) / 2
+        radius = (skin[..., 2].amax(dim=1) - skin[..., 2].amin(dim=1)) / 2
+    else:
+        share = (along - first[:, None]) / (last - first)[:, None]
+        inner = weight * ((share >= MIDDLE[0]) & (share <= MIDDLE[1]))
+        centre = (beside * inner[..., None]).sum(dim=1) / inner.sum(dim=1)[:, None]
+        radius = ((beside - centre[:, None]).norm(dim=-1) * inner).sum(dim=1) / inner.sum(dim=1)
+    middle, half = (first + last) / 2, ((last - first) / 2 - radius).clamp_min(0)
+    reach = torch.stack([middle - half, middle + half], dim=1)
+    return centre[:, None] + reach[..., None] * axis[:, None], radius

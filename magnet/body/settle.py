@@ -1,0 +1,239 @@
+"""Damped least squares over poses of several people: out of each other, hands held, feet still, on the floor.
+
+What is moved are root, legs and arms in a window of frames, and a little the back. Corrections are smooth in time and
+as small as they can be; frames and people that are fixed stay bit-identical.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body.base import Body
+from magnet.body.fitted_capsules import fit_capsules
+from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
+from magnet.body.settle_rows import Rows, Seen, all_rows
+from magnet.body.settle_wishes import Wishes
+from magnet.motion.frames import rigid
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+MOVED: tuple[int, ...] = (0, SPINE2, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
+"""Joints that are turned; the pelvis turns with the whole body."""
+
+DOFS = 3 + 3 * len(MOVED)
+"""Numbers that correct a pose: the root's shift in metres, then a rotation vector of each joint in `MOVED`, radians."""
+
+RAMP = 6
+"""Frames after a past that stays over which wishes grow to their full weight."""
+
+
+@dataclass(frozen=True)
+class Settle:
+    """How poses are corrected.
+
+    Args:
+        iterations: Gauss-Newton steps.
+        inner: conjugate gradient steps in each.
+        stay: cost of a correction itself, of a metre or radian.
+        speed: cost of its change from frame to frame.
+        bend: cost of the second difference.
+        tilt: how many times more than other joints it costs to turn the whole body or the back.
+        most: metres or radians that one step changes at most.
+    """
+
+    iterations: int = 8
+    inner: int = 40
+    stay: float = 0.02
+    speed: float = 0.3
+    bend: float = 30.0
+    tilt: float = 3.0
+    most: float = 0.15
+
+
+def _ancestry() -> Tensor:
+    """Whether turning a joint of `MOVED` moves a bone. -> (M, 22) bool"""
+    moves = torch.zeros(len(MOVED), BODY_JOINTS, dtype=torch.bool)
+    for bone in range(BODY_JOINTS):
+        joint = bone
+        while joint >= 0:
+            if joint in MOVED:
+                moves[MOVED.index(joint), bone] = True
+            joint = PARENTS[joint]
+    return moves
+
+
+ANCESTRY = _ancestry()
+
+
+def corrected(scene: Scene, offset: Tensor) -> Scene:
+    """A scene with its poses corrected; frames without a correction come back bit-identical. offset (B, T, P, DOFS)
+
+    Turns are in the frame of each joint's parent as it was, for the pelvis in the world's.
+    """
+    turns = roma.rotvec_to_rotmat(offset[..., 3:].unflatten(-1, (len(MOVED), 3)))
+    body_rot = scene.body_rot.clone()
+    limbs = [joint - 1 for joint in MOVED[1:]]
+    body_rot[..., limbs, :, :] = turns[..., 1:, :, :] @ scene.body_rot[..., limbs, :, :]
+    root = scene.T_world_root
+    T_world_root = rigid(turns[..., 0, :, :] @ root[..., :3, :3], root[..., :3, 3] + offset[..., :3])
+    changed = (offset != 0).any(dim=-1)[..., None, None]
+    return scene.replace(
+        body_rot=torch.where(changed[..., None], body_rot, scene.body_rot),
+        T_world_root=torch.where(changed, T_world_root, root),
+    )
+
+
+def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tensor) -> Tensor:
+    """How points move along a direction with the numbers that correct a pose. -> (M, DOFS)
+
+    Args:
+        seen: poses of all nodes, which are people in frames.
+        node, bone: (M,) int, whose and which bone each point is fixed to.
+        point, along: (M, 3) in the world.
+    """
+    joints = list(MOVED)
+    parents = [max(PARENTS[joint], 0) for joint in MOVED]
+    arm = point[:, None] - seen.joints[node][:, joints]  # (M, joints, 3)
+    turn = torch.linalg.cross(arm, along[:, None].expand_as(arm), dim=-1)
+    R_world_parent = seen.R_world[node][:, parents]
+    own = (R_world_parent.transpose(-1, -2) @ turn[..., None])[..., 0]
+    own[:, 0] = turn[:, 0]
+    own = own * ANCESTRY.to(own.device)[:, bone].T[..., None]
+    return torch.cat([along, own.flatten(1)], dim=-1)
+
+
+class _Damping:
+    """The cost of corrections: (stay + speed D1'D1 + bend D2'D2) x along time, each number of a correction for itself.
+
+    Where the motion goes on from a past that stays, two frames without a correction come before.
+    """
+
+    def __init__(self, settle: Settle, frames: int, begun: bool, like: Tensor) -> None:
+        self.settle, self.lead = settle, 2 if begun else 0
+        self.scale = torch.ones(DOFS, dtype=like.dtype, device=like.device)
+        self.scale[3:9] = settle.tilt
+        # The operator's diagonal: every fifth impulse is looked at by itself, so that they do not overlap.
+        diagonal = like.new_zeros(frames)
+        for k in range(5):
+            impulses = torch.zeros_like(diagonal)
+            impulses[k::5] = 1.0
+            diagonal[k::5] = self._along_time(impulses[None, :, None])[0, k::5, 0]
+        self.diagonal = diagonal[:, None] * self.scale
+
+    def _along_time(self, x: Tensor) -> Tensor:
+        """(B, T, D) -> same"""
+        x = F.pad(x, (0, 0, self.lead, 0))
+        total = self.settle.stay * x
+        for order, cost in ((1, self.settle.speed), (2, self.settle.bend)):
+            if x.shape[1] > order:
+                change = x.diff(n=order, dim=1)
+                for _ in range(order):  # the transposed difference
+                    change = F.pad(change, (0, 0, 1, 0)) - F.pad(change, (0, 0, 0, 1))
+                total = total + cost * change
+        return total[:, self.lead :]
+
+    def __call__(self, offset: Tensor) -> Tensor:
+        """(B, T, P, DOFS) -> same"""
+        return self._along_time(offset.flatten(2)).view(offset.shape) * self.scale
+
+
+def solve(
+    rows: Rows, first: Tensor, second: Tensor, damping: _Damping, offset: Tensor, free: Tensor, inner: int
+) -> Tensor:
+    """One Gauss-Newton step by preconditioned conjugate gradients. -> (B, T, P, DOFS)
+
+    Args:
+        rows: what is wished.
+        first, second: (M, DOFS) its slopes at either end, times the square root of the weight.
+        offset: (B, T, P, DOFS) the correction so far.
+        free: (B, T, P) bool, whoever may move.
+    """
+    shape, keep = offset.shape, free[..., None].to(offset)
+    a, b = rows.node, rows.other
+
+    def across(x: Tensor) -> Tensor:
+        flat = x.reshape(-1, DOFS)
+        return (first * flat[a]).sum(-1) - (second * flat[b]).sum(-1)
+
+    def back(u: Tensor) -> Tensor:
+        flat = offset.new_zeros(shape).view(-1, DOFS)
+        flat.index_add_(0, a, first * u[:, None]).index_add_(0, b, -second * u[:, None])
+        return flat.view(shape)
+
+    blocks = offset.new_zeros(free.numel(), DOFS, DOFS)
+    blocks.index_add_(0, a, first[:, :, None] * first[:, None, :])
+    blocks.index_add_(0, b, second[:, :, None] * second[:, None, :])
+    blocks = blocks.view(*shape, DOFS) + torch.diag_embed(damping.diagonal[:, None].expand(shape[1:]))
+    factor = torch.linalg.cholesky(blocks)
+
+    def preconditioned(r: Tensor) -> Tensor:
+        return torch.cholesky_solve(r[..., None], factor)[..., 0] * keep
+
+    residual = -(back(rows.root_weight * rows.residual) + damping(offset)) * keep
+    step = torch.zeros_like(offset)
+    z = preconditioned(residual)
+    direction, rz = z, (residual * z).sum()
+    for _ in range(inner):
+        if float(rz) < 1e-12:
+            break
+        product = (back(across(direction)) + damping(direction)) * keep
+        length = rz / (direction * product).sum()
+        step = step + length * direction
+        residual = residual - length * product
+        z = preconditioned(residual)
+        rz, before = (residual * z).sum(), rz
+        direction = z + rz / before * direction
+    return step
+
+
+@torch.no_grad()
+def correction(
+    scene: Scene,
+    body: Body,
+    wishes: Wishes,
+    fixed: Tensor | None = None,
+    settle: Settle | None = None,
+    begun: bool = False,
+) -> Tensor:
+    """The correction of a scene's poses that meets wishes, for `corrected`. -> (B, T, P, DOFS)
+
+    Args:
+        scene: (B, T, P) the poses.
+        body: that its shapes belong to.
+        wishes: what is wished; see `Wishes.of`.
+        fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
+        settle: how.
+        begun: the motion goes on from a past that stays where it is, so that corrections grow from 0.
+    """
+    settle = settle or Settle()
+    B, T, P = scene.T_world_root.shape[:3]
+    free = scene.present[:, None].expand(B, T, P).clone()
+    if fixed is not None:
+        free &= ~fixed.to(free.device)
+    offset = scene.T_world_root.new_zeros(B, T, P, DOFS)
+    if not bool(free.any()):
+        return offset
+    capsules = fit_capsules(body, scene.betas)
+    damping = _Damping(settle, T, begun, offset)
+    rest = body.rest_joints(scene.betas[:, None])
+    for _ in range(settle.iterations):
+        now = corrected(scene, offset)
+        R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)
+        seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)
+        rows = all_rows(seen, capsules, wishes, free)
+        if not len(rows.node):
+            break
+        if begun:
+            grown = ((rows.node // P % T + 1) / RAMP).clamp(max=1.0)
+            rows = replace(rows, root_weight=rows.root_weight * grown)
+        first = jacobian(seen, rows.node, rows.bone, rows.point, rows.along) * rows.root_weight[:, None]
+        second = jacobian(seen, rows.other, rows.other_bone, rows.other_point, rows.along)
+        second = second * (rows.root_weight * rows.two)[:, None]
+        step = solve(rows, first, second, damping, offset, free, settle.inner)
+        size = step.abs().amax(dim=-1, keepdim=True)
+        offset = offset + step * (settle.most / size.clamp_min(settle.most))
+    return offset

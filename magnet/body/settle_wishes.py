@@ -1,0 +1,170 @@
+"""What a correction of poses is to reach, read off the motion: who holds hands, which toes stand, who floats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body.base import Body
+from magnet.body.energy import CONTACT, GRAVITY, Contact, hand_points
+from magnet.body.fit import clearance
+from magnet.body.joints import FEET, TOES
+from magnet.motion.scene import Scene
+
+HELD = 0.20
+"""Metres between the middles of two hands that hold, as the metric has it."""
+LOW = 0.05
+"""Height in metres of a toe that stands, as for the metric FS."""
+SLIDES = 0.6
+"""Speed in m/s over which a low toe is taken to step."""
+FLOATS = 0.045
+"""Metres between the sole of the lower foot and the floor over which somebody floats or jumps."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What poses are to be.
+
+    Attributes:
+        contact: depths that are no penetration.
+        present: (B, P) bool, who is there.
+        clearance: (B, P, 4) height of the feet's joints over the sole, metres.
+        stands: (B, T - 1, P, 2) bool, toes that are to stand still in that step.
+        heights: (B, T, P, 2) metres that standing toes are to be over y = 0, NaN where they do not stand.
+        floats: (B, T, P) bool, people whose lower foot is to come down to the floor.
+        held: (B, T, Q, 2, 2) bool, hands of each pair of people, in the order of `combinations`, that hold.
+        between: (B, T, Q, 2, 2, 3) from the second's hands to the first's, as they are to be.
+        still: m/s at which a toe still stands.
+        fps: frames a second.
+    """
+
+    contact: Contact
+    present: Tensor
+    clearance: Tensor
+    stands: Tensor
+    heights: Tensor
+    floats: Tensor
+    held: Tensor
+    between: Tensor
+    still: float
+    fps: float
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        body: Body,
+        how: str = "firm",
+        slides: float = SLIDES,
+        still: float = 0.04,
+        begun: bool = False,
+    ) -> Wishes:
+        """Read off the motion as it is: (B, T, P).
+
+        Args:
+            how: a name in `CONTACT`.
+            slides: m/s under which a low toe is to stand.
+            still: m/s at which a toe is let move.
+            begun: the motion's first frames go on from others; who is in the air then may have jumped.
+        """
+        joints = body.joints(scene)
+        above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
+        there = scene.present[:, None]
+        floats = floating(joints, above, scene.fps, begun) & there
+        height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)
+        joints = joints.clone()
+        joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
+        held, between = holds(joints, scene.present)
+        stands = standing(joints, above, scene.fps, slides) & there[..., None]
+        on = F.pad(stands, (0, 0, 0, 0, 0, 1)) | F.pad(stands, (0, 0, 0, 0, 1, 0))
+        toes = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
+        heights = torch.where(on, toes, torch.nan)
+        return cls(CONTACT[how], scene.present, above, stands, heights, floats, held, between, still, scene.fps)
+
+    def there(self, one: int, other: int) -> Tensor:
+        """Whether both of two people are there. -> (B, 1) bool"""
+        return (self.present[:, one] & self.present[:, other])[:, None]
+
+    def everybody(self, frames: int) -> Tensor:
+        """Who is there, by frame. -> (B, T, P) bool"""
+        return self.present[:, None].expand(-1, frames, -1)
+
+    def slice(self, start: int, stop: int) -> Wishes:
+        """Those of the frames [start, stop)."""
+        frames = slice(start, stop)
+        return replace(
+            self,
+            stands=self.stands[:, start : max(stop - 1, start)],
+            heights=self.heights[:, frames],
+            floats=self.floats[:, frames],
+            held=self.held[:, frames],
+            between=self.between[:, frames],
+        )
+
+
+def holds(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Which hands hold, and from where to where. (B, T, P, 22, 3), (B, P) -> (B, T, Q, 2, 2), (B, T, Q, 2, 2, 3)
+
+    Of the four pairs of hands of two people the nearest counts, and the other two hands where they hold as well.
+    """
+    P = joints.shape[2]
+    pairs = list(combinations(range(P), 2))
+    if not pairs:
+        empty = joints.new_zeros(*joints.shape[:2], 0, 2, 2, 3)
+        return empty[..., 0].bool(), empty
+    first, second = [i for i, _ in pairs], [j for _, j in pairs]
+    hands = hand_points(joints)
+    between = hands[:, :, first, :, None] - hands[:, :, second, None]
+    apart = between.norm(dim=-1)
+    own = apart == apart.amin(dim=-1, keepdim=True)
+    held = (apart < HELD) & own & (apart == apart.amin(dim=-2, keepdim=True))
+    both = present[:, first] & present[:, second]
+    return held & both[:, None, :, None, None], between
+
+
+def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) -> Tensor:
+    """Toes that are to stand: low and slow from a frame to the next. -> (B, T - 1, P, 2) bool
+
+    joints (B, T, P, 22, 3), above (B, P, 4) clearance of the feet's joints
+    """
+    toes = joints[..., TOES, :]
+    lowest = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
+    low = toes[..., 1] - lowest < LOW
+    speed = toes[..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
+    return low[:, 1:] & low[:, :-1] & (speed < slides)
+
+
+def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> Tensor:
+    """Who is over the floor and does not jump. -> (B, T, P) bool
+
+    Both feet are over `FLOATS`. Whoever jumps falls: the centre of the body is then pulled down by about half of
+    gravity at least, on average over the time in the air, and nobody stays up for longer than 0.8 seconds.
+    """
+    height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)  # (B, T, P)
+    up = height > FLOATS
+    T = up.shape[1]
+    centre = joints[..., :, 1].mean(dim=-1)
+    padded = F.pad(centre.transpose(1, 2), (1, 1), mode="replicate").transpose(1, 2) if T > 1 else centre
+    fall = (padded[:, 2:] - 2 * padded[:, 1:-1] + padded[:, :-2]) * fps**2 if T > 1 else torch.zeros_like(centre)
+    result = torch.zeros_like(up)
+    longest = round(0.8 * fps)
+    for b, p in up.any(dim=1).nonzero().tolist():
+        row = up[b, :, p].tolist()
+        start = 0
+        while start < T:
+            if not row[start]:
+                start += 1
+                continue
+            stop = start
+            while stop < T and row[stop]:
+                stop += 1
+            cut = (start == 0 and begun) or stop == T  # it may have begun before, or end after
+            inner = fall[b, start:stop, p]
+            jumps = stop - start <= longest and float(inner.mean()) < -GRAVITY / 2
+            result[b, start:stop, p] = not jumps and not (cut and float(inner.mean()) < -GRAVITY / 4)
+            start = stop
+    return result

@@ -1,0 +1,130 @@
+"""Scenes that are put right: what was wrong is gone, what was right is still there."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.body import load_body
+from magnet.body.drift import drift, undrifted
+from magnet.body.energy import hand_points
+from magnet.body.joints import FEET, TOES
+from magnet.body.repair import repaired
+from magnet.body.settle import DOFS, corrected, jacobian
+from magnet.body.settle_rows import Seen
+from magnet.body.settle_wishes import Wishes
+from magnet.motion.scene import Scene, cat_time
+from magnet.synthesis import synthesize
+
+BODY = load_body()
+
+
+@pytest.fixture(scope="module")
+def handshake() -> Scene:
+    return synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), BODY).scene.slice(30, 120)
+
+
+def moved(scene: Scene, agent: int, shift: Tensor) -> Scene:
+    """One person moved by (T, 3) metres."""
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[0, :, agent, :3, 3] += shift
+    return scene.replace(T_world_root=T_world_root)
+
+
+def speed_of_low_toes(scene: Scene, agent: int) -> float:
+    toes = BODY.joints(scene)[0, :, agent][:, TOES]
+    low = (toes[1:, :, 1] < 0.05) & (toes[:-1, :, 1] < 0.05)
+    return float(scene.fps * toes[..., [0, 2]].diff(dim=0).norm(dim=-1)[low].median())
+
+
+def test_the_slopes_of_points_are_those_of_finite_differences(handshake: Scene) -> None:
+    scene, generator = handshake.slice(40, 41), torch.Generator().manual_seed(0)
+    offset = torch.zeros(1, 1, 2, DOFS, dtype=torch.float64)
+    double = scene.replace(**{k: v.double() for k, v in scene.tensors().items() if v.dtype == torch.float32})
+    R_world, joints = BODY.bone_chain(double.body_rot, double.T_world_root, BODY.rest_joints(double.betas[:, None]))
+    seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), joints[..., None], joints)
+    along = torch.nn.functional.normalize(torch.randn(22, 3, generator=generator, dtype=torch.float64), dim=-1)
+    node, bone = torch.ones(22, dtype=torch.long), torch.arange(22)
+    slopes = jacobian(seen, node, bone, joints[0, 0, 1], along)
+    for number in range(DOFS):
+        ahead = offset.clone()
+        ahead[0, 0, 1, number] = 1e-5
+        change = (BODY.joints(corrected(double, ahead)) - joints)[0, 0, 1] / 1e-5
+        torch.testing.assert_close(slopes[:, number], (change * along).sum(dim=-1), atol=1e-4, rtol=0)
+
+
+def test_what_is_right_is_let_be(handshake: Scene) -> None:
+    """No correction where there is nothing to correct: it costs more than it gives."""
+    once = repaired(handshake, BODY)
+    assert float((BODY.joints(once) - BODY.joints(handshake)).norm(dim=-1).mean()) < 0.012
+
+
+def test_whoever_floats_comes_down_and_whoever_jumps_does_not(handshake: Scene) -> None:
+    T = handshake.frames
+    up = torch.zeros(T, 3)
+    up[20:70, 1] = 0.15
+    foot = BODY.joints(repaired(moved(handshake, 1, up), BODY))[0, :, 1][:, FEET, 1].amin(dim=-1)
+    real = BODY.joints(handshake)[0, :, 1][:, FEET, 1].amin(dim=-1)
+    assert float((foot - real)[25:65].abs().max()) < 0.02
+    time = (torch.arange(T) - 40) / 30.0
+    jump = torch.zeros(T, 3)
+    jump[:, 1] = (0.2 - 0.5 * 9.81 * time**2).clamp_min(0)
+    made = repaired(moved(handshake, 1, jump), BODY, slides=0.0)
+    assert float((made.T_world_root - moved(handshake, 1, jump).T_world_root)[0, 36:45, 1, 1, 3].abs().max()) < 0.03
+
+
+def test_whoever_slides_stands_and_holds_again(handshake: Scene) -> None:
+    slide = torch.zeros(handshake.frames, 3)
+    slide[:, 2] = 0.3 * torch.arange(handshake.frames) / 30.0
+    damaged = moved(handshake, 0, slide)
+    assert speed_of_low_toes(damaged, 0) > 0.2
+    assert speed_of_low_toes(repaired(damaged, BODY), 0) < 0.06
+    wishes = Wishes.of(damaged, BODY)
+    assert float(drift(BODY.joints(damaged), wishes.stands, 30.0)[0, 20:70, 0, 1].mean()) == pytest.approx(
+        0.3, abs=0.05
+    )
+    whole = undrifted(damaged, BODY, fixed=torch.tensor([True, False]))
+    assert torch.equal(whole.T_world_root[:, :, 0], damaged.T_world_root[:, :, 0])
+
+
+def test_hands_that_hold_hold_on_while_bodies_leave_each_other(handshake: Scene) -> None:
+    hands = [hand_points(BODY.joints(handshake)[0, :, agent]) for agent in range(2)]
+    apart = (hands[0][:, :, None] - hands[1][:, None]).norm(dim=-1).amin(dim=(1, 2))
+    holds = apart < 0.15
+    assert int(holds.sum()) > 10
+    up = torch.zeros(handshake.frames, 3)
+    up[:, 1] = 0.12
+    made = BODY.joints(repaired(moved(handshake, 0, up), BODY))
+    hands = [hand_points(made[0, :, agent]) for agent in range(2)]
+    assert float((hands[0][:, :, None] - hands[1][:, None]).norm(dim=-1).amin(dim=(1, 2))[holds].max()) < 0.2
+
+
+def test_fixed_people_and_frames_stay_bit_identical(handshake: Scene) -> None:
+    pushed = moved(handshake, 1, torch.tensor([0.2, 0.1, 0.2]).expand(handshake.frames, 3))
+    fixed = torch.zeros(handshake.frames, 2, dtype=torch.bool)
+    fixed[:, 0], fixed[:30] = True, True
+    made = repaired(pushed, BODY, fixed=fixed)
+    for before, after in ((pushed.body_rot, made.body_rot), (pushed.T_world_root, made.T_world_root)):
+        assert torch.equal(before[0][fixed], after[0][fixed]) and not torch.equal(before, after)
+
+
+def test_a_correction_grows_from_nothing_where_the_past_stays(handshake: Scene) -> None:
+    high = moved(handshake, 1, torch.tensor([0.0, 0.15, 0.0]).expand(handshake.frames, 3)).slice(20, 60)
+    steps = {}
+    for begun in (False, True):
+        made = repaired(high, BODY, begun=begun, drifting=False)
+        steps[begun] = float((made.T_world_root - high.T_world_root)[0, 0, 1, 1, 3].abs())
+    assert steps[True] < 0.04 < 0.12 < steps[False]
+
+
+def test_scenes_of_other_rates_are_corrected_as_smoothly(handshake: Scene) -> None:
+    frames = torch.arange(0, handshake.frames, 0.25).floor().long().clamp(max=handshake.frames - 1)
+    four = moved(handshake, 1, torch.tensor([0.0, 0.15, 0.0]).expand(handshake.frames, 3)).frames_at(frames)
+    made = repaired(four.replace(fps=120.0), BODY)
+    shift = (made.T_world_root - four.T_world_root)[0, :, 1, 1, 3]
+    assert float(shift[40:300].mean()) == pytest.approx(-0.15, abs=0.03)
+    assert max(abs(float(b - a)) for a, b in pairwise(shift)) < 0.01
+    assert cat_time([four, four]).frames == 2 * four.frames
