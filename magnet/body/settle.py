@@ -109,11 +109,11 @@ def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tenso
 class _Damping:
     """The cost of corrections: (stay + speed D1'D1 + bend D2'D2) x along time, each number of a correction for itself.
 
-    Where the motion goes on from a past that stays, two frames without a correction come before.
+    Where the motion goes on from a past that stays, its last two frames come before: `past` (B, 2, P, DOFS).
     """
 
-    def __init__(self, settle: Settle, frames: int, begun: bool, like: Tensor) -> None:
-        self.settle, self.lead = settle, 2 if begun else 0
+    def __init__(self, settle: Settle, frames: int, past: Tensor | None, like: Tensor) -> None:
+        self.settle, self.past, self.lead = settle, past, 0 if past is None else past.shape[1]
         self.scale = torch.ones(DOFS, dtype=like.dtype, device=like.device)
         self.scale[3:9] = settle.tilt
         # The operator's diagonal: every fifth impulse is looked at by itself, so that they do not overlap.
@@ -124,9 +124,9 @@ class _Damping:
             diagonal[k::5] = self._along_time(impulses[None, :, None])[0, k::5, 0]
         self.diagonal = diagonal[:, None] * self.scale
 
-    def _along_time(self, x: Tensor) -> Tensor:
+    def _along_time(self, x: Tensor, past: Tensor | None = None) -> Tensor:
         """(B, T, D) -> same"""
-        x = F.pad(x, (0, 0, self.lead, 0))
+        x = F.pad(x, (0, 0, self.lead, 0)) if past is None else torch.cat([past, x], dim=1)
         total = self.settle.stay * x
         for order, cost in ((1, self.settle.speed), (2, self.settle.bend)):
             if x.shape[1] > order:
@@ -139,6 +139,11 @@ class _Damping:
     def __call__(self, offset: Tensor) -> Tensor:
         """(B, T, P, DOFS) -> same"""
         return self._along_time(offset.flatten(2)).view(offset.shape) * self.scale
+
+    def slope(self, offset: Tensor) -> Tensor:
+        """The same, counted from the corrections of the past. (B, T, P, DOFS) -> same"""
+        past = None if self.past is None else self.past.flatten(2)
+        return self._along_time(offset.flatten(2), past).view(offset.shape) * self.scale
 
 
 def solve(
@@ -173,7 +178,7 @@ def solve(
     def preconditioned(r: Tensor) -> Tensor:
         return torch.cholesky_solve(r[..., None], factor)[..., 0] * keep
 
-    residual = -(back(rows.root_weight * rows.residual) + damping(offset)) * keep
+    residual = -(back(rows.root_weight * rows.residual) + damping.slope(offset)) * keep
     step = torch.zeros_like(offset)
     z = preconditioned(residual)
     direction, rz = z, (residual * z).sum()
@@ -198,6 +203,7 @@ def correction(
     fixed: Tensor | None = None,
     settle: Settle | None = None,
     begun: bool = False,
+    past: Tensor | None = None,
 ) -> Tensor:
     """The correction of a scene's poses that meets wishes, for `corrected`. -> (B, T, P, DOFS)
 
@@ -208,6 +214,7 @@ def correction(
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
         settle: how.
         begun: the motion goes on from a past that stays where it is, so that corrections grow from 0.
+        past: (B, 2, P, DOFS) corrections of the two frames before, which this one goes on from; None: `begun` says.
     """
     settle = settle or Settle()
     B, T, P = scene.T_world_root.shape[:3]
@@ -218,7 +225,9 @@ def correction(
     if not bool(free.any()):
         return offset
     capsules = fit_capsules(body, scene.betas)
-    damping = _Damping(settle, T, begun, offset)
+    if past is None and begun:
+        past = offset.new_zeros(B, 2, P, DOFS)
+    damping = _Damping(settle, T, past, offset)
     rest = body.rest_joints(scene.betas[:, None])
     for _ in range(settle.iterations):
         now = corrected(scene, offset)

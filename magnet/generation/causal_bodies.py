@@ -10,6 +10,8 @@ from torch import Tensor
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
+from magnet.generation.settling import LEAD as LEAD_ROWS
+from magnet.generation.settling import corrected_in_views
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -99,9 +101,24 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
+    if world.options.settle != "off":
+        made = _settled(world, made, stop)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
     world.finalized = stop
+
+
+def _settled(world: World, made: Scene, stop: int) -> Scene:
+    """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before."""
+    lead = min(LEAD_ROWS, world.finalized)
+    whole = slice((world.finalized - lead) * TOKEN_FRAMES, world.finalized * TOKEN_FRAMES)
+    past = world.given.slice(whole.start, whole.stop).replace(valid=None, given=None)
+    scene = cat_time([past, made.replace(valid=None, given=None)]) if lead else made
+    new = world.by_frame(world.placed[world.finalized - lead : stop] & ~world.known[world.finalized - lead : stop])
+    new[: lead * TOKEN_FRAMES] = False
+    unseen = world.known[world.finalized : stop].any(dim=0).to(new.device)
+    scene = corrected_in_views(scene, new, unseen, world.options.settle, lead * TOKEN_FRAMES, True)
+    return scene.slice(lead * TOKEN_FRAMES).replace(valid=made.valid, given=made.given)
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:

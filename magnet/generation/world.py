@@ -12,6 +12,7 @@ from magnet.generation.blending import crossfade_given, delta_between, freeze_af
 from magnet.generation.causal_bodies import finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.generation.separation import separated
+from magnet.generation.settling import LEAD, settled_block, settled_chunk
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
     align_planar,
@@ -71,6 +72,7 @@ class WorldState:
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
+        self.correction: Tensor | None = None  # of the last two frames of the last chunk, see `settled_chunk`
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
 
     def extend(self, given: Scene, known: Tensor) -> None:
@@ -112,6 +114,8 @@ class WorldState:
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
+        if self.options.settle != "off":
+            latent = self._settle(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
@@ -153,6 +157,27 @@ class WorldState:
             (self.known[first] & self.causal).to(latent.device),
             decentralized,
         )
+
+    def _settle(
+        self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
+    ) -> Tensor:
+        """Correct the poses of the newly placed, and make them what the model goes on from. -> latents (B, n, P, C)"""
+        lead = min(LEAD, first)
+        if lead:
+            before = self.model.normalizer.denormalize(tokens[:, first - lead : first])
+            latent = torch.cat([self.model.layout.unpack(before)[0], latent], dim=1)
+        low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
+        new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
+        new, known = new.to(latent.device), self.known[low:stop].to(latent.device)
+        given, T_world_can = self.given.slice(frames.start, frames.stop), self.T_world_can[:, frames]
+        unseen = (self.known[first] & self.causal).to(latent.device)
+        made = settled_block(
+            self.model.tokenizer.decode, latent, self._deltas(low, stop), T_world_can, given, new, known, unseen,
+            self.options.settle, lead, decentralized,
+        )  # fmt: skip
+        moves = new.repeat_interleave(TOKEN_FRAMES, dim=0)[..., None, None]
+        self.T_world_can[:, frames] = torch.where(moves, canonical_frame(made.T_world_root), T_world_can)
+        return torch.where(new[..., None], self.model.encode(made), latent)[:, lead:]
 
     def _deltas(self, first: int, stop: int) -> Tensor:
         """Deltas of some tokens as placed in the world; the identity after unplaced rows. -> (B, n, P, 4, 9)"""
@@ -347,6 +372,9 @@ class WorldState:
                 decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
             )
         decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
+        if self.options.settle != "off":
+            fixed = self.by_frame(self.known[first:stop])
+            decoded, self.correction = settled_chunk(decoded, fixed, self.options.settle, self.correction)
         return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:

@@ -48,6 +48,9 @@ class SamplerOptions:
             (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
+        settle: correct the poses of each finished block: people out of each other and of themselves, hands held, feet
+            still and on the floor, and the model goes on from there (ours, `magnet.body.settle`): `off`, `light` or
+            `firm`.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
@@ -71,6 +74,7 @@ class SamplerOptions:
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
     apart: Separation = "off"
+    settle: Separation = "off"
     requantize: bool | None = None
     keep_given: bool = True
     blend: int = 10
@@ -87,6 +91,7 @@ class SamplerOptions:
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         require_choice("placement", self.placement, Placement)
         require_choice("apart", self.apart, Separation)
+        require_choice("settle", self.settle, Separation)
         require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)

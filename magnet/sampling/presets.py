@@ -33,6 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
         "apart": "off",  # the paper moves nobody out of another
+        "settle": "off",  # and corrects no pose
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four; `paper`

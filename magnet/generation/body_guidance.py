@@ -1,0 +1,224 @@
+"""Guidance by bodies: what the model expects is pushed out of collisions while it is sampled."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body.energy import CONTACT, limit_excess, pair_energy, slide, under_floor
+from magnet.body.fit import clearance
+from magnet.body.fitted_capsules import fit_capsules
+from magnet.body.settle_wishes import standing
+from magnet.generation.settling import open_body_on
+from magnet.motion.frames import from_9d, inverse, partners, posed, project_se2
+from magnet.motion.placement import place
+from magnet.motion.planar import rotate_ground
+from magnet.motion.frames import to_planar
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+
+if TYPE_CHECKING:
+    from magnet.generation.world import WorldState
+
+LAST = 3
+"""Tokens are guided in the last third of their denoising steps."""
+
+FARTHEST = {"light": 0.03, "firm": 0.06}
+"""Metres that a place is moved in one denoising step at most."""
+
+STEP = {"light": 0.5, "firm": 1.0}
+"""Share of a step that would make the energy 0, were it quadratic."""
+
+BENT = 0.15
+"""Of a latent's length: what a step changes of it at most."""
+
+FEET, TURNS = 1.0, 0.01
+"""Weights of squared metres of feet, and of squared radians beyond the range of joints, against squared depth."""
+
+
+class BodyGuidance:
+    """Moves the clean estimate down the energy of bodies together, through the decoder alone.
+
+    The energy is `magnet.body.energy` of the bodies that the estimate decodes to, placed as the world would place them.
+    Its slope with respect to latents goes through the decoder; with respect to places it is that of moving people over
+    the ground, and deltas and pairwise transforms are changed by as much as such a move changes them. Only numbers of
+    tokens whose level is low are changed, so given and finished ones never are. What a view hides does not count in it.
+
+    Args:
+        world: where everybody is.
+        how: `light` or `firm`.
+        low: level up to which tokens are guided.
+        every: denoising steps from one guided one to the next.
+    """
+
+    def __init__(self, world: WorldState, how: str, low: int, every: int) -> None:
+        self.world, self.how, self.low, self.every = world, how, low, every
+        self.steps = 0
+
+    def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor:
+        """The estimate with its bodies out of each other.
+
+        Args:
+            clean: (B V, W, P, D) normalized, of each view.
+            now: (V, W, P) int, levels that it was made at.
+            hidden: (V, W, P) bool, what each view hides; None: nothing.
+            first: row of the world that the window begins with.
+        """
+        low = (now > 0) & (now <= self.low)
+        if not bool(low.any()):
+            return clean
+        self.steps += 1
+        if self.steps % self.every:
+            return clean
+        views = len(now)
+        for view in range(views):
+            unseen = torch.zeros_like(low[0]) if hidden is None else hidden[view]
+            moves = low[view] & ~unseen
+            if bool(moves.any()):
+                clean[view::views] = self._guided(clean[view::views], moves, unseen, first)
+        return clean
+
+    def _guided(self, clean: Tensor, moves: Tensor, unseen: Tensor, first: int) -> Tensor:
+        """One view. clean (B, W, P, D), moves, unseen (W, P) bool -> (B, W, P, D)"""
+        world = self.world
+        model = world.model
+        rows = moves.any(dim=1).nonzero()[:, 0]
+        placed = world.placed[first : first + len(moves)].to(moves.device)
+        there = world.given.present.any(dim=0)
+        open_rows = (~placed & there).any(dim=1).nonzero()[:, 0]
+        begin, stop = min(int(rows[0]), int(open_rows[0])) if len(open_rows) else int(rows[0]), int(rows[-1]) + 1
+        gone = unseen[begin:stop].any(dim=0)
+        if bool(gone.any()) and first + begin == 0:
+            return clean  # nobody stands anywhere yet, and who is hidden may not say where
+        low, high = max(begin - 1, 0), min(stop + 1, clean.shape[1])
+        tokens = model.normalizer.denormalize(clean)
+        latent, deltas, pairs = model.layout.unpack(tokens)
+        seen = world.given.present & ~gone
+        T_world_can = self._placed(deltas[:, begin:stop], pairs[:, begin:stop], first + begin, seen, gone)
+        frames = slice((first + low) * TOKEN_FRAMES, (first + stop) * TOKEN_FRAMES)
+        if low < begin:
+            before = world.T_world_can[:, frames.start : frames.start + TOKEN_FRAMES]
+            T_world_can = torch.cat([before, T_world_can], dim=1)
+        decoded = latent[:, low:high], deltas[:, low:high]
+        moved = moves[low:stop]
+        bend, shift = self._slopes(*decoded, T_world_can, frames, moved, seen)
+        latent = latent.clone()
+        latent[:, low:stop] += bend
+        deltas, pairs = moved_along(deltas, pairs, T_world_can, shift, low, stop, moved)
+        changed = model.layout.spread(model.layout.group_present(moves[None])[0]) & (
+            torch.arange(model.layout.width, device=clean.device) >= 0
+        )
+        return torch.where(changed, model.normalizer.normalize(model.layout.pack(latent, deltas, pairs)), clean)
+
+    def _placed(self, deltas: Tensor, pairs: Tensor, row: int, seen: Tensor, gone: Tensor) -> Tensor:
+        """Where everybody would stand in some rows. seen (B, P), gone (P,) bool -> (B, 4 n, P, 4, 4)"""
+        world, n = self.world, deltas.shape[1]
+        known = world.placed[row].to(deltas.device)
+        T_prev_can = project_se2(from_9d(by_frame(deltas)))
+        T_self_partner = from_9d(pairwise_by_frame(pairs)) if world.model.layout.slots else None
+        starts = world.starts(T_prev_can, T_self_partner, row, ~known)
+        options = world.options
+        anchor = seen.int().argmax(dim=1)
+        made = place(
+            T_prev_can, T_self_partner, starts, options.placement, options.pairwise_weight,
+            present=seen & ~known, fixed=torch.zeros_like(known), anchor=anchor,
+        )  # fmt: skip
+        frames = slice(row * TOKEN_FRAMES, (row + n) * TOKEN_FRAMES)
+        stands = world.by_frame(world.placed[row : row + n])[..., None, None] & ~gone[:, None, None]
+        return torch.where(stands, world.T_world_can[:, frames], made)
+
+    @torch.enable_grad()
+    def _slopes(
+        self, latent: Tensor, deltas: Tensor, T_world_can: Tensor, frames: slice, moves: Tensor, seen: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What to add to latents (B, n, P, C) and to places (B, 4 n, P, 2). moves (n, P) bool, seen (B, P) bool"""
+        with torch.inference_mode(False):
+            world, body = self.world, open_body_on(latent.device)
+            n, T = len(moves), len(moves) * TOKEN_FRAMES
+            leaf, place_shift = latent.clone().requires_grad_(), torch.zeros_like(T_world_can[..., :2, 3])
+            place_shift.requires_grad_()
+            features = world.model.tokenizer.decode(leaf, world.given.betas.clone(), deltas.clone())[:, :T]
+            given = world.given.slice(frames.start, frames.stop)
+            made = posed(features, T_world_can.clone(), given)
+            real = world.by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])
+            body_rot = torch.where(real[..., None, None, None], given.body_rot, made.body_rot)
+            root = torch.where(real[..., None, None], given.T_world_root, made.T_world_root)
+            x, z = place_shift.unbind(-1)
+            root = torch.cat(
+                [root[..., :3, :3], (root[..., :3, 3] + torch.stack([x, torch.zeros_like(x), z], dim=-1))[..., None]],
+                dim=-1,
+            )
+            energy = self._energy(body, body_rot, root, given.betas, moves, seen)
+            if not bool((energy > 0).any()):
+                return torch.zeros_like(latent[:, :n]), torch.zeros_like(place_shift)
+            by_latent, by_place = torch.autograd.grad(energy.sum(), (leaf, place_shift))
+        return self._steps(latent[:, :n], by_latent[:, :n], by_place, energy.detach(), moves)
+
+    def _energy(self, body, body_rot, root, betas, moves: Tensor, seen: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        """(B, T) m^2, of frames in which somebody moves"""
+        capsules = fit_capsules(body, betas)
+        R_world, joints = body.bone_chain(body_rot, root, body.rest_joints(betas[:, None]))
+        there = seen[:, None].expand(joints.shape[:3])
+        total = pair_energy(capsules.posed(R_world, joints), capsules.radius, there, CONTACT[self.how])
+        above = clearance(body, betas.flatten(0, 1)).unflatten(0, betas.shape[:2])
+        feet = under_floor(joints, above[:, None]).square().sum(dim=-1)
+        stands = standing(joints.detach(), above, self.world.given.fps)
+        slid = F.pad(slide(joints, stands).square().sum(dim=-1), (0, 0, 1, 0))
+        turned = limit_excess(body_rot).square().sum(dim=-1)
+        own = torch.where(there, FEET * (feet + slid) + TURNS * turned, 0.0)
+        rows = moves.any(dim=1).repeat_interleave(TOKEN_FRAMES)
+        return torch.where(rows, total + own.sum(dim=-1), 0.0)
+
+    def _steps(
+        self, latent: Tensor, by_latent: Tensor, by_place: Tensor, energy: Tensor, moves: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Polyak steps, half of the energy to be taken out by latents and half by places."""
+        who = moves.repeat_interleave(TOKEN_FRAMES, dim=0)
+        by_place = torch.where(who[..., None], by_place, 0.0)
+        by_latent = torch.where(moves[..., None], by_latent, 0.0)
+        steep = by_place.square().sum(dim=(2, 3), keepdim=True).clamp_min(1e-8)
+        shift = -STEP[self.how] * energy[..., None, None] / steep * by_place
+        shift = smoothed(shift)
+        length = shift.norm(dim=-1, keepdim=True)
+        shift = shift * (FARTHEST[self.how] / length.clamp_min(FARTHEST[self.how]))
+        of_tokens = energy.unflatten(1, (-1, TOKEN_FRAMES)).sum(dim=-1)
+        steep = by_latent.square().sum(dim=(2, 3)).clamp_min(1e-8)
+        bend = -STEP[self.how] * (of_tokens / steep)[..., None, None] * by_latent
+        length, most = bend.norm(dim=-1, keepdim=True), BENT * latent.norm(dim=-1, keepdim=True)
+        return bend * (most / torch.maximum(length, most).clamp_min(1e-8)), shift
+
+
+def smoothed(shift: Tensor, frames: int = 4) -> Tensor:
+    """Averaged over so many frames before and after. (B, T, P, 2) -> same"""
+    flat = F.pad(shift.flatten(2).transpose(1, 2), (frames, frames), mode="replicate")
+    return F.avg_pool1d(flat, 2 * frames + 1, stride=1).transpose(1, 2).view(shift.shape)
+
+
+def moved_along(
+    deltas: Tensor, pairs: Tensor, T_world_can: Tensor, shift: Tensor, low: int, stop: int, moves: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Deltas and pairwise transforms of people who are moved over the ground.
+
+    Args:
+        deltas, pairs: (B, W, P, 4, 9), (B, W, P, P - 1, 4, 9) of a window.
+        T_world_can: (B, 4 n, P, 4, 4) of its rows [low, stop).
+        shift: (B, 4 n, P, 2) metres in the world.
+        low, stop: rows of the window.
+        moves: (n, P) bool, whose tokens are changed.
+    """
+    yaw, _ = to_planar(T_world_can)
+    grown = F.pad(shift, (0, 0, 0, 0, 1, 0)).diff(dim=1)
+    grown = torch.where(F.pad(moves, (0, 0, 1, 0))[:-1].repeat_interleave(TOKEN_FRAMES, dim=0)[..., None], grown, shift)
+    before = torch.cat([yaw[:, :1], yaw[:, :-1]], dim=1)
+    local = rotate_ground(-before, grown)
+    deltas = deltas.clone()
+    deltas[:, low:stop, ..., [6, 8]] += by_token(local)
+    if not pairs.shape[3]:
+        return deltas, pairs
+    away = shift[:, :, partners(shift.shape[2], shift.device)] - shift[:, :, :, None]  # (B, T, P, P - 1, 2)
+    local = rotate_ground(-yaw[..., None].expand(away.shape[:-1]), away)
+    pairs = pairs.clone()
+    pairs[:, low:stop, ..., [6, 8]] += pairwise_by_token(local)
+    return deltas, pairs

@@ -1,0 +1,120 @@
+"""New people's poses are corrected before the model goes on from them: out of each other, feet still, on the floor."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from magnet.body import Body, load_body
+from magnet.body.repair import repaired
+from magnet.body.settle import Settle, corrected, correction
+from magnet.body.settle_wishes import Wishes
+from magnet.generation.separation import Decode
+from magnet.motion.frames import posed
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES
+
+LEAD = 2
+"""Token steps of the past that a block is corrected with; they stay."""
+
+BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
+"""How a block is corrected while sampling: it is short, so its corrections are stiff; the end sees to the rest."""
+
+
+@lru_cache(maxsize=4)
+def open_body_on(device: torch.device) -> Body:
+    """Bodies while sampling are the open body's: where the skin lies is told well enough by anybody's shape numbers."""
+    return load_body().requires_grad_(False).to(device)
+
+
+def frozen(scene: Scene, agents: Tensor, frame: int) -> Scene:
+    """The scene with some agents standing still from a frame on. agents (P,) bool"""
+    rows = torch.arange(scene.frames, device=scene.device).clamp(max=frame)
+    still = scene.frames_at(rows)
+    return scene.replace(
+        body_rot=torch.where(agents[:, None, None, None], still.body_rot, scene.body_rot),
+        T_world_root=torch.where(agents[:, None, None], still.T_world_root, scene.T_world_root),
+    )
+
+
+def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead: int, decentralized: bool) -> Scene:
+    """Poses of some people corrected, each by what it may see.
+
+    Args:
+        scene: (B, T, P) bodies.
+        new: (T, P) bool, who may be moved.
+        unseen: (P,) bool, whom the new ones may know no further than the first frames: they stand still from there on.
+        how: `light` or `firm`.
+        lead: first frames that are a past; 0: none, and whoever is unseen is not there.
+        decentralized: the new ones do not see each other either.
+    """
+    body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
+    shaped = scene.replace(body=body.id, valid=None, given=None)
+    made, moving = shaped, new.any(dim=0)
+    for who in [agents == agent for agent in agents[moving]] if decentralized else [moving]:
+        hidden = unseen | (moving & ~who)
+        seen = frozen(shaped, hidden, lead - 1) if lead else shaped.replace(present=shaped.present & ~hidden)
+        own = new & who
+        one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), drifting=False)
+        made = made.replace(
+            body_rot=torch.where(own[..., None, None, None], one.body_rot, made.body_rot),
+            T_world_root=torch.where(own[..., None, None], one.T_world_root, made.T_world_root),
+        )
+    return made.replace(body=scene.body)
+
+
+@torch.no_grad()
+def settled_block(
+    decode: Decode,
+    latent: Tensor,
+    deltas: Tensor,
+    T_world_can: Tensor,
+    given: Scene,
+    new: Tensor,
+    known: Tensor,
+    unseen: Tensor,
+    how: str,
+    lead: int,
+    decentralized: bool = False,
+) -> Scene:
+    """Bodies of some rows of tokens, those of new people corrected.
+
+    Arguments as for `magnet.generation.separation.separated`, and:
+
+    Args:
+        lead: first rows that are of before, whence the new ones go on.
+
+    Returns:
+        (B, 4 n, P).
+    """
+    there = known.repeat_interleave(TOKEN_FRAMES, dim=0)
+    made = posed(decode(latent, given.betas, deltas), T_world_can, given)
+    made = made.replace(
+        body_rot=torch.where(there[..., None, None, None], given.body_rot, made.body_rot),
+        T_world_root=torch.where(there[..., None, None], given.T_world_root, made.T_world_root),
+    )
+    rows = new.repeat_interleave(TOKEN_FRAMES, dim=0)
+    return corrected_in_views(made, rows, unseen, how, lead * TOKEN_FRAMES, decentralized)
+
+
+@torch.no_grad()
+def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) -> tuple[Scene, Tensor]:
+    """Bodies of a finished chunk corrected, going on from the correction of the chunk before.
+
+    Args:
+        scene: (B, T, P) bodies.
+        fixed: (T, P) bool, who stays.
+        how: `light` or `firm`.
+        past: what the last call returned; None: the chunk is the first.
+
+    Returns:
+        The scene, and the corrections of its last two frames.
+    """
+    body = open_body_on(scene.device)
+    shaped = scene.replace(body=body.id, valid=None, given=None)
+    wishes = Wishes.of(shaped, body, how, begun=past is not None)
+    offset = correction(shaped, body, wishes, fixed, past=past)
+    made = corrected(shaped, offset)
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]
