@@ -12,6 +12,7 @@ import pytest
 import magnet
 from magnet.denoiser.module import Denoiser
 from magnet.sampling.options import SamplerOptions
+from tests.cases import some_slow
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -43,7 +44,9 @@ def files(model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Path(one.save(f"take_{letter}.bvh")).rename(f"take_{letter}.bvh")
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", some_slow([page for page in PAGES if blocks(page)], ROOT / "docs/viewer.md"), ids=lambda page: page.stem
+)
 def test_the_python_of_a_page_runs(page: Path, model, files: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(magnet, "load", lambda *_, **__: model)
     monkeypatch.setattr(Denoiser, "load", lambda *_: model.denoiser)

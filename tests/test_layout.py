@@ -1,6 +1,7 @@
 """How the code is laid out: sizes of files and functions, what is written once, what tests may reach for."""
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,10 +9,10 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES, MOST_FUNCTION_LINES = 400, 70
 
 
-def parsed(folder: str) -> Iterator[tuple[Path, str, ast.Module]]:
-    for path in sorted((ROOT / folder).rglob("*.py")):
-        text = path.read_text(encoding="utf-8")
-        yield path.relative_to(ROOT), text, ast.parse(text)
+@functools.cache
+def parsed(folder: str) -> list[tuple[Path, str, ast.Module]]:
+    texts = [(path, path.read_text(encoding="utf-8")) for path in sorted((ROOT / folder).rglob("*.py"))]
+    return [(path.relative_to(ROOT), text, ast.parse(text)) for path, text in texts]
 
 
 def test_no_file_is_longer_than_a_reader_keeps_in_mind() -> None:

@@ -268,6 +268,7 @@ def test_takes_of_the_real_recordings(cmu_root: Path) -> None:
 # -- prepared ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_prepared_store_holds_the_fits_of_the_cache_on_a_floor_of_its_own(filled: CMU, tmp_path: Path) -> None:
     """The same poses and shapes as the cache's; the floor's height and the origin follow the rule for all stores."""
     job = PrepareJob("cmu", filled.root or "", {}, "open", CanonicalizeOptions())

@@ -24,8 +24,8 @@ SMALL = {
 }  # fmt: skip
 FRAMES = {"remocap": 40, "bvh": 40, "cmu": 40}
 """Of a fake's takes, where fitting 150 takes too long."""
-SLOW = ("bvh", "chi3d", "remocap")
-"""Many frames are fitted or turned; `tests/test_own.py` goes the same way."""
+SLOW = ("bvh", "chi3d", "cmu", "remocap")
+"""Many frames are fitted or turned; `tests/test_own.py` goes the same way, and CMU's reader has tests of its own."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""
 
@@ -136,6 +136,7 @@ def fit_and_test(*data: str) -> None:
     assert json.loads(Path("tested/results.json").read_text())
 
 
+@pytest.mark.slow
 def test_recordings_of_cmu_train_without_being_prepared(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

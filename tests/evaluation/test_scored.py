@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -53,6 +54,7 @@ CASES = {
 EACH = pytest.mark.parametrize(("task", "scored"), CASES.values(), ids=CASES.keys())
 
 
+@functools.cache
 def sampled(task: object) -> tuple[Evaluator, Scene, Scene]:
     """A run's evaluator, its only batch of two people in three slots, and the samples that it draws."""
     datamodule = data(batch_size=9)

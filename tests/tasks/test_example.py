@@ -86,6 +86,7 @@ def test_its_data_set_is_listed_and_its_fields_are_options(said: dict[str, str])
     assert "magnet_duel.strolls.Strolls" in said["fit"] and "takes: 3" in said["fit"]
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass(installed: Path, tmp_path: Path):
     tests = shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
     said = run("pytest", "-q", "-p", "no:cacheprovider", str(tests), installed=installed, cwd=tmp_path)

@@ -16,10 +16,12 @@ from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
 from magnet.testing import TASK_GRIDS, check_hidden, renaming_law, sampled_blind, task_laws
+from tests.cases import some_slow
 
 TWO_AND_MORE = ("partner_inpainting", "partner_prediction", "motion_control")
 CANNOT_ROLL = ("agentic_async", "agentic_sync", "inbetweening", "motion_control")
 FROM_NOTHING = ("generation", "partner_inpainting", "inbetweening")
+HIDING = ("agentic_async", "agentic_sync")
 NAMELESS = ("joint_future", "generation", "agentic_sync", "inbetweening")
 
 
@@ -31,7 +33,7 @@ def test_every_task_obeys_the_laws(name: str):
     assert checked == [g for g in expected if g.context or name in FROM_NOTHING]
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", some_slow(registry.names(), *HIDING))
 @pytest.mark.parametrize("pyramid_offset", [0, 2])
 def test_every_task_obeys_the_laws_where_each_token_has_levels_of_its_own(name: str, pyramid_offset: int):
     """Paper A.6.2. Levels are drawn by slot, so this is the one choice in which slots are not treated alike."""
@@ -73,8 +75,6 @@ def test_joint_future_needs_a_past():
 
 
 # -- what is hidden stays hidden ---------------------------------------------------------------
-
-HIDING = ("agentic_async", "agentic_sync")
 
 
 @pytest.mark.parametrize("name", HIDING)

@@ -243,6 +243,7 @@ def test_new_noise_and_levels_nearer_to_noise_sample_the_same_futures(eta, shift
     check(JointFuture(), 2, eta=eta, shift=shift)
 
 
+@pytest.mark.slow
 def test_new_noise_samples_the_same_futures_when_rolling_and_in_turns():
     check(JointFuture(), 2, share=2, eta=1.0)
     check(AgenticAsync(), 2, eta=1.0)
