@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -88,13 +89,29 @@ class FittedCapsules:
         return (R[..., None, :, :] @ self.ends[:, None, ..., None])[..., 0] + t[..., None, :]
 
 
-@torch.no_grad()
+_KEPT: WeakKeyDictionary[Body, dict[bytes, FittedCapsules]] = WeakKeyDictionary()
+"""Capsules of the last bodies asked for: while a scene is sampled they are asked for many times."""
+
+MOST_KEPT = 8
+
+
 def fit_capsules(body: Body, betas: Tensor) -> FittedCapsules:
     """Capsules fitted to the mesh at rest. betas (B, P, 10)
 
     Across the trunk a capsule is as thick as that stretch is deep; elsewhere as thick as the skin is far from the axis
     on average. Its ends reach to the skin.
     """
+    kept = _KEPT.setdefault(body, {})
+    key = betas.detach().float().cpu().numpy().tobytes() + repr((betas.shape, betas.device)).encode()
+    if key not in kept:
+        if len(kept) >= MOST_KEPT:
+            kept.clear()
+        with torch.inference_mode(False), torch.no_grad():
+            kept[key] = _fit(body, betas.detach().clone())
+    return kept[key]
+
+
+def _fit(body: Body, betas: Tensor) -> FittedCapsules:
     flat = betas.flatten(0, 1).to(body.v_template)
     vertices = body.v_template + (flat @ body.shapedirs.flatten(0, 1).T).unflatten(-1, (-1, 3))  # (M, V, 3)
     rest = body.rest_joints(flat)

@@ -30,6 +30,9 @@ DOFS = 3 + 3 * len(MOVED)
 RAMP = 6
 """Frames after a past that stays over which wishes grow to their full weight."""
 
+DONE = 1e-10
+"""Gain that is left at which conjugate gradients stop."""
+
 
 @dataclass(frozen=True)
 class Settle:
@@ -178,20 +181,25 @@ def solve(
     def preconditioned(r: Tensor) -> Tensor:
         return torch.cholesky_solve(r[..., None], factor)[..., 0] * keep
 
+    def product(x: Tensor, y: Tensor) -> Tensor:
+        """Of each scene by itself, so that scenes do not depend on those beside them. -> (B, 1, 1, 1)"""
+        return (x * y).sum(dim=(1, 2, 3), keepdim=True)
+
     residual = -(back(rows.root_weight * rows.residual) + damping.slope(offset)) * keep
     step = torch.zeros_like(offset)
     z = preconditioned(residual)
-    direction, rz = z, (residual * z).sum()
+    direction, rz = z, product(residual, z)
     for _ in range(inner):
-        if float(rz) < 1e-12:
+        going = rz > DONE
+        if not bool(going.any()):
             break
-        product = (back(across(direction)) + damping(direction)) * keep
-        length = rz / (direction * product).sum()
+        turned = (back(across(direction)) + damping(direction)) * keep
+        length = torch.where(going, rz / product(direction, turned).clamp_min(1e-20), 0.0)
         step = step + length * direction
-        residual = residual - length * product
+        residual = residual - length * turned
         z = preconditioned(residual)
-        rz, before = (residual * z).sum(), rz
-        direction = z + rz / before * direction
+        rz, before = product(residual, z), rz
+        direction = z + torch.where(going, rz / before.clamp_min(1e-20), 0.0) * direction
     return step
 
 

@@ -8,16 +8,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.body.base import Body
 from magnet.body.energy import CONTACT, limit_excess, pair_energy, slide, under_floor
 from magnet.body.fit import clearance
 from magnet.body.fitted_capsules import fit_capsules
 from magnet.body.settle_wishes import standing
 from magnet.generation.settling import open_body_on
-from magnet.motion.frames import from_9d, inverse, partners, posed, project_se2
+from magnet.motion.frames import from_9d, partners, posed, project_se2, to_planar
 from magnet.motion.placement import place
 from magnet.motion.planar import rotate_ground
-from magnet.motion.frames import to_planar
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.sampling.grid import Grid
+from magnet.sampling.plans import token_levels
 
 if TYPE_CHECKING:
     from magnet.generation.world import WorldState
@@ -25,13 +27,16 @@ if TYPE_CHECKING:
 LAST = 3
 """Tokens are guided in the last third of their denoising steps."""
 
-FARTHEST = {"light": 0.03, "firm": 0.06}
+FARTHEST = {"light": 0.02, "firm": 0.04}
 """Metres that a place is moved in one denoising step at most."""
 
 STEP = {"light": 0.5, "firm": 1.0}
 """Share of a step that would make the energy 0, were it quadratic."""
 
-BENT = 0.15
+RAMP = 8
+"""Frames over which a place's move grows."""
+
+BENT = 0.1
 """Of a latent's length: what a step changes of it at most."""
 
 FEET, TURNS = 1.0, 0.01
@@ -57,6 +62,13 @@ class BodyGuidance:
         self.world, self.how, self.low, self.every = world, how, low, every
         self.steps = 0
 
+    @classmethod
+    def of(cls, world: WorldState, grid: Grid) -> BodyGuidance:
+        """As the options of a world say; each token is guided at least once in the last third of its steps."""
+        last = -(-grid.steps // LAST)
+        low = int(token_levels(grid)[grid.steps - last].max())
+        return cls(world, world.options.body_guidance, low, last)
+
     def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor:
         """The estimate with its bodies out of each other.
 
@@ -64,8 +76,9 @@ class BodyGuidance:
             clean: (B V, W, P, D) normalized, of each view.
             now: (V, W, P) int, levels that it was made at.
             hidden: (V, W, P) bool, what each view hides; None: nothing.
-            first: row of the world that the window begins with.
+            first: token step, of all, that the window begins with.
         """
+        first -= self.world.released
         low = (now > 0) & (now <= self.low)
         if not bool(low.any()):
             return clean
@@ -77,11 +90,11 @@ class BodyGuidance:
             unseen = torch.zeros_like(low[0]) if hidden is None else hidden[view]
             moves = low[view] & ~unseen
             if bool(moves.any()):
-                clean[view::views] = self._guided(clean[view::views], moves, unseen, first)
+                clean[view::views] = self._guided(clean[view::views], now[view], moves, unseen, first)
         return clean
 
-    def _guided(self, clean: Tensor, moves: Tensor, unseen: Tensor, first: int) -> Tensor:
-        """One view. clean (B, W, P, D), moves, unseen (W, P) bool -> (B, W, P, D)"""
+    def _guided(self, clean: Tensor, now: Tensor, moves: Tensor, unseen: Tensor, first: int) -> Tensor:
+        """One view. clean (B, W, P, D), now (W, P) int, moves, unseen (W, P) bool -> (B, W, P, D)"""
         world = self.world
         model = world.model
         rows = moves.any(dim=1).nonzero()[:, 0]
@@ -106,24 +119,21 @@ class BodyGuidance:
         bend, shift = self._slopes(*decoded, T_world_can, frames, moved, seen)
         latent = latent.clone()
         latent[:, low:stop] += bend
-        deltas, pairs = moved_along(deltas, pairs, T_world_can, shift, low, stop, moved)
-        changed = model.layout.spread(model.layout.group_present(moves[None])[0]) & (
-            torch.arange(model.layout.width, device=clean.device) >= 0
-        )
+        deltas, pairs = moved_along(deltas, pairs, T_world_can, shift, low, stop)
+        group = model.layout.spread(model.layout.group_levels(torch.where(unseen, self.low + 1, now)))
+        changed = (group > 0) & (group <= self.low)
         return torch.where(changed, model.normalizer.normalize(model.layout.pack(latent, deltas, pairs)), clean)
 
     def _placed(self, deltas: Tensor, pairs: Tensor, row: int, seen: Tensor, gone: Tensor) -> Tensor:
         """Where everybody would stand in some rows. seen (B, P), gone (P,) bool -> (B, 4 n, P, 4, 4)"""
-        world, n = self.world, deltas.shape[1]
-        known = world.placed[row].to(deltas.device)
-        T_prev_can = project_se2(from_9d(by_frame(deltas)))
+        world, options, n = self.world, self.world.options, deltas.shape[1]
+        known = world.placed[row].to(deltas.device) & ~gone
+        true_deltas = from_9d(by_frame(world.placed_deltas(row, row + n)))
+        T_prev_can = torch.where(known[:, None, None], true_deltas, project_se2(from_9d(by_frame(deltas))))
         T_self_partner = from_9d(pairwise_by_frame(pairs)) if world.model.layout.slots else None
-        starts = world.starts(T_prev_can, T_self_partner, row, ~known)
-        options = world.options
-        anchor = seen.int().argmax(dim=1)
         made = place(
-            T_prev_can, T_self_partner, starts, options.placement, options.pairwise_weight,
-            present=seen & ~known, fixed=torch.zeros_like(known), anchor=anchor,
+            T_prev_can, T_self_partner, world.starts(T_prev_can, T_self_partner, row, ~known), options.placement,
+            options.pairwise_weight, present=seen, fixed=known, anchor=seen.int().argmax(dim=1),
         )  # fmt: skip
         frames = slice(row * TOKEN_FRAMES, (row + n) * TOKEN_FRAMES)
         stands = world.by_frame(world.placed[row : row + n])[..., None, None] & ~gone[:, None, None]
@@ -134,29 +144,35 @@ class BodyGuidance:
         self, latent: Tensor, deltas: Tensor, T_world_can: Tensor, frames: slice, moves: Tensor, seen: Tensor
     ) -> tuple[Tensor, Tensor]:
         """What to add to latents (B, n, P, C) and to places (B, 4 n, P, 2). moves (n, P) bool, seen (B, P) bool"""
-        with torch.inference_mode(False):
+        with torch.inference_mode(False):  # Lightning tests in inference mode, whose tensors no gradient may pass
             world, body = self.world, open_body_on(latent.device)
+            slots = world.given.present.any(dim=0).nonzero()[:, 0]
             n, T = len(moves), len(moves) * TOKEN_FRAMES
-            leaf, place_shift = latent.clone().requires_grad_(), torch.zeros_like(T_world_can[..., :2, 3])
-            place_shift.requires_grad_()
-            features = world.model.tokenizer.decode(leaf, world.given.betas.clone(), deltas.clone())[:, :T]
-            given = world.given.slice(frames.start, frames.stop)
-            made = posed(features, T_world_can.clone(), given)
-            real = world.by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])
+            bend, shift = torch.zeros_like(latent[:, :n]), torch.zeros_like(T_world_can[..., :2, 3])
+            moves, seen, T_world_can = moves[:, slots].clone(), seen[:, slots].clone(), T_world_can[:, :, slots].clone()
+            leaf = latent[:, :, slots].clone().requires_grad_()
+            place_shift = shift[:, :, slots].clone().requires_grad_()
+            given = world.given.slice(frames.start, frames.stop).permute_agents(slots)
+            given = given.replace(**{name: value.clone() for name, value in given.tensors().items()})
+            features = world.model.tokenizer.decode(leaf, given.betas, deltas[:, :, slots].clone())[:, :T]
+            made = posed(features, T_world_can, given)
+            real = world.by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])[:, slots]
             body_rot = torch.where(real[..., None, None, None], given.body_rot, made.body_rot)
             root = torch.where(real[..., None, None], given.T_world_root, made.T_world_root)
             x, z = place_shift.unbind(-1)
-            root = torch.cat(
-                [root[..., :3, :3], (root[..., :3, 3] + torch.stack([x, torch.zeros_like(x), z], dim=-1))[..., None]],
-                dim=-1,
-            )
-            energy = self._energy(body, body_rot, root, given.betas, moves, seen)
+            lifted = torch.stack([x, torch.zeros_like(x), z], dim=-1)
+            root = torch.cat([root[..., :3, :3], (root[..., :3, 3] + lifted)[..., None]], dim=-1)
+            energy = self._energy(body, body_rot, root, lifted, given.betas, moves, seen)
             if not bool((energy > 0).any()):
-                return torch.zeros_like(latent[:, :n]), torch.zeros_like(place_shift)
+                return bend, shift
             by_latent, by_place = torch.autograd.grad(energy.sum(), (leaf, place_shift))
-        return self._steps(latent[:, :n], by_latent[:, :n], by_place, energy.detach(), moves)
+            found = self._steps(leaf.detach()[:, :n], by_latent[:, :n], by_place, energy.detach(), moves)
+            bend[:, :, slots], shift[:, :, slots] = found
+        return bend, shift
 
-    def _energy(self, body, body_rot, root, betas, moves: Tensor, seen: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+    def _energy(
+        self, body: Body, body_rot: Tensor, root: Tensor, lifted: Tensor, betas: Tensor, moves: Tensor, seen: Tensor
+    ) -> Tensor:
         """(B, T) m^2, of frames in which somebody moves"""
         capsules = fit_capsules(body, betas)
         R_world, joints = body.bone_chain(body_rot, root, body.rest_joints(betas[:, None]))
@@ -164,6 +180,7 @@ class BodyGuidance:
         total = pair_energy(capsules.posed(R_world, joints), capsules.radius, there, CONTACT[self.how])
         above = clearance(body, betas.flatten(0, 1)).unflatten(0, betas.shape[:2])
         feet = under_floor(joints, above[:, None]).square().sum(dim=-1)
+        joints = joints - lifted[..., None, :]  # feet are mended by poses: moves by place would shake
         stands = standing(joints.detach(), above, self.world.given.fps)
         slid = F.pad(slide(joints, stands).square().sum(dim=-1), (0, 0, 1, 0))
         turned = limit_excess(body_rot).square().sum(dim=-1)
@@ -180,7 +197,8 @@ class BodyGuidance:
         by_latent = torch.where(moves[..., None], by_latent, 0.0)
         steep = by_place.square().sum(dim=(2, 3), keepdim=True).clamp_min(1e-8)
         shift = -STEP[self.how] * energy[..., None, None] / steep * by_place
-        shift = smoothed(shift)
+        begun = who.int().cumsum(dim=0) * who  # it grows from where people stand
+        shift = smoothed(shift) * (begun / RAMP).clamp(max=1.0)[..., None]
         length = shift.norm(dim=-1, keepdim=True)
         shift = shift * (FARTHEST[self.how] / length.clamp_min(FARTHEST[self.how]))
         of_tokens = energy.unflatten(1, (-1, TOKEN_FRAMES)).sum(dim=-1)
@@ -197,7 +215,7 @@ def smoothed(shift: Tensor, frames: int = 4) -> Tensor:
 
 
 def moved_along(
-    deltas: Tensor, pairs: Tensor, T_world_can: Tensor, shift: Tensor, low: int, stop: int, moves: Tensor
+    deltas: Tensor, pairs: Tensor, T_world_can: Tensor, shift: Tensor, low: int, stop: int
 ) -> tuple[Tensor, Tensor]:
     """Deltas and pairwise transforms of people who are moved over the ground.
 
@@ -206,11 +224,9 @@ def moved_along(
         T_world_can: (B, 4 n, P, 4, 4) of its rows [low, stop).
         shift: (B, 4 n, P, 2) metres in the world.
         low, stop: rows of the window.
-        moves: (n, P) bool, whose tokens are changed.
     """
     yaw, _ = to_planar(T_world_can)
     grown = F.pad(shift, (0, 0, 0, 0, 1, 0)).diff(dim=1)
-    grown = torch.where(F.pad(moves, (0, 0, 1, 0))[:-1].repeat_interleave(TOKEN_FRAMES, dim=0)[..., None], grown, shift)
     before = torch.cat([yaw[:, :1], yaw[:, :-1]], dim=1)
     local = rotate_ground(-before, grown)
     deltas = deltas.clone()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.transformer import without_dropout
+from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
 from magnet.generation.conditioning import (
     known_tokens,
@@ -186,6 +187,7 @@ class Rollout:
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
+        self.body_guidance = None if o.body_guidance == "off" else BodyGuidance.of(self.world, grid)
         kind = model.device.type
         self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
 
@@ -253,6 +255,7 @@ class Rollout:
                 self.noise,
                 self.first,
                 self.history,
+                self.body_guidance,
             )
         self.reached = max(self.reached, stage.active[1])
         if self.world.causal and self.expected.most:

@@ -120,7 +120,7 @@ class WorldState:
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
-        true_deltas = self._deltas(begin, stop)
+        true_deltas = self.placed_deltas(begin, stop)
         implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * TOKEN_FRAMES : stop * TOKEN_FRAMES])))
         settled = layout.pack(latent, true_deltas, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
@@ -147,7 +147,7 @@ class WorldState:
         self.T_world_can[:, frames] = separated(
             self.model.tokenizer.decode,
             latent,
-            self._deltas(low, stop),
+            self.placed_deltas(low, stop),
             self.T_world_can[:, frames],
             self.given.slice(frames.start, frames.stop),
             new.to(latent.device),
@@ -172,14 +172,14 @@ class WorldState:
         given, T_world_can = self.given.slice(frames.start, frames.stop), self.T_world_can[:, frames]
         unseen = (self.known[first] & self.causal).to(latent.device)
         made = settled_block(
-            self.model.tokenizer.decode, latent, self._deltas(low, stop), T_world_can, given, new, known, unseen,
+            self.model.tokenizer.decode, latent, self.placed_deltas(low, stop), T_world_can, given, new, known, unseen,
             self.options.settle, lead, decentralized,
         )  # fmt: skip
         moves = new.repeat_interleave(TOKEN_FRAMES, dim=0)[..., None, None]
         self.T_world_can[:, frames] = torch.where(moves, canonical_frame(made.T_world_root), T_world_can)
         return torch.where(new[..., None], self.model.encode(made), latent)[:, lead:]
 
-    def _deltas(self, first: int, stop: int) -> Tensor:
+    def placed_deltas(self, first: int, stop: int) -> Tensor:
         """Deltas of some tokens as placed in the world; the identity after unplaced rows. -> (B, n, P, 4, 9)"""
         # One frame more in front, so that the first delta leads in from where each agent stood.
         lead = min(1, first)
@@ -199,7 +199,7 @@ class WorldState:
             return tokens
         layout, normalizer = self.model.layout, self.model.normalizer
         latent, _, pairs = layout.unpack(tokens[:, first:until])
-        true = normalizer.normalize(layout.pack(latent, self._deltas(first, until), pairs))
+        true = normalizer.normalize(layout.pack(latent, self.placed_deltas(first, until), pairs))
         number = torch.arange(layout.width, device=tokens.device)
         delta = (number >= layout.latent) & (number < layout.latent + 9)
         tokens[:, first:until] = torch.where(entered[..., None] & delta, true, tokens[:, first:until])
@@ -246,7 +246,7 @@ class WorldState:
         """Place newly generated agents by their predicted deltas and pairwise transforms. new (P,) bool"""
         new = new.to(deltas.device)
         known = self.placed[first].to(deltas.device)
-        true_deltas = from_9d(by_frame(self._deltas(first, stop)))
+        true_deltas = from_9d(by_frame(self.placed_deltas(first, stop)))
         T_prev_can = torch.where(known[:, None, None], true_deltas, project_se2(from_9d(by_frame(deltas))))
         T_self_partner = None
         if pairs is not None:
@@ -255,7 +255,7 @@ class WorldState:
         placed = place(
             T_prev_can,
             T_self_partner,
-            self._starts(T_prev_can, T_self_partner, first, new),
+            self.starts(T_prev_can, T_self_partner, first, new),
             placement,
             self.options.pairwise_weight,
             present=there,
@@ -265,7 +265,7 @@ class WorldState:
         frames = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
-    def _starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
+    def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`, such that the first delta leads to the right place.
 
         Agents that were placed before continue from there. A new agent is placed so that its pairwise transforms to an

@@ -48,6 +48,8 @@ class SamplerOptions:
             (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
+        body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
+            (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
         settle: correct the poses of each finished block: people out of each other and of themselves, hands held, feet
             still and on the floor, and the model goes on from there (ours, `magnet.body.settle`): `off`, `light` or
             `firm`.
@@ -74,6 +76,7 @@ class SamplerOptions:
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
     apart: Separation = "off"
+    body_guidance: Separation = "off"
     settle: Separation = "off"
     requantize: bool | None = None
     keep_given: bool = True
@@ -91,6 +94,7 @@ class SamplerOptions:
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         require_choice("placement", self.placement, Placement)
         require_choice("apart", self.apart, Separation)
+        require_choice("body_guidance", self.body_guidance, Separation)
         require_choice("settle", self.settle, Separation)
         require_choice("solver", self.solver, Solver)
         require_whole("steps", self.steps, 1, LEVELS)

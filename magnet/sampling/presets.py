@@ -33,6 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
         "apart": "off",  # the paper moves nobody out of another
+        "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose
     },
 }

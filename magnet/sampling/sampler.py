@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from itertools import pairwise
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,6 +21,16 @@ StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was
 decentralized (`Stage.decentralized`). Returns the tokens with the finished ones made self-consistent: latents moved to
 their nearest codes, transforms recomputed from world poses."""
+
+
+class Correct(Protocol):
+    """Changes what a step predicts.
+
+    clean (B V, W, P, D) tokens of V views, the levels now (V, W, P) they were predicted at, what each view hides
+    (V, W, P) bool or None, and the token step that the window begins with -> (B V, W, P, D)
+    """
+
+    def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor: ...
 
 
 @torch.no_grad()
@@ -96,11 +108,13 @@ def run_stages(
     noise: NoiseStream | None = None,
     offset: int = 0,
     history: History | None = None,
+    correct: Correct | None = None,
 ) -> Tensor:
     """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
-    `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it.
+    `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
+    `correct` changes what each step predicts.
     """
     tokens = tokens.clone()
     for stage in stages:
@@ -117,6 +131,7 @@ def run_stages(
             noise,
             offset + stage.start,
             None if history is None else history.window(window),
+            correct,
         )
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)
@@ -137,6 +152,7 @@ def run_stage(
     noise: NoiseStream | None = None,
     first: int = 0,
     history: History | None = None,
+    correct: Correct | None = None,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
 
@@ -153,9 +169,11 @@ def run_stage(
         if hidden is None:
             each = now.expand(len(tokens), -1, -1)
             tokens, clean = guidance.apply(denoise, tokens, each, present, mask_noise, layout, moves)
+            clean = clean if correct is None else correct(clean, now[None], None, first)
         else:
+            in_views = None if correct is None else partial(correct, first=first)
             tokens, clean, group, group_after = _predict_in_views(
-                denoise, tokens, mask_noise, now, after, hidden, present, layout, guidance
+                denoise, tokens, mask_noise, now, after, hidden, present, layout, guidance, in_views
             )
         tokens = solver_step(tokens, clean, group, group_after, eta, step_noise, history)
         if progress is not None:
@@ -173,6 +191,7 @@ def _predict_in_views(
     present: Tensor,
     layout: TokenLayout,
     guidance: Guidance,
+    correct: Callable[..., Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Predict each agent's tokens in its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
@@ -203,6 +222,7 @@ def _predict_in_views(
         layout,
         (group != group_after).expand_as(views).flatten(0, 1),
     )
+    clean = clean if correct is None else correct(clean, seen_now, views_hidden)
     moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
     moved = torch.where(unknown, tokens[:, None], moved)
     source = layout.spread(_views_to_read(hidden, view_of, layout))  # (W, P, D)

@@ -1,0 +1,121 @@
+"""Bodies together before and after, same seeds: shipped weights with guidance by bodies and the settle step.
+
+    MAGNET_CMU=... python benchmarks/bodies.py --scenes 3 --samples 2 --frames 96 --out runs/results/bodies.json
+    python benchmarks/bodies.py --people 3 --people 4
+
+Recorded test takes for two people, scenes from nothing for `--people`. Numbers are those of docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import magnet
+from magnet.body import load_body
+from magnet.datamodules.cmu import CMU
+from magnet.generation.rollout import generate
+from magnet.metrics import all_metrics, ground_truth_metrics
+from magnet.motion.scene import Scene, concatenate, empty_scene
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks import registry
+
+SHOWN = [
+    "depth_body_over_5cm", "depth_body_over_10cm", "depth_over_10cm", "fs", "toe_still", "floating",
+    "ground_penetration", "fd_pair", "fd", "mpjpe@1s", "div", "hand_contact", "jitter",
+]  # fmt: skip
+CONTEXT = 32
+
+
+def ways(options: SamplerOptions, which: list[str]) -> dict[str, SamplerOptions]:
+    """How is sampled, by the name of its column."""
+    every = {
+        "off": options,
+        "guidance light": replace(options, body_guidance="light"),
+        "guidance firm": replace(options, body_guidance="firm"),
+        "settle light": replace(options, settle="light"),
+        "settle firm": replace(options, settle="firm"),
+        "both light": replace(options, body_guidance="light", settle="light"),
+        "both firm": replace(options, body_guidance="firm", settle="firm"),
+    }
+    return {name: way for name, way in every.items() if name in which}
+
+
+def recorded(count: int) -> Scene:
+    """Test scenes spread over the takes."""
+    data = CMU(singles=False)
+    data.prepare_data()
+    data.setup("test")
+    scenes = concatenate(list(data.test_dataloader()))
+    return scenes.select(torch.linspace(0, scenes.scenes - 1, count).round().long())
+
+
+def measured(model, scene: Scene, name: str, frames: int, samples: int, options: SamplerOptions):  # type: ignore[no-untyped-def]
+    """Numbers of one task, by name, and its seconds."""
+    context = 0 if name == "generation" else CONTEXT
+    generators = [torch.Generator().manual_seed(seed) for seed in range(scene.scenes * samples)]
+    begun = time.process_time()
+    made = generate(model, scene, registry.get(name)(), context, frames, samples, options, generators)
+    seconds = time.process_time() - begun
+    made = made.permute_agents(torch.arange(scene.agents)).slice(context)
+    body = load_body()
+    joints = body.joints(made.replace(given=None)).unflatten(0, (scene.scenes, samples)).transpose(0, 1)
+    scored: Tensor = ~made.given[0]
+    metrics = all_metrics()
+    truth = body.joints(scene.slice(context, context + frames)) if scene.frames >= context + frames else joints[0]
+    metrics.update(joints, truth, scene.present, agents=scored)
+    return {key: float(value) for key, value in metrics.compute().items() if value.ndim == 0}, seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=list(registry.names()))
+    parser.add_argument("--people", type=int, action="append", default=[], help="so many from nothing; no takes")
+    parser.add_argument("--scenes", type=int, default=3)
+    parser.add_argument("--samples", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=96)
+    parser.add_argument("--steps", type=int, default=8)
+    parser.add_argument("--ways", nargs="+", default=["off", "guidance firm", "both firm"])
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    duet = magnet.load("duet")
+    sampler = replace(duet.sampler, steps=options.steps)
+    cases: list[tuple[str, str, Scene]] = []
+    for people in options.people:
+        empty = empty_scene(options.scenes, 0, people, torch.zeros(1))
+        there = torch.ones(options.scenes, people, dtype=torch.bool)
+        cases.append((f"generation, {people} people", "generation", empty.replace(present=there)))
+    if not options.people:
+        takes = recorded(options.scenes)
+        cases = [(name, name, takes) for name in options.tasks]
+        truth = ground_truth_metrics()
+        joints = load_body().joints(takes.slice(CONTEXT, CONTEXT + options.frames))
+        truth.update(joints[None], joints, takes.present)
+        told("recorded", "", {key: float(value) for key, value in truth.compute().items() if value.ndim == 0})
+    rows = {}
+    for title, name, scene in cases:
+        for way, how in ways(sampler, options.ways).items():
+            numbers, seconds = measured(duet.denoiser, scene, name, options.frames, options.samples, how)
+            rows[f"{title} | {way}"] = {**numbers, "seconds": seconds}
+            told(title, way, rows[f"{title} | {way}"])
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(rows, indent=1))
+
+
+def told(title: str, way: str, numbers: dict[str, float]) -> None:
+    """One row of the table."""
+    cells = [f"{numbers[name]:.3f}" if name in numbers else "-" for name in [*SHOWN, "seconds"]]
+    print(f"| {title} | {way} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    print(f"| task | way | {' | '.join([*SHOWN, 'seconds'])} |\n|{'---|' * (len(SHOWN) + 3)}")
+    main()

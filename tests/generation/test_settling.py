@@ -1,0 +1,112 @@
+"""Sampling that keeps bodies in order: the settle step after a block, and guidance by bodies inside of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+import torch
+
+import magnet
+from magnet.body import load_body
+from magnet.body.energy import CONTACT
+from magnet.generation.body_guidance import FARTHEST, STEP
+from magnet.generation.rollout import generate
+from magnet.metrics.body_depth import deepest
+from magnet.motion.scene import Scene
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions, Separation
+from magnet.sampling.schedule import Grid
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing.poses import pose_law
+from tests.cases import some_slow
+
+BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="firm")
+GRID = Grid(12, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_denoiser(max_agents=3, window=8)
+
+
+def run(model, scene: Scene, name: str, options: SamplerOptions, **more) -> Scene:
+    context = 0 if name == "generation" else 16
+    generator = torch.Generator().manual_seed(0)
+    return generate(model, scene, registry.get(name)(), context, 40 - context, 1, options, generator, **more)
+
+
+def test_every_choice_but_off_has_its_sizes() -> None:
+    assert set(get_args(Separation)) - {"off"} == set(CONTACT) == set(FARTHEST) == set(STEP)
+    assert SamplerOptions().settle == SamplerOptions().body_guidance == "off"
+
+
+@pytest.mark.parametrize("name", some_slow(registry.names(), "agentic_async", "agentic_sync", "motion_control"))
+def test_whoever_is_given_stays_bit_identical_in_every_task(model, name) -> None:
+    scene = random_scene(1, 40, 3, torch.Generator().manual_seed(2))
+    plain, made = (run(model, scene, name, replace(BOTH, body_guidance=how, settle=how)) for how in ("off", "firm"))
+    assert torch.equal(plain.given, made.given)
+    for before, after in ((scene.body_rot, made.body_rot), (scene.T_world_root, made.T_world_root)):
+        assert torch.equal(before[made.given], after[made.given]) and after.isfinite().all()
+    assert not torch.equal(plain.T_world_root, made.T_world_root)
+
+
+CAUSAL = [name for name in registry.names() if registry.get(name)().schedule(GRID).causal]
+
+
+@pytest.mark.parametrize("what", ["body_guidance", "settle"])
+@pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
+def test_no_pose_depends_on_what_is_not_known_when_it_is_shown(name, what) -> None:
+    assert pose_law(registry.get(name)(), GRID, SamplerOptions(**{what: "firm"}))
+
+
+@pytest.mark.parametrize("name", some_slow(["partner_inpainting", "joint_future"], "partner_inpainting"))
+def test_what_is_not_given_is_not_read(model, name) -> None:
+    scene, other = (random_scene(1, 40, 3, torch.Generator().manual_seed(seed)) for seed in (2, 3))
+    plain = run(model, scene, name, BOTH)
+    mixed = scene.replace(
+        body_rot=torch.where(plain.given[..., None, None, None], scene.body_rot, other.body_rot),
+        T_world_root=torch.where(plain.given[..., None, None], scene.T_world_root, other.T_world_root),
+    )
+    made = run(model, mixed, name, BOTH)
+    assert torch.equal(plain.T_world_root, made.T_world_root) and torch.equal(plain.body_rot, made.body_rot)
+
+
+def test_scenes_do_not_depend_on_those_beside_them(model) -> None:
+    scenes = random_scene(2, 40, 2, torch.Generator().manual_seed(5))
+
+    def sampled(rows: list[int]) -> Scene:
+        generators = [torch.Generator().manual_seed(row) for row in rows]
+        return generate(model, scenes.select(rows), registry.get("joint_future")(), 16, 24, 1, BOTH, generators)
+
+    together, alone = sampled([0, 1]), sampled([1])
+    assert torch.allclose(together.T_world_root[1], alone.T_world_root[0], atol=2e-3)
+
+
+def test_it_goes_together_with_history_guidance_and_rolling(model) -> None:
+    scene = random_scene(1, 40, 2, torch.Generator().manual_seed(2))
+    options = SamplerOptions(steps=8, pyramid_offset=2, body_guidance="firm", guidance=Guidance(kind="self"))
+    made = run(model, scene, "joint_future", options)
+    assert made.T_world_root.isfinite().all()
+    assert not torch.equal(
+        made.T_world_root, run(model, scene, "joint_future", replace(options, body_guidance="off")).T_world_root
+    )
+
+
+@pytest.mark.slow
+def test_people_of_the_shipped_model_are_out_of_each_other() -> None:
+    duet, body = magnet.load("duet"), load_body()
+
+    def depth(**how: Separation) -> float:
+        """Centimetres beyond 5, mean over frames of the two who are worst."""
+        model = replace(duet, sampler=replace(duet.sampler, steps=2, **how))
+        joints = body.joints(model.generate(people=3, frames=48, samples=2, seed=0).plain())
+        pairs = [joints[:, :, pair].flatten(0, 1).unbind(1) for pair in ([0, 1], [0, 2], [1, 2])]
+        worst = torch.stack([deepest(one, other)[:, 1] for one, other in pairs]).amax(dim=0)
+        return 100 * float((worst - 0.05).clamp_min(0).mean())
+
+    plain, guided, settled = depth(), depth(body_guidance="firm"), depth(settle="firm")
+    assert plain > 0.5, "two steps from nothing: people do run through each other"
+    assert guided < 0.9 * plain and settled < 0.1 * plain
