@@ -178,6 +178,11 @@ class Rollout:
             raise ValueError(
                 f"cond: got {len(self.cond) // samples} rows, expected one for each of {scene.scenes} scenes"
             )
+        if self.cond is None and o.guidance.cond_weight:
+            raise ValueError(
+                f"guidance.cond_weight: got {o.guidance.cond_weight:g} and no condition to guide by; give `cond`, "
+                "or leave it at 0"
+            )
         self.stats.begin(B)
         self.first = self.stop = 0
         self.there: float = self.length
@@ -241,7 +246,7 @@ class Rollout:
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
-                self._denoise,
+                self._guided_by_condition,
                 [dataclasses.replace(stage, start=stage.start - self.first)],
                 self.tokens,
                 self.mask_noise,
@@ -257,6 +262,15 @@ class Rollout:
         self.reached = max(self.reached, stage.active[1])
         if self.world.causal and self.expected.most:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
+
+    def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""
+        weight = self.options.guidance.cond_weight
+        if not weight:
+            return self._denoise(noisy, levels, present)
+        clean = self._denoise(*(x.repeat_interleave(2, dim=0) for x in (noisy, levels, present)))
+        self._clean, clean = (x[0::2] + weight * (x[0::2] - x[1::2]) for x in (self._clean, clean))
+        return clean
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
@@ -277,7 +291,10 @@ class Rollout:
         if cond.ndim == 3:
             cond = cond[:, self._begins : self._begins + width]
             cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
-        return cond.repeat_interleave(rows // len(cond), dim=0)
+        cond = cond.repeat_interleave(rows // len(cond), dim=0)
+        if self.options.guidance.cond_weight:
+            cond[1::2] = torch.nan
+        return cond
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
