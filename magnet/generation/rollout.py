@@ -188,6 +188,7 @@ class Rollout:
         self.there: float = self.length
         self.reached = 0  # one past the last row that has been generated
         self.expected = Expected(receptive_field(model)[1])
+        self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
@@ -269,7 +270,8 @@ class Rollout:
         if not weight:
             return self._denoise(noisy, levels, present)
         clean = self._denoise(*(x.repeat_interleave(2, dim=0) for x in (noisy, levels, present)))
-        self._clean, clean = (x[0::2] + weight * (x[0::2] - x[1::2]) for x in (self._clean, clean))
+        whole: Tensor = self._clean
+        self._clean, clean = (x[0::2] + weight * (x[0::2] - x[1::2]) for x in (whole, clean))
         return clean
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
