@@ -28,7 +28,7 @@ def seconds(frames: int) -> Tensor:
 
 
 def keyed(when: tuple[Tensor, Tensor], values: Tensor, clock: Tensor) -> Tensor:
-    """Rest at values[k], leave for values[k + 1] at when[0][k], arrive when[1][k] later. (K, ...) -> (T, ...)"""
+    """Rest at `values[k]`, leave for the next at `when[0][k]`, arrive `when[1][k]` later. (K, ...) -> (T, ...)"""
     times, moves = when
     progress = ease((clock[:, None] - times) / moves)  # (T, K - 1)
     return values[0] + torch.tensordot(progress, torch.diff(values, dim=0), dims=1)
