@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +31,7 @@ from magnet.precision import dtype_of, require_float32_scenes
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
+from magnet.tokenizer.lean import encoded, encoded_plainly
 from magnet.tokenizer.module import RawPose, Tokenizer
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
@@ -172,15 +174,18 @@ class Denoiser(L.LightningModule):
 
     # -- what the model does -------------------------------------------------------------------
 
-    def encode(self, scene: Scene) -> Tensor:
+    def encode(self, scene: Scene, tokens: slice = slice(None), packed: bool = False) -> Tensor:
         """Latents of those present, codes if `quantized`; invalid frames are not looked at. -> (B, N, P, C) float32
 
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
+        `tokens` says which are wanted; `packed`: see `magnet.tokenizer.lean`.
         """
-        people = self.tokenizer.encode_scene(scene.people().pad_frames(TOKEN_FRAMES), self.quantized).float()[
-            :, 1:-1, 0
-        ]
+        held = scene.people().pad_frames(TOKEN_FRAMES)
+        first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
+        wanted = slice(first + 1, stop + 1)
+        encode = encoded if packed else encoded_plainly
+        people = encode(self.tokenizer, held, self.quantized, wanted)[:, :, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -193,20 +198,35 @@ class Denoiser(L.LightningModule):
         """
         return None
 
-    def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+    def denoise(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        cond: Tensor | None = None,
+        network: Callable[..., Tensor] | None = None,
+    ) -> Tensor:
         """Predict clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
 
-        `cond` is that of `Transformer.forward`.
+        `cond` is that of `Transformer.forward`; `network` runs in its place, such as a `LeanTransformer` of it.
 
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        clean = self.predict_tokens(noisy, levels, present, cond)
+        clean = self.predict_tokens(noisy, levels, present, cond, network)
         return self.fused(clean, noisy, levels, present)
 
-    def predict_tokens(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+    def predict_tokens(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        cond: Tensor | None = None,
+        network: Callable[..., Tensor] | None = None,
+    ) -> Tensor:
         """What the transformer itself predicts, before `fused`; as `denoise`."""
-        return self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
+        network = network or self.transformer
+        return network(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
 
     def fused(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Predicted tokens with their deltas and pairwise transforms as one posterior, if the model has one."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.lean import lean
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
 from magnet.generation.conditioning import (
@@ -25,6 +27,7 @@ from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import dtype_of
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
@@ -244,6 +247,7 @@ class Rollout:
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
         self._ahead, self._begins = stage.ahead, stage.start
+        self._ask_for(stage)
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
@@ -264,6 +268,25 @@ class Rollout:
         if self.world.causal and self.expected.most:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
+    def _ask_for(self, stage: Stage) -> None:
+        """Which predictions of each step are read: of what the stage changes, and of what follows it in the end."""
+        self._left = len(stage.levels) - 1
+        # A token that is known may hold pairwise transforms to somebody who is not.
+        begins, ends = (self.model.layout.group_levels(levels) for levels in stage.levels[[0, -1]])
+        self._asked = torch.nn.functional.pad((begins != ends).any(dim=-1), (0, 0, 0, stage.ahead))
+
+    def _network(self) -> Callable[..., Tensor]:
+        """What predicts: the transformer as it was trained, or its lean form."""
+        network, precision = self.model.transformer, self.options.precision
+        smooth = self.options.guidance.smooth  # by a gradient, which packed weights have not
+        if precision == "reference" or smooth or dtype_of(network) != torch.float32:
+            return network
+        whole = self.model.posterior is not None
+        self._left -= 1
+        if self._left == 0 and self.expected.most:
+            self._asked[len(self._asked) - self._ahead :] = True
+        return functools.partial(lean(network, precision), wanted=None if whole else self._asked)
+
     def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""
         weight = self.options.guidance.cond_weight
@@ -281,7 +304,8 @@ class Rollout:
         noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
         levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
-            clean = self.model.denoise(noisy, levels, present, self._condition(*noisy.shape[:2])).float()
+            cond = self._condition(*noisy.shape[:2])
+            clean = self.model.denoise(noisy, levels, present, cond, self._network()).float()
         self._clean = clean.detach()
         return clean[:, :width]
 
@@ -325,7 +349,8 @@ class Rollout:
             given = self._given(low, high)
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
-            tokens = known_tokens(self.model, given, known, related, self._limits(low, high, part))[:, part]
+            limits, packed = self._limits(low, high, part), self.options.precision != "reference"
+            tokens = known_tokens(self.model, given, known, related, limits, packed)[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             init_noise, mask_noise = self.noise.draw(last - self.stop)
             new = begin(tokens, init_noise, known[part], self.model.layout)

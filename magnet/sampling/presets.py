@@ -33,6 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "noise_sampling": "joint",  # A.6.2
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
+        "precision": "reference",  # A.3 names none: the network as it was trained
         "apart": "off",  # the paper moves nobody out of another
     },
 }

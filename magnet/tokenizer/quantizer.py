@@ -54,6 +54,7 @@ class ResidualVQ(Float32):
         self.size, self.dim, self.num_quantizers = codebook_size, codebook_dim, num_quantizers
         self.ema_decay, self.dead_code_threshold = ema_decay, dead_code_threshold
         self.frozen = False
+        self._lengths: tuple[tuple[int, int], Tensor] | None = None  # of codes, squared, while they stay
         self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
         self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
         self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
@@ -112,7 +113,12 @@ class ResidualVQ(Float32):
             return latent.view(vectors.shape)
 
     def _nearest(self, vectors: Tensor, book: int) -> Tensor:
-        return _nearest(vectors, self.codes[book])
+        if self.training or self.codes.is_inference():
+            return _nearest(vectors, self.codes[book])
+        now = (self.codes.data_ptr(), self.codes._version)
+        if self._lengths is None or self._lengths[0] != now:
+            self._lengths = (now, self.codes.square().sum(-1))
+        return (self._lengths[1][book] - 2 * vectors @ self.codes[book].T).argmin(-1)
 
     # -- following -----------------------------------------------------------------------------
 

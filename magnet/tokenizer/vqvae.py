@@ -144,21 +144,29 @@ class VQVAE(nn.Module):
 
         What is not known enters as the mean, whatever it holds.
         """
-        shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
-        seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
-        moved = torch.where(known[..., 1:], self.deltas.normalize(deltas.float()), 0.0)
-        inputs = torch.cat([seen, moved, shape], dim=-1)
+        inputs = self.encoder_inputs(pose, betas, deltas, known)
         if not inputs.numel():  # convolutions refuse nothing
             return inputs.new_zeros(len(pose), pose.shape[1] // self.stride, self.latent)
         return self.encoder(inputs.to(dtype_of(self.encoder))).float()
 
+    def encoder_inputs(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
+        """What the encoder sees at every frame. -> (B, T, pose + 19)"""
+        shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
+        seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
+        moved = torch.where(known[..., 1:], self.deltas.normalize(deltas.float()), 0.0)
+        return torch.cat([seen, moved, shape], dim=-1)
+
     def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, known: Tensor | None = None) -> Tensor:
         """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
+        inputs = self.decoder_inputs(latent, betas, deltas, known)
+        if not inputs.numel():
+            return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
+        return self.pose.denormalize(self.decoder(inputs.to(dtype_of(self.decoder))).float())
+
+    def decoder_inputs(self, latent: Tensor, betas: Tensor, deltas: Tensor, known: Tensor | None = None) -> Tensor:
+        """What the decoder sees at every token. -> (B, N, latent + 10 + 9 * stride)"""
         shape = self.betas.normalize(betas.float())[:, None].expand(-1, latent.shape[1], -1)
         moved = self.deltas.normalize(deltas.float())
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
-        inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)
-        if not inputs.numel():
-            return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
-        return self.pose.denormalize(self.decoder(inputs.to(dtype_of(self.decoder))).float())
+        return torch.cat([latent, moved.flatten(-2), shape], dim=-1)
