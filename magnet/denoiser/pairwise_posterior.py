@@ -1,4 +1,4 @@
-"""The most likely paths of people who meet, given what is shown of them and what the network predicts."""
+"""Posterior of deltas and pairwise transforms, given the noisy tokens and what the network predicts."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ SHARPEST = 2e-3
 class PairwisePosterior(nn.Module):
     """Replaces the deltas and pairwise transforms that a network predicts by their posterior mean in closed form.
 
-    A network returns a pairwise transform worse than it was shown it, while its deltas are good to millimetres from one
-    frame to the next and add up to much more over a second. So what is shown (noisy, with the variance that its level
-    tells) is fused by precision with the predicted deltas, whose errors change little from frame to frame, and with the
-    network's own pairwise transforms. What comes out is one motion: its deltas lead where its pairwise transforms say.
+    At low levels a network predicts pairwise transforms less accurately than they are shown to it. Its deltas are
+    accurate to millimetres a frame, but their errors add up over a second. Three estimates are therefore fused by
+    precision: the noisy pairwise transforms, with the variance of their level; the predicted pairwise transforms; and
+    the predicted deltas, whose errors change slowly over time. The result is consistent: its deltas lead to its
+    pairwise transforms.
 
     Args:
         layout: what a token holds; with pairwise transforms.
@@ -132,7 +133,7 @@ def deviation(value: float) -> nn.Parameter:
 
 
 def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> Tensor:
-    """What noisy tokens say of the clean ones without knowing anything else, in real units; at level K nothing."""
+    """Clean tokens estimated from the noisy ones alone, in real units; at level K they tell nothing."""
     scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)
     return normalizer.denormalize(noisy / layout.spread(scale))
 
@@ -158,7 +159,7 @@ def precision(deviation: Tensor) -> Tensor:
 
 
 def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
-    """Headings at the start that fit pairwise headings roughly, so that what is left is far from a half turn.
+    """Initial headings that roughly fit the pairwise headings, so that residuals stay far from a half turn.
 
     yaw, weight (B, T, P, P - 1), delta_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
     anchor

@@ -31,7 +31,7 @@ PICTURES = (".mp4", ".gif", ".webp")
 
 @dataclass(frozen=True)
 class Read:
-    """A scene from files, the body its shapes belong to, and what is worth knowing about how it was read."""
+    """A scene from files, the body its shapes belong to, and notes on how it was read."""
 
     scene: Scene
     body: Body
@@ -40,7 +40,7 @@ class Read:
 
 @dataclass(frozen=True)
 class Reading:
-    """What files may leave open.
+    """How to read what files do not say.
 
     Args:
         fps: bring everything to this rate; None: as recorded.

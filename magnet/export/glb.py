@@ -27,7 +27,7 @@ INFLUENCES = 4
 
 
 class Skinned(Protocol):
-    """What a skinned mesh asks of a body model (`magnet.body.Body` is one)."""
+    """What a skinned mesh needs of a body model (`magnet.body.Body` is one)."""
 
     id: str
     v_template: Tensor  # (V, 3)

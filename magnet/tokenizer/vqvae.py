@@ -22,9 +22,9 @@ class Conv(nn.Module):
     Args:
         inputs: channels in.
         outputs: channels out.
-        kernel: steps seen; `kernel - stride` must be even unless causal.
-        stride: steps in for one step out.
-        dilation: distance of the steps seen.
+        kernel: width of the kernel; `kernel - stride` must be even unless causal.
+        stride: input steps for each output step.
+        dilation: distance of the input steps that a kernel reads.
         causal: an output sees nothing after the last of its own `stride` input steps.
     """
 
@@ -55,12 +55,12 @@ class ResidualBlock(nn.Module):
 
 
 def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
-    """`depth` blocks, widest reach first. (B, T, C) -> same"""
+    """`depth` blocks, largest dilation first. (B, T, C) -> same"""
     return nn.Sequential(*[ResidualBlock(width, DILATION**i, causal) for i in reversed(range(depth))])
 
 
 class Upsample(nn.Module):
-    """Twice as many steps, each said twice. (B, T, C) -> (B, 2 T, C)"""
+    """Each step repeated: nearest-neighbour upsampling by 2. (B, T, C) -> (B, 2 T, C)"""
 
     def forward(self, x: Tensor) -> Tensor:
         return x.repeat_interleave(2, dim=1)
@@ -142,7 +142,7 @@ class VQVAE(nn.Module):
     def encode(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
         """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)
 
-        What is not known enters as the mean, whatever it holds.
+        What is not known is replaced by its mean.
         """
         inputs = self.encoder_inputs(pose, betas, deltas, known)
         if not inputs.numel():  # convolutions refuse nothing

@@ -82,7 +82,7 @@ class LiveApp(ViewerBase):
         self.views[0].set_visible(True)
 
     def before_draw(self) -> None:
-        """Take in what has been generated meanwhile."""
+        """Add what has been generated meanwhile."""
         with self.lock:
             scene = self.live.scene
             if self.version != self.live.version:
