@@ -98,6 +98,12 @@ def standing(body: Skinned, betas: Tensor) -> Tensor:
     return body.rest_joints(betas).detach().cpu().double() + _raised(_resting(body, betas))
 
 
+def standing_vertices(body: Skinned, betas: Tensor) -> NDArray[np.float64]:
+    """Vertices at rest of somebody who stands on the floor. betas (10,) -> (V, 3)"""
+    vertices = _resting(body, betas)
+    return (vertices + _raised(vertices)).numpy()
+
+
 def _resting(body: Skinned, betas: Tensor) -> Tensor:
     """Vertices of a body in its own frame. -> (V, 3) float64"""
     return body.v_template.detach().cpu().double() + body.shapedirs.detach().cpu().double() @ betas.double()
@@ -169,8 +175,7 @@ class _Gltf:
 
     def shape_of(self, body: Skinned, betas: Tensor) -> dict[str, int]:
         """The mesh at rest of one shape, standing on the floor."""
-        resting = _resting(body, betas)
-        vertices = (resting + _raised(resting)).numpy()
+        vertices = standing_vertices(body, betas)
         normals = vertex_normals(vertices, body.faces.detach().cpu().numpy())
         return {
             "POSITION": self.accessor(vertices, FLOAT, "VEC3", VERTEX_DATA, bounds=True),
