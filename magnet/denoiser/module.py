@@ -21,7 +21,7 @@ from magnet.denoiser.levels import draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
-from magnet.denoiser.self_forcing import with_self_forcing
+from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.scene import Scene
@@ -90,6 +90,7 @@ class Denoiser(L.LightningModule):
         self.save_hyperparameters(plain({**sizes, **groups, "optimizer": self.optimizer, **rest}))
         self.window = window
         self.tokenizer: PoseTokenizer
+        self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
@@ -293,7 +294,9 @@ class Denoiser(L.LightningModule):
         generator = step_generator(
             self.device, self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank
         )
-        losses = self.losses(batch, generator)
+        scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
+        scene, made = with_made_pasts(scene, self.made_pasts, generator)
+        losses = self.losses(scene, generator, made)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True)
         return losses["loss"]
@@ -306,8 +309,11 @@ class Denoiser(L.LightningModule):
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    def losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
-        """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11)."""
+    def losses(self, scene: Scene, generator: torch.Generator, made: Tensor | None = None) -> dict[str, Tensor]:
+        """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11).
+
+        made (B, N) bool: token steps that the model has made itself; they are shown clean and do not count.
+        """
         layout, weight = self.layout, self.loss
         with torch.no_grad():
             tokens, there = self.tokenize(scene)
@@ -315,6 +321,8 @@ class Denoiser(L.LightningModule):
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
+            if made is not None:
+                levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
             cond = self.shown_condition(scene, generator)
