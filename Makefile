@@ -10,7 +10,7 @@ PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format clean distclean
+.PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format docs clean distclean
 
 help:  ## list what make can do
 	@echo "magnet: diffusion forcing for the motion of several people"
@@ -89,9 +89,15 @@ format: $(READY)  ## rewrite the code in the project's style
 	@$(PY) -m ruff check --fix .
 	@$(PY) -m ruff format .
 
+docs: $(READY)  ## the documentation as a site in site/; a broken link is an error
+	@echo "docs: mkdocs, strict; the tour is run for it, a minute"
+	@$(PY) -m pip install -qq --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build -q
+	@echo "docs: open site/index.html, or $(PY) -m http.server -d site"
+
 clean:  ## remove caches and builds
 	@echo "clean: caches and builds"
-	@rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@rm -rf build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find magnet tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## clean, and the virtual environments

@@ -208,7 +208,8 @@ class Model:
     """A trained model and how it samples.
 
     Every method takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
-    b * samples + s of the result, which includes the given frames.
+    b * samples + s of the result, which includes the given frames. `cond` is what a model with conditions is told of
+    each scene, as in `magnet.generation.rollout.generate`; `sampler.guidance.cond_weight` says how strongly.
     """
 
     denoiser: Denoiser
@@ -224,7 +225,15 @@ class Model:
     def most_people(self) -> int:
         return self.denoiser.layout.agents
 
-    def generate(self, people: int = 2, frames: int = 300, *, seed: int | None = None, samples: int = 1) -> Motion:
+    def generate(
+        self,
+        people: int = 2,
+        frames: int = 300,
+        *,
+        seed: int | None = None,
+        samples: int = 1,
+        cond: Tensor | None = None,
+    ) -> Motion:
         """A scene from nothing, of people of average shape.
 
         Raises:
@@ -233,10 +242,17 @@ class Model:
         require_whole("people", people, 1, self.most_people)
         empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
-        return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples)
+        return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples, cond=cond)
 
     def continue_(
-        self, scene: Scene, frames: int = 150, *, context: int | None = None, seed: int | None = None, samples: int = 1
+        self,
+        scene: Scene,
+        frames: int = 150,
+        *,
+        context: int | None = None,
+        seed: int | None = None,
+        samples: int = 1,
+        cond: Tensor | None = None,
     ) -> Motion:
         """How a scene goes on for everybody in it.
 
@@ -255,7 +271,8 @@ class Model:
         if given < TOKEN_FRAMES:
             raise ValueError(f"to go on, the model needs {TOKEN_FRAMES} frames or more; got {max(given, 0)}")
         scene = scene.slice(scene.frames - given)
-        return self.predict(scene, "joint_future", context=given, frames=frames, seed=seed, samples=samples)
+        said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
+        return self.predict(scene, "joint_future", context=given, frames=frames, **said)
 
     def inpaint(
         self,
@@ -322,6 +339,7 @@ class Model:
         frames: int | None = None,
         seed: int | None = None,
         samples: int = 1,
+        cond: Tensor | None = None,
         **fields: Any,
     ) -> Motion:
         """Sample any task; see `magnet tasks`, and `fields` are its own.
@@ -353,7 +371,8 @@ class Model:
         chosen: Task = kind(**fields)
         generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
-        sampled = generate(self.denoiser, plain, chosen, context, frames, samples, self.sampler, generator).to("cpu")
+        how = (context, frames, samples, self.sampler, generator)
+        sampled = generate(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
         return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
 

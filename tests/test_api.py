@@ -217,8 +217,8 @@ def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
         model.inpaint(duet, agent=())
     with pytest.raises(ValueError, match="no checkpoint trio"):
         magnet.load("trio")
-    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'"):
-        model.generate(frames=8).save("a.fbx")
+    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.obj'"):
+        model.generate(frames=8).save("a.obj")
 
 
 CARELESS = {

@@ -52,7 +52,7 @@ def test_licensed_extras_are_not_needed_to_run() -> None:
 def test_the_extra_all_holds_every_optional_feature() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
     (everything,) = extras["all"]
-    assert set(re.findall(r"\w+", everything.partition("[")[2])) == set(extras) - {"all", "dev", "bake"}
+    assert set(re.findall(r"\w+", everything.partition("[")[2])) == set(extras) - {"all", "dev", "docs", "bake"}
 
 
 def test_the_version_is_told_alike_everywhere() -> None:
@@ -80,7 +80,7 @@ def test_make_says_which_python_it_needs(tmp_path: Path) -> None:
 def test_the_check_of_changes_runs_the_tests() -> None:
     script = ROOT / ".ci" / "run"
     assert os.access(script, os.X_OK)
-    assert {"make check", "make test", "make test-slow"} <= set(script.read_text().splitlines())
+    assert {"make check", "make test", "make test-slow", "make docs"} <= set(script.read_text().splitlines())
 
 
 def test_no_file_knows_the_machine_that_it_was_written_on() -> None:

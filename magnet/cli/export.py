@@ -16,6 +16,8 @@ OUT's suffix:
   .npz    the scene itself; with --smplx, SMPL-X's conventional keys
   .bvh    a skeleton a person: out_0.bvh, out_1.bvh ..., all in one world
   .glb    everybody skinned, coloured and animated in one world
+  .fbx    the same, by Blender, where it or its module bpy is
+  .usdc .usda .usdz   the same as USD (pip install "magnet-motion[usd]")
   .csv    joint positions, a row a frame and person, in metres
   .html   a page that plays the scene, by itself
   .mp4 .gif .webp   a film;   .png   a strip of moments
@@ -25,6 +27,7 @@ for example:
   magnet export leader.bvh follower.bvh duet.npz --fps 30 --trim
   magnet export duet.npz duet.bvh --unit cm
   magnet export duet.npz leader.glb --person 0
+  magnet export duet.npz duet.fbx --names mixamo
   magnet export upstairs.npz duet.npz --on_floor
 """
 
@@ -41,6 +44,25 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
     options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
+    bones = options.add_argument_group("bones of .glb, .fbx and .usd")
+    bones.add_argument(
+        "--names",
+        choices=("smplx", "vrm", "mixamo"),
+        default="smplx",
+        help="SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's (default: %(default)s)",
+    )
+    bones.add_argument(
+        "--root",
+        choices=("floor", "none"),
+        default="floor",
+        help="a bone on the floor that carries where somebody walks, or none (default: %(default)s)",
+    )
+    bones.add_argument(
+        "--clips",
+        choices=("scene", "person"),
+        default="scene",
+        help="one animation of a .glb for all, or one for each person (default: %(default)s)",
+    )
     pictures = options.add_argument_group("pictures, films and pages")
     pictures.add_argument(
         "--context",
@@ -79,6 +101,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body import on_floor
     from magnet.cli.errors import CommandError
     from magnet.export import formats
+    from magnet.export.bones import BoneOptions
 
     out = scene_files.path_to_write(options.out)
     given = dict(pair.partition("=")[::2] for pair in options.joint)
@@ -115,6 +138,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         style=options.style,
         title=options.title,
         progress=True,
+        bones=BoneOptions(options.names, options.root, options.clips),
     )
     scene_files.say_written(written)
     return 0

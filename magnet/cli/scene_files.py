@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from magnet.export.formats import Read, Reading
 
-FBX = "; for .fbx write .glb and let Blender convert it (docs/export.md)"
-
 
 def parser_of(command: str, description: str | None, epilog: str) -> argparse.ArgumentParser:
     """A parser that knows IN, OUT, --body and --trim."""
@@ -40,8 +38,8 @@ def path_to_write(out: str) -> Path:
 
     path = Path(out)
     if path.suffix.lower() not in formats.WRITTEN:
-        raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use "
-                           f"{', '.join(formats.WRITTEN)}{FBX if path.suffix.lower() == '.fbx' else ''}")  # fmt: skip
+        known = ", ".join(formats.WRITTEN)
+        raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
     return path
 
 

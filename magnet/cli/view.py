@@ -13,6 +13,10 @@ from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
 """Denoising steps where nothing is said: quick enough to watch."""
+EXAMPLE = "duet"
+"""Scene that a live model goes on from where nothing is said: its couple stays together (docs/viewer.md)."""
+LIVE_PRESET = "steady"
+"""How a live model samples where nothing is said: over minutes, feet stay on the floor and bodies out of each other."""
 
 EXAMPLES = """\
 examples:
@@ -69,7 +73,9 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     live.add_argument("--frames", type=int, default=64, metavar="N", help="frames that --record adds (default: 64)")
     live.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
     live.add_argument("--task", default="joint_future", help="task to begin with (default: %(default)s)")
-    live.add_argument("--people", type=int, default=2, metavar="N", help="people of a scene from nothing (default: 2)")
+    live.add_argument(
+        "--people", type=int, metavar="N", help="so many people from nothing (default: a couple that comes along)"
+    )
     live.add_argument("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
     live.add_argument(
         "--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)"
@@ -204,7 +210,10 @@ def sampler_options(options: argparse.Namespace) -> Any:
     from magnet.sampling.options import SamplerOptions
 
     steps = STEPS if options.sampler is None and options.steps is None else options.steps
-    return SamplerOptions.preset(options.sampler or "default", **({} if steps is None else {"steps": steps}))
+    said: dict[str, Any] = {} if steps is None else {"steps": steps}
+    if options.live and options.sampler is None:
+        return SamplerOptions.preset(LIVE_PRESET, apart="light", **said)
+    return SamplerOptions.preset(options.sampler or "default", **said)
 
 
 def _live(options: argparse.Namespace) -> Any:
@@ -214,23 +223,29 @@ def _live(options: argparse.Namespace) -> Any:
     free_port(options.host, options.port)
     import torch
 
+    from magnet import checkpoints
     from magnet.body.base import load_body
     from magnet.cli import checkpoint_config
     from magnet.denoiser.module import Denoiser
     from magnet.generation.live import Live
+    from magnet.motion.scene import Scene
     from magnet.tasks import registry
     from magnet.viewer.live_app import LiveApp
     from magnet.viewer.scene_view import RenderOptions
 
     registry.get(options.task)
-    start = None
+    folder = checkpoints.FOLDER / "duet" / "scenes"
+    examples = {path.stem: path for path in sorted(folder.glob("*.npz"))}
     body = load_body(options.body or "open")
+    start, began = None, None
     if options.files:
         takes, body = _read(options)
         start = takes[0].scene
+    elif options.people is None:
+        start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
     model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
-    live = Live(model, options.people, start, generator=torch.Generator().manual_seed(options.seed))
+    live = Live(model, options.people or 2, start, generator=torch.Generator().manual_seed(options.seed))
     live.settings.task, live.settings.sampler = options.task, sampler_options(options)
     live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
     render = RenderOptions(style=options.style or "body", shadows=not options.no_shadows)
-    return LiveApp(live, body, options.host, options.port, render)
+    return LiveApp(live, body, options.host, options.port, render, examples=examples, example=began)

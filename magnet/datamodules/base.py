@@ -1,4 +1,4 @@
-"""What every data set is to the rest: a list of clips, from which batches of `Scene` are made."""
+"""The base of all data sets: a list of clips, from which batches of `Scene` are made."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class MotionDataModule(LightningDataModule):
         batch_size: scenes a training batch and process (paper A.3).
         max_agents: slots P of every batch; smaller scenes leave slots empty (paper 4, 2 to 4 people).
         augment: what happens to training windows.
-        test: which scenes test.
+        test: scenes to test on.
         weights: share of each source of clips among training windows; None: as many as it has frames.
         epoch_size: training windows an epoch over all processes; None: as many as fit side by side into the
             training frames, times four.
@@ -158,7 +158,8 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> TrainLoader:
         """Random windows (batch_size, window_frames, max_agents).
 
-        They go on where a loaded state stood, or where the same trainer's last ones ended; another's begin anew.
+        They continue at a loaded state, or where the last loader of the same trainer ended; with another trainer they
+        start anew.
         """
         if self.trainer is not None and self.trainer is self._trained_by:
             self._resume = self.state_dict()
@@ -269,7 +270,7 @@ class MotionDataModule(LightningDataModule):
     # -- Lightning -----------------------------------------------------------------------------
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        """Scenes know how to move; anything else goes Lightning's way."""
+        """Move scenes by `Scene.to`, and anything else as Lightning does."""
         if isinstance(batch, Scene | Tensor):
             return batch.to(device)
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
@@ -283,7 +284,7 @@ class MotionDataModule(LightningDataModule):
             self._train_loader.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Place in the training stream. Lightning restores a loader's own state only within an epoch."""
+        """Position in the training stream. Lightning restores a loader's own state only within an epoch."""
         return {} if self._train_loader is None else self._train_loader.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

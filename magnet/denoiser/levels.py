@@ -34,9 +34,9 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
-    `per_sequence`: one a scene. `mixture` (ours) draws one of these or a *roll-out* for each scene: a
-    clean past, a block being denoised, an unknown future, which is what the sampler will ask about but
-    what independent levels almost never show.
+    `per_sequence`: one a scene. `mixture` (ours) draws for each scene one of these or a *roll-out*: a clean past, a
+    block being denoised and an unknown future. The sampler uses such levels, which independent levels almost never
+    are.
 
     Args:
         kind: see above.
@@ -68,9 +68,9 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
 def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
     """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
-    In some of the scenes every agent is generated. In the others each agent is, by chance (`ROLES`), generated,
-    given as far as the block reaches, given to the end, or hidden from the block on: partner
-    prediction, motion control and inpainting.
+    In some scenes every agent is generated. In the others each agent draws a role (`ROLES`): generated, given up to
+    the end of the block (motion control), given to the end (inpainting), or unknown from the block on (partner
+    prediction).
     """
     device = generator.device
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from magnet.denoiser.levels import draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
-from magnet.denoiser.self_forcing import with_self_forcing
+from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.scene import Scene
@@ -30,6 +31,7 @@ from magnet.precision import dtype_of, require_float32_scenes
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
+from magnet.tokenizer.lean import encoded, encoded_plainly
 from magnet.tokenizer.module import RawPose, Tokenizer
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
@@ -88,6 +90,7 @@ class Denoiser(L.LightningModule):
         self.save_hyperparameters(plain({**sizes, **groups, "optimizer": self.optimizer, **rest}))
         self.window = window
         self.tokenizer: PoseTokenizer
+        self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
         if tokenizer == "raw":
             self.build(RawPose())
@@ -172,15 +175,18 @@ class Denoiser(L.LightningModule):
 
     # -- what the model does -------------------------------------------------------------------
 
-    def encode(self, scene: Scene) -> Tensor:
+    def encode(self, scene: Scene, tokens: slice = slice(None), packed: bool = False) -> Tensor:
         """Latents of those present, codes if `quantized`; invalid frames are not looked at. -> (B, N, P, C) float32
 
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
+        `tokens` says which are wanted; `packed`: see `magnet.tokenizer.lean`.
         """
-        people = self.tokenizer.encode_scene(scene.people().pad_frames(TOKEN_FRAMES), self.quantized).float()[
-            :, 1:-1, 0
-        ]
+        held = scene.people().pad_frames(TOKEN_FRAMES)
+        first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
+        wanted = slice(first + 1, stop + 1)
+        encode = encoded if packed else encoded_plainly
+        people = encode(self.tokenizer, held, self.quantized, wanted)[:, :, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)
@@ -193,20 +199,35 @@ class Denoiser(L.LightningModule):
         """
         return None
 
-    def denoise(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+    def denoise(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        cond: Tensor | None = None,
+        network: Callable[..., Tensor] | None = None,
+    ) -> Tensor:
         """Predict clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
 
-        `cond` is that of `Transformer.forward`.
+        `cond` is that of `Transformer.forward`; `network` runs in its place, such as a `LeanTransformer` of it.
 
         A window does not know what came before it: its first step is always shown as standing still, in
         training as in sampling.
         """
-        clean = self.predict_tokens(noisy, levels, present, cond)
+        clean = self.predict_tokens(noisy, levels, present, cond, network)
         return self.fused(clean, noisy, levels, present)
 
-    def predict_tokens(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
+    def predict_tokens(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        cond: Tensor | None = None,
+        network: Callable[..., Tensor] | None = None,
+    ) -> Tensor:
         """What the transformer itself predicts, before `fused`; as `denoise`."""
-        return self.transformer(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
+        network = network or self.transformer
+        return network(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
 
     def fused(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Predicted tokens with their deltas and pairwise transforms as one posterior, if the model has one."""
@@ -273,7 +294,9 @@ class Denoiser(L.LightningModule):
         generator = step_generator(
             self.device, self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank
         )
-        losses = self.losses(batch, generator)
+        scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
+        scene, made = with_made_pasts(scene, self.made_pasts, generator)
+        losses = self.losses(scene, generator, made)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True)
         return losses["loss"]
@@ -286,8 +309,11 @@ class Denoiser(L.LightningModule):
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    def losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
-        """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11)."""
+    def losses(self, scene: Scene, generator: torch.Generator, made: Tensor | None = None) -> dict[str, Tensor]:
+        """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11).
+
+        made (B, N) bool: token steps that the model has made itself; they are shown clean and do not count.
+        """
         layout, weight = self.layout, self.loss
         with torch.no_grad():
             tokens, there = self.tokenize(scene)
@@ -295,6 +321,8 @@ class Denoiser(L.LightningModule):
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
+            if made is not None:
+                levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
             cond = self.shown_condition(scene, generator)

@@ -149,13 +149,17 @@ class SelfForcing:
         share: of the training scenes with a past, how many show it as the model would have made it.
         placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.frames.place`.
         pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
+        displaced: share of the training scenes in which people stand a little off at first and come back, as those must
+            who have drifted while they were generated; see `displaced_at_first`.
     """
 
     share: float = 0.0
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
+    displaced: float = 0.0
 
     def __post_init__(self) -> None:
-        require_number("share", self.share, 0, 1)
+        for name in ("share", "displaced"):
+            require_number(name, getattr(self, name), 0, 1)
         require_choice("placement", self.placement, Placement)
         require_number("pairwise_weight", self.pairwise_weight, least=0)

@@ -1,4 +1,4 @@
-"""The most likely paths of people who meet, given what is shown of them and what the network predicts."""
+"""Posterior of deltas and pairwise transforms, given the noisy tokens and what the network predicts."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ SHARPEST = 2e-3
 class PairwisePosterior(nn.Module):
     """Replaces the deltas and pairwise transforms that a network predicts by their posterior mean in closed form.
 
-    A network returns a pairwise transform worse than it was shown it, while its deltas are good to millimetres from one
-    frame to the next and add up to much more over a second. So what is shown (noisy, with the variance that its level
-    tells) is fused by precision with the predicted deltas, whose errors change little from frame to frame, and with the
-    network's own pairwise transforms. What comes out is one motion: its deltas lead where its pairwise transforms say.
+    At low levels a network predicts pairwise transforms less accurately than they are shown to it. Its deltas are
+    accurate to millimetres a frame, but their errors add up over a second. Three estimates are therefore fused by
+    precision: the noisy pairwise transforms, with the variance of their level; the predicted pairwise transforms; and
+    the predicted deltas, whose errors change slowly over time. The result is consistent: its deltas lead to its
+    pairwise transforms.
 
     Args:
         layout: what a token holds; with pairwise transforms.
@@ -38,12 +39,11 @@ class PairwisePosterior(nn.Module):
     def __init__(self, layout: TokenLayout) -> None:
         super().__init__()
         self.layout = layout
-        # Chosen by samples, not by errors on recordings, which ask for surer deltas: on a past that the model has made
-        # itself people would drift apart. The network's own pairwise transforms are off by 4 to 15 cm, but alike in
-        # neighbouring frames: as observations that count as independent they are worth less than that.
-        self.log_pair_ground, self.log_pair_yaw = deviation(0.2), deviation(0.8)
-        self.log_delta_ground, self.log_delta_yaw = deviation(0.05), deviation(0.02)
-        self.log_bend_ground, self.log_bend_yaw = deviation(0.002), deviation(0.002)
+        # Fitted to the shipped model on training takes. Its own pairwise transforms are off by 4 to 15 cm, but alike in
+        # neighbouring frames: as observations that count as independent they are worth far less than that.
+        self.log_pair_ground, self.log_pair_yaw = deviation(0.4), deviation(0.6)
+        self.log_delta_ground, self.log_delta_yaw = deviation(0.008), deviation(0.015)
+        self.log_bend_ground, self.log_bend_yaw = deviation(0.001), deviation(0.005)
 
     def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Tensor:
         """The same prediction with better deltas and pairwise transforms.
@@ -132,7 +132,7 @@ def deviation(value: float) -> nn.Parameter:
 
 
 def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> Tensor:
-    """What noisy tokens say of the clean ones without knowing anything else, in real units; at level K nothing."""
+    """Clean tokens estimated from the noisy ones alone, in real units; at level K they tell nothing."""
     scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)
     return normalizer.denormalize(noisy / layout.spread(scale))
 
@@ -158,7 +158,7 @@ def precision(deviation: Tensor) -> Tensor:
 
 
 def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
-    """Headings at the start that fit pairwise headings roughly, so that what is left is far from a half turn.
+    """Initial headings that roughly fit the pairwise headings, so that residuals stay far from a half turn.
 
     yaw, weight (B, T, P, P - 1), delta_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
     anchor

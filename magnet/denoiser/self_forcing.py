@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from magnet.denoiser.options import SelfForcing
-from magnet.motion.frames import canonical_frame, from_9d, pairwise, partners, project_se2
+from magnet.motion.frames import canonical_frame, from_9d, from_planar, pairwise, partners, project_se2
 from magnet.motion.placement import place
-from magnet.motion.scene import Scene
-from magnet.motion.tokens import TokenLayout, by_frame, transforms
+from magnet.motion.scene import Scene, concatenate
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
 from magnet.tokenizer.normalizer import Normalizer
 
@@ -20,6 +21,74 @@ Denoise = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 
 MOST_NOISE, LEAST_NOISE = 0.75, 0.1
 """Between which of the even levels, as shares of K, a past is made noisy before the model restores it."""
+
+DISPLACED_GROUND, DISPLACED_YAW = 0.1, 0.12
+"""Standard deviations, in metres and radians, by which somebody stands off at first."""
+
+RETURN_FRAMES = 30, 75
+"""Fewest and most frames in which such people come back: slowly, for feet slide on the way."""
+
+
+@dataclass(frozen=True, eq=False)
+class MadePasts:
+    """Scenes whose beginning the model has made, with a recording behind it; see `magnet.callbacks.RollOuts`.
+
+    Attributes:
+        scenes: (R, T) as long as training scenes.
+        past: token steps that are made.
+        share: of a batch's scenes that these replace.
+    """
+
+    scenes: Scene
+    past: int
+    share: float
+
+
+def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Generator) -> tuple[Scene, Tensor | None]:
+    """Replace some scenes of a batch. -> the batch, (B, N) bool which token steps the model has made, or None"""
+    if made is None:
+        return scene, None
+    B = scene.scenes
+    replaced = torch.rand(B, generator=generator, device=generator.device) < made.share
+    count = int(replaced.sum())
+    if not count:
+        return scene, None
+    chosen = torch.randint(made.scenes.scenes, (count,), generator=generator, device=generator.device)
+    kept = (~replaced).nonzero()[:, 0]
+    parts = [scene.select(kept)] if len(kept) else []
+    own = torch.zeros(B, scene.frames // TOKEN_FRAMES, dtype=torch.bool, device=generator.device)
+    own[B - count :, : made.past] = True
+    return concatenate([*parts, made.scenes.select(chosen)]), own
+
+
+@torch.no_grad()
+def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -> Scene:
+    """Some scenes with everybody moved and turned a little up to a random frame, and eased back from there.
+
+    What a model has made drifts: people stand where no recording has them, and the way back is in none. Poses stay as
+    they are, so that where people are does not follow from them.
+
+    Args:
+        scene: (B, T) of P agents.
+        share: of the scenes that are changed.
+        generator: of all randomness.
+    """
+    if not share:
+        return scene
+    B, T, P = scene.T_world_root.shape[:3]
+    device, dtype = scene.T_world_root.device, scene.T_world_root.dtype
+    changed, begin, length = torch.rand(3, B, 1, generator=generator, device=device)
+    begin = begin * T
+    length = RETURN_FRAMES[0] + (RETURN_FRAMES[1] - RETURN_FRAMES[0]) * length
+    way = ((torch.arange(T, device=device) - begin) / length).clamp(0, 1)
+    off = (1 - way * way * (3 - 2 * way)) * (changed < share)  # (B, T)
+    drawn = torch.randn(B, 1, P, 3, generator=generator, device=device) * off[..., None, None]
+    yaw, ground = DISPLACED_YAW * drawn[..., 0], DISPLACED_GROUND * drawn[..., 1:]
+    T_turn = from_planar(yaw, torch.zeros_like(ground)).to(dtype)
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[..., :3, :3] = T_turn[..., :3, :3] @ T_world_root[..., :3, :3]
+    T_world_root[..., [0, 2], 3] += ground.to(dtype)
+    return scene.replace(T_world_root=T_world_root)
 
 
 @torch.no_grad()

@@ -150,10 +150,10 @@ class Transformer(nn.Module):
         if self.agent is not None:
             parts.append(self.agent.to(noisy.dtype).expand(B, N, P, -1))
         x = self.in_proj(torch.cat(parts, dim=-1))
-        condition = self._condition(cond, B, N)
+        condition = self.condition(cond, B, N)
         return self.out_proj(self._blocks(x if condition is None else x + condition, present))
 
-    def _condition(self, cond: Tensor | None, B: int, N: int) -> Tensor | None:
+    def condition(self, cond: Tensor | None, B: int, N: int) -> Tensor | None:
         """What a condition adds to each token. -> (B or 1, N or 1, 1, d)"""
         size = self.options.cond_dim
         if cond is not None and (not size or cond.shape not in ((B, size), (B, N, size))):

@@ -27,7 +27,7 @@ TIPS: dict[int, tuple[float, float, float]] = {
 
 
 class Jointed(Protocol):
-    """What a skeleton asks of a body model: where its joints rest."""
+    """What writing a skeleton needs of a body model: its joints at rest."""
 
     id: str
 
@@ -35,7 +35,7 @@ class Jointed(Protocol):
 
 
 def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m") -> list[Path]:
-    """Write one scene (B = 1), a file a person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
+    """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
 
     All people keep their places in the one world of the scene, y up. Joints carry SMPL-X's names; the root's position
     is the pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.

@@ -55,8 +55,8 @@ class Bvh:
 def read_bvh(path: str | Path) -> Bvh:
     """Read one BVH file.
 
-    Positions of joints replace their OFFSET, as most programs write them, unless they stay nearer to zero than to it,
-    in which case they are added.
+    Position channels of a joint replace its OFFSET, as most programs write them. If they are nearer to zero than to
+    the OFFSET, they are added to it.
 
     Raises:
         FileNotFoundError: there is no such file.

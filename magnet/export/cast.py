@@ -22,7 +22,7 @@ STYLES: tuple[Style, ...] = ("skeleton", "capsules", "body")
 
 
 class Posable(Protocol):
-    """What drawing asks of a body model (`magnet.body.Body` is one)."""
+    """What drawing needs of a body model (`magnet.body.Body` is one)."""
 
     faces: Tensor  # (F, 3)
 

@@ -91,7 +91,7 @@ class View:
 
 
 def plan_views(groups: list[Array], camera: Camera, size: Size, fps: float) -> list[list[View]]:
-    """Views of recordings of the same length; what starts alike is seen from one side and at one scale, to compare.
+    """Views of recordings of the same length; those that start alike share side and scale, to be compared.
 
     groups: for each picture (T, M, 22, 3) joints of all who must be seen. size: pixels. -> for each group T views.
     """

@@ -119,7 +119,7 @@ def bulged(corners: Array, normals: Array, bulge: float = 0.7) -> tuple[Array, A
 
 
 def _add_shaded(canvas: Canvas, points: Array, normals: Array, faces: NDArray[np.integer], tint: Array) -> None:
-    """Keep the faces that look at the eye, lit. (..., V, 3) x 2, (F, corners), tint (..., 1, 3)"""
+    """Shade the faces that face the camera, and keep them. (..., V, 3) x 2, (F, corners), tint (..., 1, 3)"""
     view = canvas.view
     pixels, depth = view.project(points)
     a, b, c = (pixels[..., faces[:, corner], :] for corner in (0, 1, -1))

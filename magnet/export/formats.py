@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import level
 from magnet.checks import require_number
+from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, save_bvh
 from magnet.export.cast import Style
+from magnet.export.fbx import save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
@@ -27,11 +29,12 @@ if TYPE_CHECKING:
 
 READ = (".npz", ".bvh")
 PICTURES = (".mp4", ".gif", ".webp")
+USD = (".usdc", ".usda", ".usdz")
 
 
 @dataclass(frozen=True)
 class Read:
-    """A scene from files, the body its shapes belong to, and what is worth knowing about how it was read."""
+    """A scene from files, the body its shapes belong to, and notes on how it was read."""
 
     scene: Scene
     body: Body
@@ -40,7 +43,7 @@ class Read:
 
 @dataclass(frozen=True)
 class Reading:
-    """What files may leave open.
+    """How to read what files do not say.
 
     Args:
         fps: bring everything to this rate; None: as recorded.
@@ -168,6 +171,7 @@ class WriteOptions:
     style: Style | Literal["light"]
     title: str | None
     progress: bool | Report
+    bones: BoneOptions
 
     @property
     def look(self) -> dict[str, Any]:
@@ -204,6 +208,12 @@ def _write_page(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
     return [save_html(scene, path, o.body, context=o.context_frames, title=o.title or "", styles=styles)]
 
 
+def _write_usd(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
+    from magnet.export.usd import save_usd
+
+    return [save_usd(scene, path, o.body, o.bones)]
+
+
 def _write_film(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
     from magnet.export.video import render_video
 
@@ -219,7 +229,9 @@ def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
 WRITTEN: dict[str, Format] = {
     ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
     ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit)),  # a skeleton a person, one file each
-    ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body)]),  # everybody skinned and animated in one world
+    ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
+    ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)]),  # the same, by Blender
+    **{suffix: Format(_write_usd) for suffix in USD},
     ".csv": Format(lambda all, to, o: [save_csv(all, to, o.body)], batch=True),  # a table of joint positions
     ".html": Format(_write_page, batch=True),  # a page that plays the scene, by itself
     **{suffix: Format(_write_film, batch=True, own_rate=True) for suffix in PICTURES},
@@ -240,6 +252,7 @@ def write(
     style: Style | Literal["light"] = "body",
     title: str | None = None,
     progress: bool | Report = False,
+    bones: BoneOptions = BoneOptions(),
 ) -> list[Path]:
     """Write a scene in the format of the path's suffix.
 
@@ -255,6 +268,7 @@ def write(
         style: how pictures show people: `body`, `capsules` or `skeleton`; of pages also `light`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function told (done, all).
+        bones: how people hang in GLB, FBX and USD.
 
     Returns:
         The paths written.
@@ -279,7 +293,7 @@ def write(
     if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
-    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress)
+    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones)
     if scene.scenes == 1 or (kind.batch and not apart):
         return list(kind.write(scene, path, options))
     places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]

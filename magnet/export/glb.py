@@ -13,8 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.joints import JOINT_NAMES, PARENTS
+from magnet.body.joints import PARENTS
+from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
+from magnet.motion.frames import canonical_frame, inverse
 from magnet.motion.scene import BODY_JOINTS, Scene, require_one
 from magnet.version import __version__
 
@@ -25,7 +27,7 @@ INFLUENCES = 4
 
 
 class Skinned(Protocol):
-    """What a skinned mesh asks of a body model (`magnet.body.Body` is one)."""
+    """What a skinned mesh needs of a body model (`magnet.body.Body` is one)."""
 
     id: str
     v_template: Tensor  # (V, 3)
@@ -36,12 +38,15 @@ class Skinned(Protocol):
     def rest_joints(self, betas: Tensor) -> Tensor: ...
 
 
-def save_glb(scene: Scene, path: str | Path, body: Skinned) -> Path:
+def save_glb(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
 
-    Each person present is a node `person_0`, `person_1` ... with the 22 joints below it under SMPL-X's names, and a
-    mesh skinned to them in the colour that pictures give the slot. People of one shape share their mesh. Pose
-    correctives of a SMPL-X file cannot be expressed and are left out.
+    Each person present is a node `person_0`, `person_1` ... with a bone on the floor and the 22 joints below it, and a
+    mesh skinned to them in the colour that pictures give the slot. At rest everybody stands on the floor in the T pose.
+    People of one shape share their mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
+
+    Args:
+        bones: their names, whether there is one on the floor, and into how many animations motion goes.
 
     Returns:
         The path written.
@@ -59,21 +64,54 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned) -> Path:
     skin = gltf.skin_of(body)
     times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
     shaped: dict[bytes, dict[str, int]] = {}
-    animation: dict[str, Any] = {"name": "motion", "samplers": [], "channels": []}
+    whole = _animation("motion")
     for number, slot in enumerate(slots):
         betas = scene.betas[0, slot].detach().cpu().float()
         shape = shaped.setdefault(betas.numpy().tobytes(), {})
         if not shape:
             shape |= gltf.shape_of(body, betas)
-        first = gltf.person(number, slot, body.rest_joints(betas), {**skin, **shape})
-        T_world_root = scene.T_world_root[0, :, slot].detach().cpu()
-        local = torch.cat([T_world_root[:, None, :3, :3], scene.body_rot[0, :, slot].detach().cpu()], dim=1)
-        gltf.animate(animation, times, first, T_world_root[:, :3, 3], local)
-    gltf.document["animations"] = [animation]
+        pelvis, floor = gltf.person(number, slot, standing(body, betas), {**skin, **shape}, bones)
+        T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu()
+        clip = whole if bones.clips == "scene" else _animation(f"person_{number}")
+        if floor is not None:
+            T_world_floor = canonical_frame(T_above_pelvis)
+            T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
+            gltf.animate(clip, times, floor, T_world_floor[:, :3, 3], T_world_floor[:, None, :3, :3])
+        local = torch.cat([T_above_pelvis[:, None, :3, :3], scene.body_rot[0, :, slot].detach().cpu()], dim=1)
+        gltf.animate(clip, times, pelvis, T_above_pelvis[:, :3, 3], local)
+        if bones.clips == "person":
+            gltf.document["animations"].append(clip)
+    if bones.clips == "scene":
+        gltf.document["animations"].append(whole)
     path = Path(path).with_suffix(".glb")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(gltf.packed())
     return path
+
+
+def _animation(name: str) -> dict[str, Any]:
+    return {"name": name, "samplers": [], "channels": []}
+
+
+def standing(body: Skinned, betas: Tensor) -> Tensor:
+    """Joints at rest of somebody who stands on the floor. betas (10,) -> (22, 3) float64"""
+    return body.rest_joints(betas).detach().cpu().double() + _raised(_resting(body, betas))
+
+
+def standing_vertices(body: Skinned, betas: Tensor) -> NDArray[np.float64]:
+    """Vertices at rest of somebody who stands on the floor. betas (10,) -> (V, 3)"""
+    vertices = _resting(body, betas)
+    return (vertices + _raised(vertices)).numpy()
+
+
+def _resting(body: Skinned, betas: Tensor) -> Tensor:
+    """Vertices of a body in its own frame. -> (V, 3) float64"""
+    return body.v_template.detach().cpu().double() + body.shapedirs.detach().cpu().double() @ betas.double()
+
+
+def _raised(vertices: Tensor) -> Tensor:
+    """By how much a resting body must be raised to stand on y = 0. (V, 3) -> (3,)"""
+    return torch.tensor([0.0, -float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
 
 
 class _Gltf:
@@ -88,6 +126,7 @@ class _Gltf:
             "meshes": [],
             "materials": [],
             "skins": [],
+            "animations": [],
             "accessors": [],
             "bufferViews": [],
         }
@@ -135,32 +174,40 @@ class _Gltf:
         }
 
     def shape_of(self, body: Skinned, betas: Tensor) -> dict[str, int]:
-        """The mesh at rest of one shape."""
-        at = body.v_template.detach().cpu().double() + body.shapedirs.detach().cpu().double() @ betas.double()
-        vertices = at.numpy()
+        """The mesh at rest of one shape, standing on the floor."""
+        vertices = standing_vertices(body, betas)
         normals = vertex_normals(vertices, body.faces.detach().cpu().numpy())
         return {
             "POSITION": self.accessor(vertices, FLOAT, "VEC3", VERTEX_DATA, bounds=True),
             "NORMAL": self.accessor(normals, FLOAT, "VEC3", VERTEX_DATA),
         }
 
-    def person(self, number: int, slot: int, rest: Tensor, mesh: dict[str, int]) -> int:
-        """Nodes, colour, mesh and skin of one person at rest. Returns the pelvis's node; joints follow in order."""
+    def person(
+        self, number: int, slot: int, rest: Tensor, mesh: dict[str, int], bones: BoneOptions
+    ) -> tuple[int, int | None]:
+        """Nodes, colour, mesh and skin of one person at rest. rest (22, 3), standing
+
+        Returns:
+            The pelvis's node, after which joints follow in order, and that of the bone on the floor.
+        """
         label = f"person_{number}"
-        rest = rest.detach().cpu().double()
         group = self.add("nodes", {"name": label, "children": []})
-        pelvis = group + 1
-        self.document["nodes"][group]["children"].append(pelvis)
-        for j, name in enumerate(JOINT_NAMES):
+        floor = self.add("nodes", {"name": "root", "children": []}) if bones.root == "floor" else None
+        pelvis = len(self.document["nodes"])
+        if floor is not None:
+            self.document["nodes"][group]["children"].append(floor)
+        self.document["nodes"][group if floor is None else floor]["children"].append(pelvis)
+        for j, name in enumerate(bone_names(bones.names)):
             away = rest[j] - (rest[PARENTS[j]] if j else 0.0)
             node: dict[str, Any] = {"name": name, "translation": away.tolist()}
             children = [pelvis + c for c in range(BODY_JOINTS) if PARENTS[c] == j]
             self.add("nodes", node | ({"children": children} if children else {}))
-        bind = np.tile(np.eye(4), (BODY_JOINTS, 1, 1))
-        bind[:, 3, :3] = -rest.numpy()  # column-major: the translation is the last row
-        matrices = self.accessor(bind.reshape(BODY_JOINTS, 16), FLOAT, "MAT4")
-        joints = list(range(pelvis, pelvis + BODY_JOINTS))
-        skin = {"name": label, "joints": joints, "skeleton": pelvis, "inverseBindMatrices": matrices}
+        joints = [*range(pelvis, pelvis + BODY_JOINTS), *([] if floor is None else [floor])]
+        bind = np.tile(np.eye(4), (len(joints), 1, 1))
+        bind[:BODY_JOINTS, 3, :3] = -rest.numpy()  # column-major: the translation is the last row
+        matrices = self.accessor(bind.reshape(len(joints), 16), FLOAT, "MAT4")
+        top = pelvis if floor is None else floor
+        skin = {"name": label, "joints": joints, "skeleton": top, "inverseBindMatrices": matrices}
         look = {
             "name": label,
             "pbrMetallicRoughness": {
@@ -178,14 +225,14 @@ class _Gltf:
         }
         # A skinned mesh moves with its joints alone, so that it must not also hang on a node that moves.
         self.document["scenes"][0]["nodes"] += [group, self.add("nodes", body)]
-        return pelvis
+        return pelvis, floor
 
-    def animate(self, animation: dict[str, Any], times: int, pelvis: int, place: Tensor, local: Tensor) -> None:
-        """Keyframes of one person. place (T, 3), local (T, 22, 3, 3)"""
+    def animate(self, animation: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
+        """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""
         quaternions = unbroken(roma.rotmat_to_unitquat(local.double()))
-        tracks = [("translation", pelvis, self.accessor(place.numpy(), FLOAT, "VEC3"))]
-        for j in range(BODY_JOINTS):
-            tracks.append(("rotation", pelvis + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))
+        tracks = [("translation", first, self.accessor(place.numpy(), FLOAT, "VEC3"))]
+        for j in range(local.shape[1]):
+            tracks.append(("rotation", first + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))
         for what, node, output in tracks:
             animation["channels"].append(
                 {"sampler": len(animation["samplers"]), "target": {"node": node, "path": what}}

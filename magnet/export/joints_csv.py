@@ -13,7 +13,7 @@ from magnet.motion.scene import Scene
 
 
 class Posed(Protocol):
-    """What a table asks of a body model."""
+    """What a table of joints needs of a body model."""
 
     def joints(self, scene: Scene) -> Tensor: ...
 

@@ -1,4 +1,4 @@
-"""Which joint of a stranger's skeleton is which of ours, by the naming schemes in use."""
+"""Joints of foreign skeletons recognised by the naming schemes in use."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ SIGNS = {"CMU": "left:hipjoint"}
 
 @dataclass(frozen=True)
 class Naming:
-    """What names say: the scheme they follow, and our joint: number of theirs."""
+    """The naming scheme of a skeleton, and which of its joints each of ours is."""
 
     scheme: str
     joints: dict[int, int]
 
     @property
     def missing(self) -> list[str]:
-        """Our joints that are needed and that no name stands for."""
+        """Joints of ours that are needed and that no name matches."""
         return [JOINT_NAMES[j] for j in NEEDED if j not in self.joints]
 
 
@@ -138,7 +138,7 @@ def plain(names: Sequence[str]) -> list[str]:
 
 
 def split_side(name: str) -> tuple[str, set[str]]:
-    """The side of the body a name says ("left", "right", "" for none), and what the rest may be.
+    """The side of the body in a name ("left", "right", "" for none), and candidates for the rest of it.
 
     "LeftUpLeg", "upleg_l", "L UpLeg" and "lUpLeg" all give ("left", {"left:upleg"}); a name that merely begins with
     an l or r, such as "lowerback", may also be taken whole, and has side "?".

@@ -19,7 +19,7 @@ SMPLX_JOINTS = 55
 
 
 class Shaped(Protocol):
-    """What these files ask of a body model: where its joints rest."""
+    """What these files need of a body model: its joints at rest."""
 
     id: str
 

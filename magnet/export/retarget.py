@@ -1,4 +1,4 @@
-"""BVH files of any skeleton brought onto a body: by joint names, whatever their units, up axis and rest pose."""
+"""Retargeting of BVH files to a body: any skeleton with known joint names, in any unit, up axis and rest pose."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ POOR_FIT, REFUSED_FIT = 0.04, 0.15
 
 @dataclass(frozen=True)
 class Source:
-    """How one file was understood."""
+    """How one file was interpreted."""
 
     path: Path
     scheme: str
@@ -74,7 +74,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Imported:
-    """People read from BVH files as one scene (B = 1), and how each file was understood."""
+    """People read from BVH files as one scene (B = 1), and how each file was interpreted."""
 
     scene: Scene
     sources: tuple[Source, ...]
@@ -137,7 +137,7 @@ def load_bvh(
 def onto(
     skeleton: Skeleton, body: Body, refuse_above: float = REFUSED_FIT, most_shape: float | None = None
 ) -> tuple[Scene, Source]:
-    """One person on a body, and how the file was understood.
+    """One person on a body, and how the file was interpreted.
 
     Args:
         refuse_above: mean distance of limb joints in metres that is no fit.

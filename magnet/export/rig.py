@@ -1,4 +1,4 @@
-"""What a stranger's BVH file means: which joint is which, in what unit, which way is up and how it rests."""
+"""Interpretation of a BVH file: its joints, unit, up axis and rest pose."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Skeleton:
 
 
 def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
-    """A file's skeleton on our terms; None: found out.
+    """A file's skeleton in metres, y up, with our joints; what is None is found out.
 
     Args:
         given: our joint's name: theirs, for names that no scheme knows.

@@ -17,6 +17,7 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
+from magnet.tokenizer.lean import decoded
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
@@ -32,6 +33,7 @@ class World(Protocol):
     placed: Tensor
     T_world_can: Tensor
     finalized: int
+    there: Tensor
 
     def by_frame(self, rows: Tensor) -> Tensor: ...
 
@@ -147,8 +149,8 @@ def decode_bodies(
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
-    features = model.tokenizer.decode(latent, world.given.betas, deltas)
-    features = features[:, frames.start - low * TOKEN_FRAMES : frames.stop - low * TOKEN_FRAMES]
+    shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
+    features = decoded_frames(world, latent, deltas, shown)
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
@@ -156,6 +158,19 @@ def decode_bodies(
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
+
+
+def decoded_frames(world: World, latent: Tensor, deltas: Tensor, frames: slice) -> Tensor:
+    """Some frames of decoded tokens, of those who are there. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)"""
+    tokenizer, betas = world.model.tokenizer, world.given.betas
+    if world.options.precision == "reference":
+        return tokenizer.decode(latent, betas, deltas)[:, frames]
+    there = world.there
+    made = decoded(tokenizer, latent[:, :, there], betas[:, there], deltas[:, :, there], frames)
+    whole = made.new_zeros(*made.shape[:2], latent.shape[2], made.shape[3])
+    whole[..., ::6] = whole[..., 4::6] = 1.0  # absent: any proper rotations
+    whole[:, :, there] = made
+    return whole
 
 
 def continuation(

@@ -123,7 +123,12 @@ def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
 
 
 def known_tokens(
-    model: Denoiser, given: Scene, known: Tensor, related: Scene | None = None, limits: Tensor | None = None
+    model: Denoiser,
+    given: Scene,
+    known: Tensor,
+    related: Scene | None = None,
+    limits: Tensor | None = None,
+    packed: bool = False,
 ) -> Tensor:
     """Normalized tokens of what is known; the others hold no information. known (N, P) -> (B, N, P, D)
 
@@ -131,7 +136,7 @@ def known_tokens(
     beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are
     those of `related`, by default the same scene. The delta into a segment from an unknown frame is unknown too: the
     segment's next delta stands in for it, which leaves a smaller error at keyframes than a delta of zero. The first
-    step of a scene is zero.
+    step of a scene is zero. `packed`: with the lean form of the encoder.
     """
     N, P = known.shape
     like = given.T_world_root
@@ -145,7 +150,7 @@ def known_tokens(
             seen = given.slice(low * TOKEN_FRAMES, limit * TOKEN_FRAMES).permute_agents(
                 torch.tensor(those, device=like.device)
             )
-            latent[:, first:last, those] = model.encode(seen)[:, first - low : last - low]
+            latent[:, first:last, those] = model.encode(seen, slice(first - low, last - low), packed)
         own = by_token(to_9d(canonical_deltas(canonical_frame(part.T_world_root))))
         if start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.lean import lean
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
@@ -26,6 +28,7 @@ from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import dtype_of
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
@@ -179,11 +182,17 @@ class Rollout:
             raise ValueError(
                 f"cond: got {len(self.cond) // samples} rows, expected one for each of {scene.scenes} scenes"
             )
+        if self.cond is None and o.guidance.cond_weight:
+            raise ValueError(
+                f"guidance.cond_weight: got {o.guidance.cond_weight:g} and no condition to guide by; give `cond`, "
+                "or leave it at 0"
+            )
         self.stats.begin(B)
         self.first = self.stop = 0
         self.there: float = self.length
         self.reached = 0  # one past the last row that has been generated
         self.expected = Expected(receptive_field(model)[1])
+        self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
@@ -240,10 +249,11 @@ class Rollout:
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
         self._ahead, self._begins = stage.ahead, stage.start
+        self._ask_for(stage)
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
-                self._denoise,
+                self._guided_by_condition,
                 [dataclasses.replace(stage, start=stage.start - self.first)],
                 self.tokens,
                 self.mask_noise,
@@ -261,6 +271,35 @@ class Rollout:
         if self.world.causal and self.expected.most:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
+    def _ask_for(self, stage: Stage) -> None:
+        """Which predictions of each step are read: of what the stage changes, and of what follows it in the end."""
+        self._left = len(stage.levels) - 1
+        # A token that is known may hold pairwise transforms to somebody who is not.
+        begins, ends = (self.model.layout.group_levels(levels) for levels in stage.levels[[0, -1]])
+        self._asked = torch.nn.functional.pad((begins != ends).any(dim=-1), (0, 0, 0, stage.ahead))
+
+    def _network(self) -> Callable[..., Tensor]:
+        """What predicts: the transformer as it was trained, or its lean form."""
+        network, precision = self.model.transformer, self.options.precision
+        smooth = self.options.guidance.smooth  # by a gradient, which packed weights have not
+        if precision == "reference" or smooth or dtype_of(network) != torch.float32:
+            return network
+        whole = self.model.posterior is not None
+        self._left -= 1
+        if self._left == 0 and self.expected.most:
+            self._asked[len(self._asked) - self._ahead :] = True
+        return functools.partial(lean(network, precision), wanted=None if whole else self._asked)
+
+    def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""
+        weight = self.options.guidance.cond_weight
+        if not weight:
+            return self._denoise(noisy, levels, present)
+        clean = self._denoise(*(x.repeat_interleave(2, dim=0) for x in (noisy, levels, present)))
+        whole: Tensor = self._clean
+        self._clean, clean = (x[0::2] + weight * (x[0::2] - x[1::2]) for x in (whole, clean))
+        return clean
+
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
         width = noisy.shape[1]
@@ -268,7 +307,8 @@ class Rollout:
         noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
         levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
-            clean = self.model.denoise(noisy, levels, present, self._condition(*noisy.shape[:2])).float()
+            cond = self._condition(*noisy.shape[:2])
+            clean = self.model.denoise(noisy, levels, present, cond, self._network()).float()
         self._clean = clean.detach()
         return clean[:, :width]
 
@@ -280,7 +320,10 @@ class Rollout:
         if cond.ndim == 3:
             cond = cond[:, self._begins : self._begins + width]
             cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
-        return cond.repeat_interleave(rows // len(cond), dim=0)
+        cond = cond.repeat_interleave(rows // len(cond), dim=0)
+        if self.options.guidance.cond_weight:
+            cond[1::2] = torch.nan
+        return cond
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
@@ -309,7 +352,8 @@ class Rollout:
             given = self._given(low, high)
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
-            tokens = known_tokens(self.model, given, known, related, self._limits(low, high, part))[:, part]
+            limits, packed = self._limits(low, high, part), self.options.precision != "reference"
+            tokens = known_tokens(self.model, given, known, related, limits, packed)[:, part]
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             init_noise, mask_noise = self.noise.draw(last - self.stop)
             new = begin(tokens, init_noise, known[part], self.model.layout)

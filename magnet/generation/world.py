@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
-from magnet.generation.causal_bodies import finalized_bodies
+from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.generation.separation import separated
 from magnet.generation.settling import LEAD, settled_block, settled_chunk
@@ -67,6 +67,7 @@ class WorldState:
         self.samples = samples
         self.known = schedule.known[: given.frames // TOKEN_FRAMES]
         self.given = given.repeat(samples)
+        self.there = self.given.present.any(dim=0).nonzero()[:, 0]  # slots that somebody is in
         self.placed = self.known.clone()
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
@@ -362,11 +363,11 @@ class WorldState:
         behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
         latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
-        features = self.model.tokenizer.decode(latent, self.given.betas, deltas)
         frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
+        features = decoded_frames(self, latent, deltas, frames)
         given = self.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
         T_world_can = self.T_world_can[:, low * TOKEN_FRAMES : high * TOKEN_FRAMES]
-        decoded = posed(features[:, frames], T_world_can, given)
+        decoded = posed(features, T_world_can, given)
         if self.options.keep_given:
             decoded = crossfade_given(
                 decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend

@@ -8,6 +8,8 @@ is fully described by a yaw and a ground position: its *planar* form.
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -121,8 +123,14 @@ def partners(agents: int, device: torch.device | None = None) -> Tensor:
             [0, 2],
             [0, 1]])
     """
-    everyone = torch.arange(agents, device=device).expand(agents, agents)
-    return everyone[~torch.eye(agents, dtype=torch.bool, device=device)].view(agents, agents - 1)
+    return _partners(agents, device)
+
+
+@functools.cache
+def _partners(agents: int, device: torch.device | None) -> Tensor:
+    with torch.inference_mode(False):  # or training, later, could not use it
+        slot = torch.arange(max(agents - 1, 0), device=device).expand(agents, -1)
+        return slot + (slot >= torch.arange(agents, device=device)[:, None])
 
 
 def pairwise(T_world_can: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,8 +46,7 @@ class TokenLayout:
 
     def groups(self, device: torch.device | None = None) -> Tensor:
         """Group of each number of a token. (D,) int"""
-        sizes = [self.latent + 9 * TOKEN_FRAMES] + [9 * TOKEN_FRAMES] * self.slots
-        return torch.arange(len(sizes), device=device).repeat_interleave(torch.tensor(sizes, device=device))
+        return _groups(self, device)
 
     def group_levels(self, levels: Tensor) -> Tensor:
         """Noise level of each group: pairwise ones are as noisy as their noisier end. (..., P) -> (..., P, 1 + slots)
@@ -84,6 +84,14 @@ class TokenLayout:
         sizes = [self.latent, 9 * TOKEN_FRAMES, 9 * TOKEN_FRAMES * self.slots]
         latent, deltas, pairs = tokens.split(sizes, dim=-1)
         return latent, deltas.unflatten(-1, (TOKEN_FRAMES, 9)), pairs.unflatten(-1, (self.slots, TOKEN_FRAMES, 9))
+
+
+@functools.cache
+def _groups(layout: TokenLayout, device: torch.device | None) -> Tensor:
+    with torch.inference_mode(False):  # or training, later, could not use it
+        sizes = [layout.latent + 9 * TOKEN_FRAMES] + [9 * TOKEN_FRAMES] * layout.slots
+        each = [torch.full((size,), group, device=device) for group, size in enumerate(sizes)]
+        return torch.cat(each)
 
 
 def by_token(frames: Tensor) -> Tensor:

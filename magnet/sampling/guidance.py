@@ -36,6 +36,8 @@ class Guidance:
             also runs the model backward. Known tokens are never moved.
         stabilization_level: noise level at which the model is shown what is finished, for long scenes: small errors
             then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
+        cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
+            with the condition plus w times its difference to the one without. 0: the condition alone.
     """
 
     kind: Kind = "none"
@@ -43,12 +45,14 @@ class Guidance:
     paper_average: bool = False
     smooth: float = 0.0
     stabilization_level: int = 0
+    cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise ValueError(f"kind: got {self.kind!r}, expected {' or '.join(get_args(Kind))}")
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
+        require_number("cond_weight", self.cond_weight, least=0)
         require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
 
     def branches(self, there: Tensor) -> Tensor:

@@ -195,6 +195,7 @@ class NoiseStream:
         require_number("eta", self.eta, 0, 1)
         # Drawn once, so that the noise of a step depends on its place alone, not on the order of the calls.
         self._seeds = self._draw_seeds() if self.eta else []
+        self._again = torch.Generator(device=self.device)  # seeded anew for each draw
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         """Initial noise of the next `count` token steps, and their mask noise, shown where a view hides them.
@@ -227,6 +228,24 @@ class NoiseStream:
                 seeds = [derive(seed, first + row, level) for seed in self._seeds]
                 drawn = self._seeded(seeds, (B // len(seeds), P, D)).flatten(0, 1)
                 noise[:, row] = torch.where(levels[row] == level, drawn, noise[:, row])
+        return noise
+
+    def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
+        """Step noise of a planned step: `step_noise` for the given (row, level, where (P, D)). -> (B, rows, P, D)
+
+        Where nothing moves it may hold anything.
+        """
+        B, P, D = self.shape
+        noise = torch.empty(B, rows, P, D, device=self.device, dtype=self.dtype)
+        if len({row for row, _, _ in draws}) < rows:
+            noise.zero_()
+        each = B // len(self._seeds)
+        for row, level, where in draws:
+            for number, seed in enumerate(self._seeds):
+                self._again.manual_seed(derive(seed, first + row, level))
+                scenes = slice(number * each, (number + 1) * each)
+                new = torch.randn(each, P, D, generator=self._again, device=self.device, dtype=self.dtype)
+                noise[scenes, row] = new if where is None else torch.where(where, new, noise[scenes, row])
         return noise
 
     def _draw_seeds(self) -> list[int]:

@@ -16,6 +16,7 @@ Separation = Literal["off", "light", "firm"]
 
 
 NoiseSampling = Literal["joint", "independent"]
+Precision = Literal["reference", "float32", "bf16"]
 Spacing = Literal["even", "log_snr"]
 
 
@@ -68,6 +69,9 @@ class SamplerOptions:
             with few steps.
         spacing: of the levels: `even`, as in the paper, changed by `shift`; or evenly in `log_snr`, with a last level
             near 0.
+        precision: of the network while it samples: `float32`, with weights packed for the processor, which is twice as
+            fast on a CPU and rounds otherwise than the network as it is trained, `reference`; or `bf16`, the
+            blocks' weights in half precision, a trade (docs/speed.md says what it costs in poses).
     """
 
     steps: int = 16
@@ -88,6 +92,7 @@ class SamplerOptions:
     noise_sampling: NoiseSampling = "joint"
     solver: Solver = "dpmpp_2m"
     spacing: Spacing = "log_snr"
+    precision: Precision = "float32"
 
     def __post_init__(self) -> None:
         if not isinstance(self.guidance, Guidance):
@@ -97,6 +102,7 @@ class SamplerOptions:
         require_choice("body_guidance", self.body_guidance, Separation)
         require_choice("settle", self.settle, Separation)
         require_choice("solver", self.solver, Solver)
+        require_choice("precision", self.precision, Precision)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)
         if self.pyramid_offset is not None:

@@ -28,10 +28,12 @@ PRESETS: dict[str, dict[str, Any]] = {
             "paper_average": True,
             "smooth": 0.0,
             "stabilization_level": 0,
+            "cond_weight": 0.0,  # the paper has no conditions
         },  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
+        "precision": "reference",  # A.3 names none: the network as it was trained
         "apart": "off",  # the paper moves nobody out of another
         "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose

@@ -10,10 +10,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream
+from magnet.sampling.planned_stage import run_planned_stage, views_to_read
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver, solver_step
 
@@ -116,10 +116,12 @@ def run_stages(
     `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
     `correct` changes what each step predicts.
     """
-    tokens = tokens.clone()
+    tokens, guidance = tokens.clone(), guidance or Guidance()
+    # Smoothing moves noisy tokens by a gradient in each step, which no plan knows of.
+    run = run_stage if guidance.smooth else run_planned_stage
     for stage in stages:
         window = slice(stage.start, stage.stop)
-        tokens[:, window] = run_stage(
+        tokens[:, window] = run(
             denoise,
             stage,
             tokens[:, window],
@@ -127,7 +129,7 @@ def run_stages(
             present,
             layout,
             progress,
-            guidance or Guidance(),
+            guidance,
             noise,
             offset + stage.start,
             None if history is None else history.window(window),
@@ -155,6 +157,8 @@ def run_stage(
     correct: Correct | None = None,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
+
+    The plain loop, which works out everything in each step; `run_planned_stage` is held to its results.
 
     `first` is the row of `noise` that the window begins with; `history` is that of the window.
     """
@@ -225,23 +229,10 @@ def _predict_in_views(
     clean = clean if correct is None else correct(clean, seen_now, views_hidden)
     moved, clean = moved.unflatten(0, (B, V)), clean.unflatten(0, (B, V))
     moved = torch.where(unknown, tokens[:, None], moved)
-    source = layout.spread(_views_to_read(hidden, view_of, layout))  # (W, P, D)
+    source = layout.spread(views_to_read(hidden, view_of, layout))  # (W, P, D)
 
     def read(views: Tensor) -> Tensor:
         """From each number's own view. (..., V, W, P, D) -> (..., W, P, D)"""
         return views.gather(-4, source.expand(*views.shape[:-4], 1, W, P, -1)).squeeze(-4)
 
     return read(moved), read(clean), read(group), read(group_after)
-
-
-def _views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tensor:
-    """The view that each group of each token is read from. hidden (P, W, P), view_of (P,) -> (W, P, 1 + slots) int"""
-    P, W = hidden.shape[:2]
-    own = view_of.expand(W, P)[..., None]
-    if not layout.slots:
-        return own
-    partner = partners(P, hidden.device)  # (P, slots)
-    unseen = hidden.transpose(0, 1)  # (W, P viewer, P viewed)
-    agent = torch.arange(P, device=hidden.device)[:, None]
-    blind = unseen[:, agent, partner] & ~unseen[:, partner, agent]  # who sees one is not seen
-    return torch.cat([own, torch.where(blind, view_of[partner], own)], dim=-1)

@@ -17,7 +17,7 @@ from magnet.synthesis.ring import circle, patty_cake
 
 @dataclass(frozen=True)
 class Coupling:
-    """A builder and the sizes of groups that it is for."""
+    """A builder of scenes and the group sizes that it supports."""
 
     plan: Callable[[People, int, torch.Generator], tuple[Plan, Truth]]
     fewest: int

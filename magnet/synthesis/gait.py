@@ -1,4 +1,4 @@
-"""Where the feet go: plants are decided first, and a planted foot never moves."""
+"""Placement of feet: footholds are planned first, and a planted foot never moves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Feet:
         return Feet(**{name: value[frames] for name, value in vars(self).items()})
 
     def mirrored(self) -> Feet:
-        """Seen in a mirror that stands on z = 0: z changes sign, left and right swap. Of one person."""
+        """Reflected in the plane z = 0: z changes sign, left and right swap. Of one person."""
         swapped = {name: value.flip(1) for name, value in vars(self).items()}
         flip = torch.tensor([1.0, 1.0, -1.0], dtype=self.ball.dtype)
         return replace(Feet(**swapped), ball=swapped["ball"] * flip, yaw=torch.pi - swapped["yaw"])
@@ -76,20 +76,20 @@ class _Step:
 def plan_feet(ground: Tensor, yaw: Tensor, people: People, person: int) -> Feet:
     """Footsteps that carry a body along a path: strolling, side-stepping, backing, turning, standing.
 
-    A foot lands where the body will be in the middle of the stance that follows, so long strides lead
-    and a body that stands still gathers its feet beneath it.
+    A foot lands where the body will be in the middle of its next stance: ahead of a walking body, and below one that
+    stands still.
 
     Args:
         ground: (T, 2) path of the pelvis as (x, z), metres.
         yaw: (T,) where the body faces, radians, unwrapped.
-        people: whose manner and measures to use, `person` says which.
+        people: gait parameters and body measures; `person` is the index to use.
     """
     steps = _decide(ground.numpy(), yaw.numpy(), people, person)
     return _trace(steps, ground.shape[0], _places(ground.numpy(), yaw.numpy(), people, person))
 
 
 def _places(ground: np.ndarray, yaw: np.ndarray, people: People, person: int) -> np.ndarray:
-    """Where each foot belongs if the body were to rest there: x, z, yaw. -> (T, 2, 3)"""
+    """Where each foot would stand if the body rested in that frame: x, z, yaw. -> (T, 2, 3)"""
     forward = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
     left = np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
     aside = np.abs((np.gradient(ground, axis=0) * left).sum(-1)) * FPS

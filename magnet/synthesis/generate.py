@@ -1,4 +1,4 @@
-"""`synthesize`: a name, a group size and a generator to a scene and what couples its people."""
+"""`synthesize`: scenes of people who are coupled in a known way."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def synthesize(coupling: str, people: int, frames: int, generator: torch.Generat
         body: whose shape numbers and joints at rest are used.
 
     Raises:
-        ValueError: no such coupling, a group or a stretch it is not for.
+        ValueError: no such coupling, or a group size or length that it does not support.
 
     >>> from magnet.body import load_body
     >>> made = synthesize("mirror", 2, 120, torch.Generator().manual_seed(0), load_body())

@@ -31,7 +31,7 @@ def about(axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def fraction(rotation: Tensor, share: float) -> Tensor:
-    """The same turn by a share of its angle, for angles below pi. (..., 3, 3) -> (..., 3, 3)"""
+    """Rotation by a fraction of its angle, for angles below pi. (..., 3, 3) -> (..., 3, 3)"""
     vee = torch.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
@@ -92,7 +92,7 @@ def two_bones(
 
 
 def ease(u: Tensor) -> Tensor:
-    """0 to 1 with least jerk: no speed and no acceleration at either end. Clamped outside [0, 1]."""
+    """Minimum-jerk curve from 0 to 1: no speed and no acceleration at either end. Clamped outside [0, 1]."""
     u = u.clamp(0, 1)
     return u**3 * (10 - 15 * u + 6 * u**2)
 

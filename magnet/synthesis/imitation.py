@@ -1,4 +1,4 @@
-"""Doing what another does, later: mirroring, and following the leader."""
+"""Imitation with a delay: mirroring, and following a leader."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ POSES = torch.tensor(  # of a left hand: azimuth (0 aside, pi/2 ahead), elevatio
 
 
 def _dance(frames: int, generator: torch.Generator) -> dict[str, Tensor]:
-    """Steps on the spot and gestures, facing +z: each field of `Plan` that they fill, for one person."""
+    """The fields of `Plan` for one person who steps on the spot and gestures, facing +z."""
     clock = torch.arange(frames, dtype=torch.float64) / FPS
     keys = int(frames / FPS / 0.9) + 3
 

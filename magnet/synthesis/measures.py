@@ -1,4 +1,4 @@
-"""How far a motion is from its coupling's closed form: what a test asks of a model that should have learnt it."""
+"""How far a motion is from its coupling's closed form, to test models that were trained on it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIMBS = (*KNEES, *ANKLES, *ELBOWS, *WRISTS)
 
 
 def coupling_error(coupling: str, joints: Tensor, truth: Truth, start: float = 0.0) -> dict[str, float]:
-    """Distance of a motion from what its coupling demands; NaN where the stretch shows nothing of it.
+    """Deviation of a motion from its coupling; NaN where these frames do not show it.
 
     Args:
         coupling: name in `COUPLINGS`.

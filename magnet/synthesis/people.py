@@ -1,4 +1,4 @@
-"""Who moves: bodies, their measures at rest, their manner; and the slow noise of living bodies."""
+"""People drawn at random: shapes, measures at rest and gait parameters; and the smooth noise of their motion."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def gather(count: int, generator: torch.Generator, body: RestBody) -> People:
 
 
 def noise(generator: torch.Generator, frames: int, *shape: int, low: float = 0.08, high: float = 0.7) -> Tensor:
-    """Smooth band-limited noise of unit variance: a few sines at random, never the same mix. Hz -> (T, *shape)"""
+    """Smooth band-limited noise of unit variance: a sum of sines of random frequency and phase. Hz -> (T, *shape)"""
     waves = 6
     hertz = low * (high / low) ** torch.rand(waves, *shape, generator=generator, dtype=torch.float64)
     phase = 2 * math.pi * torch.rand(waves, *shape, generator=generator, dtype=torch.float64)

@@ -1,7 +1,7 @@
 """What the builders of couplings share: clocks, keyed curves, directions on the ground.
 
-A builder plans `frames + 2 * PAD` frames, of which the middle ones are kept, so that nobody starts
-from nothing. Times in its `truth` are seconds from the first kept frame.
+A builder plans `frames + 2 * PAD` frames, of which the middle ones are kept, so that all motion is under way at the
+first of them. Times in its `truth` are seconds from the first kept frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def seconds(frames: int) -> Tensor:
 
 
 def keyed(when: tuple[Tensor, Tensor], values: Tensor, clock: Tensor) -> Tensor:
-    """Rest at values[k], leave for values[k + 1] at when[0][k], arrive when[1][k] later. (K, ...) -> (T, ...)"""
+    """Rest at `values[k]`, leave for the next at `when[0][k]`, arrive `when[1][k]` later. (K, ...) -> (T, ...)"""
     times, moves = when
     progress = ease((clock[:, None] - times) / moves)  # (T, K - 1)
     return values[0] + torch.tensordot(progress, torch.diff(values, dim=0), dims=1)
@@ -46,7 +46,7 @@ def facing(yaw: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def walked(ground: Tensor, yaw: Tensor, people: People) -> Plan:
-    """Everybody with footsteps of their own along (T, P, 2) and (T, P)."""
+    """Footsteps of everybody along ground paths (T, P, 2) with yaws (T, P)."""
     feet = stack([plan_feet(ground[:, p], yaw[:, p], people, p) for p in range(len(people))])
     return still(ground, yaw, feet, people)
 

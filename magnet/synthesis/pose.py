@@ -42,7 +42,7 @@ class Plan:
 
 
 def still(ground: Tensor, yaw: Tensor, feet: Feet, people: People) -> Plan:
-    """People on their way with nothing else to do: arms swing, eyes look ahead."""
+    """A plan of people who only walk: arms swing, eyes look ahead."""
     T, P = yaw.shape
     zero = ground.new_zeros
     ahead = ground + 6 * torch.stack([yaw.sin(), yaw.cos()], dim=-1)
@@ -227,8 +227,8 @@ def _arm(plan: Plan, people: People, bodies: _Bodies, hand: int, scissor: Tensor
 def _elbow_side(side: int, aim: Tensor) -> Tensor:
     """Where the elbow points, by where the hand is: back when it hangs, down when ahead, out when up. (..., 3)
 
-    No such field is without a direction that leaves the elbow undecided; this one's lies high across the
-    other shoulder, where hands seldom are.
+    Every such field is undefined in some direction; for this one it is high across the other shoulder, where hands
+    seldom are.
     """
     up, ahead = aim[..., 1].clamp_min(0.0) ** 2, aim[..., 2].clamp_min(0.0) ** 2
     return torch.stack([side * (0.4 + 0.7 * up), -0.6 - 0.6 * ahead, -0.9 + 0.9 * ahead], dim=-1)
@@ -243,7 +243,7 @@ def _hanging(side: int, out: Tensor, swing: Tensor) -> Tensor:
 def _hand(
     forearm: Tensor, lower: Tensor, hand: int, fingers: Tensor, thumb: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Share the hand's turn: the forearm twists toward the thumb, the wrist does the rest."""
+    """Split the hand's rotation: the forearm twists toward the thumb, the wrist does the rest."""
     side = 1 - 2 * hand
     axis = F.normalize(rotate(forearm, lower), dim=-1)
     now = forearm[..., 2]  # the thumb side of the forearm
@@ -264,7 +264,7 @@ def _hand(
 
 
 def _share(rotation: Tensor, weight: Tensor) -> Tensor:
-    """A turn by a varying share of its angle. (..., 3, 3), (...) -> (..., 3, 3)"""
+    """Rotation by a varying fraction of its angle. (..., 3, 3), (...) -> (..., 3, 3)"""
     eye = torch.eye(3, dtype=rotation.dtype)
     mixed = eye + weight[..., None, None] * (rotation - eye)
     # Gram-Schmidt of the mix: as smooth as the turn, exact at both ends.
@@ -272,7 +272,7 @@ def _share(rotation: Tensor, weight: Tensor) -> Tensor:
 
 
 def _head(plan: Plan, bodies: _Bodies, drift: Tensor) -> None:
-    """Neck and head share the turn toward what the eyes rest on."""
+    """Neck and head share the rotation toward what the eyes look at."""
     chest = bodies.R[SPINE3]
     bodies.attach(HEAD, NECK)
     gaze = rotate(chest.transpose(-1, -2), plan.gaze - bodies.t[HEAD])

@@ -1,4 +1,4 @@
-"""Poses nobody recorded, for a tokenizer that must code them all (ours)."""
+"""Augmentation of poses for training a tokenizer (ours)."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ DRIFT_FRAMES = 6.0
 
 
 def swap_limbs(scene: Scene, probability: float, generator: torch.Generator) -> Scene:
-    """Give each limb of each person, with a probability, the motion of that limb of somebody else in the batch.
+    """Replace limbs, each with a probability, by the same limb of another person in the batch.
 
-    A few minutes of dance hold few pairs of an upper and a lower body; a pose coder should not learn which.
+    A few minutes of dance hold few combinations of upper and lower bodies; the tokenizer should not memorize them.
     """
     B, P = scene.present.shape
     people = scene.present.flatten().nonzero()[:, 0]
@@ -60,7 +60,7 @@ def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene
 
 
 def root_noise(deltas: Tensor, speed: float, generator: torch.Generator) -> Tensor:
-    """Deltas with a slow error over the ground, of each person its own, as sampled ones have it.
+    """Add a slow error over the ground to deltas, one for each person, as sampled deltas have it.
 
     Args:
         deltas: (B, T, P, 9) canonical deltas.

@@ -14,10 +14,10 @@ from magnet.motion.scene import Scene
 
 @runtime_checkable
 class PoseTokenizer(Protocol):
-    """Poses of one person to latents and back: all that a denoiser asks of a tokenizer.
+    """Encodes poses of one person as latents and decodes them: all that a denoiser needs of a tokenizer.
 
-    It is a `torch.nn.Module`; the denoiser freezes it. `Tokenizer` and `RawPose` are two. A latent is of `TOKEN_FRAMES`
-    frames. Give yours to `Denoiser.build`.
+    It is a `torch.nn.Module`; the denoiser freezes it. `Tokenizer` and `RawPose` implement it. A latent covers
+    `TOKEN_FRAMES` frames. Give yours to `Denoiser.build`.
     """
 
     codebook_dim: int  # C, numbers in a latent
@@ -28,7 +28,7 @@ class PoseTokenizer(Protocol):
         ...
 
     def encode_scene(self, scene: Scene, quantize: bool = True) -> Tensor:
-        """Latents of a scene, cut to whole tokens, codes or as they are before. -> (B, N, P, C) float32"""
+        """Latents of a scene that is cut to whole tokens, quantized or not. -> (B, N, P, C) float32"""
         ...
 
     def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, window: int | None = None) -> Tensor:
@@ -43,7 +43,7 @@ class PoseTokenizer(Protocol):
         ...
 
     def fit_normalizers(self, scenes: Iterable[Scene]) -> None:
-        """Set what is measured on training scenes."""
+        """Measure the statistics of normalizers on training scenes."""
         ...
 
     def requires_grad_(self, requires_grad: bool = True) -> Self: ...
@@ -55,7 +55,7 @@ class PoseTokenizer(Protocol):
 
 @dataclass(frozen=True)
 class Quantized:
-    """What a quantizer makes of vectors (..., D)."""
+    """The result of quantizing vectors (..., D)."""
 
     latent: Tensor  # (..., C) the code; gradients pass straight to the vectors
     index: Tensor  # (..., quantizers) int, the code chosen in each codebook; -1 where masked out
@@ -64,7 +64,7 @@ class Quantized:
 
 
 class Quantizer(Protocol):
-    """The encoder's output to codes. `ResidualVQ` and `FSQ` are two; both are torch modules."""
+    """Maps the encoder's output to codes. `ResidualVQ` and `FSQ` implement it; both are torch modules."""
 
     size: int  # codes in a codebook
     dim: int  # C, numbers in a code
@@ -76,7 +76,8 @@ class Quantizer(Protocol):
     def __call__(
         self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
     ) -> Quantized:
-        """Codes in training. vectors (..., C), mask (...) bool: False changes nothing that is learned or counted."""
+        """Quantize in training. vectors (..., C), mask (...) bool: what is False is neither learned from nor
+        counted."""
         ...
 
     def continuous(self, vectors: Tensor) -> Tensor:

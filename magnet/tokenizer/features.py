@@ -45,7 +45,7 @@ def features(scene: Scene) -> Features:
 
 
 def delta_known(valid: Tensor) -> Tensor:
-    """A step is known where both of its frames are; the first one is by definition. (..., T) bool -> same"""
+    """A delta is known where both of its frames are; the first one always is. (..., T) bool -> same"""
     return valid & torch.cat([valid[..., :1], valid[..., :-1]], dim=-1)
 
 

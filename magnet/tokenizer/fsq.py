@@ -74,7 +74,7 @@ class FSQ(Float32):
             return Quantized(codes, index[..., None], latents.new_zeros(()), counts[None])
 
     def continuous(self, vectors: Tensor) -> Tensor:
-        """Each number bounded to where its levels are. (..., C) -> (..., C) in about -1 to 1"""
+        """Each number bounded to the range of its levels. (..., C) -> (..., C) in about -1 to 1"""
         bounded = torch.tanh(vectors.float() + self.shift) * self.half_range - self.offset
         return bounded / self.step
 

@@ -1,4 +1,4 @@
-"""How far a decoded pose is from the truth (paper Eq. 4 and 5)."""
+"""Reconstruction losses of the tokenizer (paper Eq. 4 and 5)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BODY = 21 * 6
 
 
 def orthonormalize(pose: Tensor) -> Tensor:
-    """The pose with true rotations in its 6-D numbers and the pelvis above its canonical frame. (..., 135) -> same"""
+    """Orthonormalize a pose's 6-D rotations and put the pelvis above its canonical frame. (..., 135) -> same"""
     rotations = torch.cat([pose[..., :BODY], pose[..., BODY : BODY + 6]], dim=-1).unflatten(-1, (22, 6))
     rotations = from_6d(rotations)[..., :2].transpose(-1, -2).flatten(-3)
     up = torch.tensor([0.0, 1.0, 0.0], dtype=pose.dtype, device=pose.device)
@@ -56,7 +56,7 @@ def reconstruction_losses(
 ) -> dict[str, Tensor]:
     """The terms of paper Eq. 4, each a mean over people, frames and joints; and four of ours.
 
-    A smooth-L1 of the angle is quadratic below 1 radian: gentle to the many small errors, not led by a few flips.
+    A smooth L1 of the angle is quadratic below 1 radian and linear above, so that a few flips do not dominate it.
 
     Args:
         decoded: (B, T, P, 135), any scale of 6-D numbers.
@@ -69,10 +69,10 @@ def reconstruction_losses(
 
     Returns:
         joint_rotation: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of
-        the joints, metres. velocity: what that distance changes by from frame to frame, m/s; small errors that flicker
-        cost nothing else, and are what an eye sees first. foot_velocity: the same of ankles and toes alone, whose
-        flicker is seen as sliding. foot_contact: error of the velocities over the ground of toes that stand in the
-        recording, m/s, on the way that the given deltas lead.
+        the joints, metres. velocity: error of the joints' velocities, m/s; small errors that flicker cost little
+        elsewhere, and are the first that one sees. foot_velocity: the same of ankles and toes alone, where flicker
+        looks like sliding. foot_contact: error of the velocities over the ground, m/s, of toes that stand in the
+        recording, with roots moved by the given deltas.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -99,7 +99,7 @@ def reconstruction_losses(
 
 
 def length(vector: Tensor) -> Tensor:
-    """Length of a vector, with a slope at 0 that is finite. (..., 3) -> (...)"""
+    """Norm of a vector, with a finite gradient at 0. (..., 3) -> (...)"""
     return (vector.square().sum(-1) + 1e-8).sqrt()
 
 
@@ -114,7 +114,7 @@ def moved(nine: Tensor, points: Tensor) -> Tensor:
 
 
 def world_velocity(joints: Tensor, deltas: Tensor) -> Tensor:
-    """Way of joints from frame to frame in the world, as seen from the canonical frame before.
+    """Displacement of joints in the world from frame to frame, seen from the canonical frame before.
 
     (B, T, P, 22, 3) in canonical frames, (B, T, P, 9) -> (B, T - 1, P, 22, 3) metres
     """
@@ -122,7 +122,7 @@ def world_velocity(joints: Tensor, deltas: Tensor) -> Tensor:
 
 
 def standing(joints: Tensor, deltas: Tensor) -> Tensor:
-    """Which toes stand from a frame to the next, being low and slow. Arguments as above -> (B, T - 1, P, 2) bool"""
+    """Which toes stand from one frame to the next: low and slow ones. Arguments as above -> (B, T - 1, P, 2) bool"""
     height, speed = STANDS
     low = joints[..., TOES, 1] < height
     slow = FPS * world_velocity(joints, deltas)[..., TOES, :].norm(dim=-1) < speed

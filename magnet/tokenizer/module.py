@@ -44,7 +44,7 @@ GLANCE = 4
 
 
 def make_quantizer(options: QuantizerOptions) -> ResidualVQ | FSQ:
-    """The quantizer of some options; a new kind has its line here and its file beside `fsq.py`."""
+    """The quantizer that options describe; a new kind has a line here and a file beside `fsq.py`."""
     if options.kind == "fsq":
         return FSQ(options.levels)
     return ResidualVQ(
@@ -125,7 +125,7 @@ class Tokenizer(L.LightningModule):
         return self.quantizer.nearest(latent) if quantize else latent
 
     def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, window: int | None = None) -> Tensor:
-        """Poses whose rotations are proper. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
+        """Poses with valid rotations. (B, N, P, C), (B, P, 10), (B, N, P, 4, 9) -> (B, T, P, 135)
 
         `window` tokens are decoded at a time, each with all the neighbours it can depend on: the same poses in
         bounded memory. None decodes the whole clip at once.
@@ -194,7 +194,7 @@ class Tokenizer(L.LightningModule):
 
     @torch.no_grad()
     def init_codebook(self, scenes: Iterable[Scene]) -> None:
-        """Statistics, then the k-means start of the codebook, from the first training batches; once only."""
+        """Fit normalizers, then initialize the codebook by k-means, on the first training batches; only once."""
         some = []
         for number, scene in enumerate(scenes):
             some.append(scene.to(self.device))
@@ -282,7 +282,7 @@ class Tokenizer(L.LightningModule):
         return losses["loss"]
 
     def losses(self, seen: Features, batch_idx: int = 0) -> tuple[dict[str, Tensor], Tensor, Quantized]:
-        """Weighted sum and terms; decoded poses (B, T, P, 135); what the codebook said."""
+        """Weighted sum and terms; decoded poses (B, T, P, 135); the quantizer's result."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.hparams["decoder_only"]):
             embedded = self.embed(seen.pose, seen.betas, seen.deltas, seen.valid)
         quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))

@@ -54,6 +54,7 @@ class ResidualVQ(Float32):
         self.size, self.dim, self.num_quantizers = codebook_size, codebook_dim, num_quantizers
         self.ema_decay, self.dead_code_threshold = ema_decay, dead_code_threshold
         self.frozen = False
+        self._lengths: tuple[tuple[int, int], Tensor] | None = None  # of codes, squared, while they stay
         self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
         self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
         self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
@@ -64,11 +65,11 @@ class ResidualVQ(Float32):
     def forward(
         self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
     ) -> Quantized:
-        """Nearest codes; in training the codes then move.
+        """Quantize; in training also update the codes.
 
         Args:
             vectors: (..., D), computed in float32 whatever the autocast.
-            mask: (...) bool; False: looked up like the others, but touches neither codes, loss nor counts.
+            mask: (...) bool; False: quantized, but left out of updates, loss and counts.
             generator: draws the vectors that start and revive codes; only that of rank 0 counts.
         """
         with torch.autocast(vectors.device.type, enabled=False):
@@ -97,12 +98,12 @@ class ResidualVQ(Float32):
             )
 
     def continuous(self, vectors: Tensor) -> Tensor:
-        """The vectors as they are: codes lie among them."""
+        """The vectors unchanged: codes lie in the same space."""
         return vectors.float()
 
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
-        """The sum of codes nearest to each vector, codebook by codebook; nothing moves. (..., D) -> (..., D) float32"""
+        """The sum of the nearest codes, codebook by codebook; nothing is updated. (..., D) -> (..., D) float32"""
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
             latent = torch.zeros_like(residual)
@@ -112,7 +113,12 @@ class ResidualVQ(Float32):
             return latent.view(vectors.shape)
 
     def _nearest(self, vectors: Tensor, book: int) -> Tensor:
-        return _nearest(vectors, self.codes[book])
+        if self.training or self.codes.is_inference():
+            return _nearest(vectors, self.codes[book])
+        now = (self.codes.data_ptr(), self.codes._version)
+        if self._lengths is None or self._lengths[0] != now:
+            self._lengths = (now, self.codes.square().sum(-1))
+        return (self._lengths[1][book] - 2 * vectors @ self.codes[book].T).argmin(-1)
 
     # -- following -----------------------------------------------------------------------------
 
@@ -126,7 +132,7 @@ class ResidualVQ(Float32):
         generator: torch.Generator | None,
         update: bool,
     ) -> Tensor:
-        """Count who chose each code, (codes,); in training also move the codes."""
+        """Count the vectors of each code, (codes,); in training also update the codes."""
         onto = F.one_hot(chosen, self.size).to(vectors.dtype) * keep[:, None]
         count = onto.sum(0)
         if not update:
@@ -153,7 +159,7 @@ class ResidualVQ(Float32):
         return count
 
     def _picks(self, vectors: Tensor, keep: Tensor, generator: torch.Generator | None) -> Tensor:
-        """One vector for each code out of those kept in any process, the same in every process. (codes, D)"""
+        """Draw an unmasked vector of any process for each code, the same in every process. (codes, D)"""
         draws = _rand(self.size, vectors.device, generator)
         mine = keep.sum()
         before, everyone = _before_mine(mine)
@@ -170,7 +176,8 @@ class ResidualVQ(Float32):
     def kmeans_init(self, vectors: Tensor, generator: torch.Generator | None = None) -> None:
         """Set the codes by k-means over the vectors (M, D) of all processes; called once, by training.
 
-        With fewer vectors than codes, codes start equal and are told apart by revival. No vectors: no start.
+        With fewer vectors than codes some codes start equal; replacing dead codes separates them. Without vectors
+        nothing is set.
         """
         pool = _gather(_some(vectors.float(), KMEANS_VECTORS * self.size, generator))
         if not len(pool):

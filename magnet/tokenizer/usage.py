@@ -13,7 +13,7 @@ def usage(counts: Tensor) -> Tensor:
 
 
 def perplexity(counts: Tensor) -> Tensor:
-    """How many codes, chosen equally often, would be as hard to guess. (..., codes) -> (...), from 1 to codes"""
+    """Perplexity of the codes chosen: exp of their entropy. (..., codes) -> (...), from 1 to codes"""
     share = counts.double() / counts.double().sum(-1, keepdim=True).clamp(min=1)
     return torch.special.entr(share).sum(-1).exp().float()
 

@@ -22,9 +22,9 @@ class Conv(nn.Module):
     Args:
         inputs: channels in.
         outputs: channels out.
-        kernel: steps seen; `kernel - stride` must be even unless causal.
-        stride: steps in for one step out.
-        dilation: distance of the steps seen.
+        kernel: width of the kernel; `kernel - stride` must be even unless causal.
+        stride: input steps for each output step.
+        dilation: distance of the input steps that a kernel reads.
         causal: an output sees nothing after the last of its own `stride` input steps.
     """
 
@@ -55,12 +55,12 @@ class ResidualBlock(nn.Module):
 
 
 def stack(width: int, depth: int, causal: bool) -> nn.Sequential:
-    """`depth` blocks, widest reach first. (B, T, C) -> same"""
+    """`depth` blocks, largest dilation first. (B, T, C) -> same"""
     return nn.Sequential(*[ResidualBlock(width, DILATION**i, causal) for i in reversed(range(depth))])
 
 
 class Upsample(nn.Module):
-    """Twice as many steps, each said twice. (B, T, C) -> (B, 2 T, C)"""
+    """Each step repeated: nearest-neighbour upsampling by 2. (B, T, C) -> (B, 2 T, C)"""
 
     def forward(self, x: Tensor) -> Tensor:
         return x.repeat_interleave(2, dim=1)
@@ -142,23 +142,31 @@ class VQVAE(nn.Module):
     def encode(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
         """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)
 
-        What is not known enters as the mean, whatever it holds.
+        What is not known is replaced by its mean.
         """
-        shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
-        seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
-        moved = torch.where(known[..., 1:], self.deltas.normalize(deltas.float()), 0.0)
-        inputs = torch.cat([seen, moved, shape], dim=-1)
+        inputs = self.encoder_inputs(pose, betas, deltas, known)
         if not inputs.numel():  # convolutions refuse nothing
             return inputs.new_zeros(len(pose), pose.shape[1] // self.stride, self.latent)
         return self.encoder(inputs.to(dtype_of(self.encoder))).float()
 
+    def encoder_inputs(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
+        """What the encoder sees at every frame. -> (B, T, pose + 19)"""
+        shape = self.betas.normalize(betas.float())[:, None].expand(-1, pose.shape[1], -1)
+        seen = torch.where(known[..., :1], self.pose.normalize(pose.float()), 0.0)
+        moved = torch.where(known[..., 1:], self.deltas.normalize(deltas.float()), 0.0)
+        return torch.cat([seen, moved, shape], dim=-1)
+
     def decode(self, latent: Tensor, betas: Tensor, deltas: Tensor, known: Tensor | None = None) -> Tensor:
         """(B, N, latent), (B, 10), (B, N, 4, 9), known (B, N, 4) bool -> (B, 4 N, pose), rotations not yet proper"""
+        inputs = self.decoder_inputs(latent, betas, deltas, known)
+        if not inputs.numel():
+            return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
+        return self.pose.denormalize(self.decoder(inputs.to(dtype_of(self.decoder))).float())
+
+    def decoder_inputs(self, latent: Tensor, betas: Tensor, deltas: Tensor, known: Tensor | None = None) -> Tensor:
+        """What the decoder sees at every token. -> (B, N, latent + 10 + 9 * stride)"""
         shape = self.betas.normalize(betas.float())[:, None].expand(-1, latent.shape[1], -1)
         moved = self.deltas.normalize(deltas.float())
         if known is not None:
             moved = torch.where(known[..., None], moved, 0.0)
-        inputs = torch.cat([latent, moved.flatten(-2), shape], dim=-1)
-        if not inputs.numel():
-            return inputs.new_zeros(len(latent), latent.shape[1] * self.stride, len(self.pose.mean))
-        return self.pose.denormalize(self.decoder(inputs.to(dtype_of(self.decoder))).float())
+        return torch.cat([latent, moved.flatten(-2), shape], dim=-1)

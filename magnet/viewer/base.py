@@ -16,6 +16,7 @@ from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start
+from magnet.viewer.timeline import Timeline, Tracks
 
 RATE = 30.0
 """Frames a second that are sent at most."""
@@ -25,6 +26,12 @@ CAMERAS = {"three quarters": (0.65, 0.30), "front": (0.0, 0.12), "side": (1.571,
 """Presets: azimuth about the vertical from +z and elevation, radians."""
 AIM = 0.85
 FIELD = 0.70
+TRACKS = 8
+"""People who have tracks; a crowd's would fill the window."""
+NOBODY_LOOKS = 1.0
+"""Seconds between two looks whether somebody has come."""
+ROOM = 0.75
+"""Metres around people's pelvises that the camera keeps in sight."""
 
 
 class ViewerBase:
@@ -63,10 +70,12 @@ class ViewerBase:
     # -- controls ------------------------------------------------------------------------------
 
     def add_timeline(self) -> None:
-        """Buttons and sliders of the clock."""
+        """Buttons of the clock, and its slider below the tracks of the people."""
         gui = self.server.gui
+        people = sum(len(view.take.slots) for view in self.views)
+        self.timeline = Timeline(self.server, self.clock.frames, min(people, TRACKS))
+        self.slider = self.timeline.slider
         with gui.add_folder("Time"):
-            self.slider = gui.add_slider("frame", 0, max(self.clock.frames - 1, 1), 1, 0)
             self.play = gui.add_button("Pause", icon="player-pause")
             steps = gui.add_button_group("step", ("|<", "-10", "-1", "+1", "+10", ">|"))
             speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
@@ -220,7 +229,10 @@ class ViewerBase:
                 for view in self.views:
                     view.show(frame)
                 self._follow(frame, jump)
+                self._keep_in_sight(frame)
                 self.slider.value = frame
+                if frame % 3 == 0 or jump or not self.clock.playing:
+                    self.timeline.show(self.tracks(), frame, self.clock.fps)
                 self.clock_text.content = self.caption(frame)
             self.shown = frame
             self.sent += 1
@@ -232,6 +244,35 @@ class ViewerBase:
             goal = middle * np.array([1.0, 0.0, 1.0])
             self.centre = goal if jump else self.centre + 0.08 * (goal - self.centre)
         self.root.position = tuple(float(-x) for x in self.centre)
+
+    def tracks(self) -> Tracks:
+        """What the timeline shows: the people of all takes, one after the other."""
+        known = [np.resize(view.take.known, (self.clock.frames, len(view.take.slots))) for view in self.views]
+        own = np.concatenate([view.own for view in self.views])
+        return Tracks(np.concatenate(known, axis=1)[:, :TRACKS], own[:TRACKS])
+
+    def places_in_sight(self, frame: int) -> Array:
+        """What must be seen: everybody's pelvis on the stage. -> (M, 3)"""
+        return np.concatenate([view.places(frame) for view in self.views])
+
+    def _keep_in_sight(self, frame: int) -> None:
+        """Move cameras away, on the line that they look along, where not everybody would be in the picture."""
+        if not self.follow:
+            return
+        away = self.places_in_sight(frame) - self.centre
+        reach = max(float(np.linalg.norm(away[:, [0, 2]], axis=1).max()) + ROOM, 1.2)
+        for client in self.server.get_clients().values():
+            camera = client.camera
+            if not camera.image_height:
+                continue  # it has not told yet how it looks
+            half = min(camera.fov / 2, float(np.arctan(np.tan(camera.fov / 2) * camera.aspect)))
+            aim = np.array([0.0, AIM, 0.0])
+            view = np.asarray(camera.position) - aim
+            far, needed = float(np.linalg.norm(view)), reach / float(np.sin(half))
+            if 1e-3 < far < needed:
+                with client.atomic():
+                    camera.position = aim + view * (needed / far)
+                    camera.look_at = aim
 
     def caption(self, frame: int) -> str:
         """What the panel says about a frame."""
@@ -260,11 +301,19 @@ class ViewerBase:
     def before_draw(self) -> None:
         """What happens between two frames."""
 
+    def watched(self) -> bool:
+        """Whether anybody looks; if not, time stands still and nothing is done."""
+        return bool(self.server.get_clients())
+
     def run(self, seconds: float | None = None) -> None:
         """Play until stopped, or for so many seconds."""
         begin = last = time.perf_counter()
         while not self._stop.is_set() and (seconds is None or last - begin < seconds):
             now = time.perf_counter()
+            if not self.watched():
+                self._stop.wait(NOBODY_LOOKS)
+                last = time.perf_counter()
+                continue
             with self.lock:
                 was = self.clock.playing
                 self.clock.tick(now - last)

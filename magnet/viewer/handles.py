@@ -43,7 +43,7 @@ HERE = -1
 
 
 def floor_handle(server: Any, name: str, goal: Goal, moved: Callable[[Goal], None], scale: float = 0.7) -> Any:
-    """Arrows on the floor and a ring that turns; whoever drags them has `moved` called."""
+    """Arrows on the floor and a ring that turns; dragging them calls `moved`."""
     handle = server.scene.add_transform_controls(
         name,
         scale=scale,
@@ -101,7 +101,7 @@ class Steering:
         moved(goal)
 
     def nobody(self) -> None:
-        """Steer nobody any more."""
+        """Stop steering."""
         self.who.value = NOBODY  # runs `_choose`
 
 

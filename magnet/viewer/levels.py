@@ -1,4 +1,4 @@
-"""The schedule's progress as a small picture: token time to the right, people down, noise as paleness."""
+"""A small picture of noise levels: token time to the right, people downwards, paler where noisier."""
 
 from __future__ import annotations
 

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from magnet.body.base import Body
+from magnet.export.page.rig import Array
 from magnet.export.page.takes import ShownTake, take
 from magnet.generation.live import Live, LiveChunk
+from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
+from magnet.viewer.guide import add_guide
 from magnet.viewer.handles import KeyframePanel, Steering
 from magnet.viewer.scene_view import RenderOptions, SceneView
+from magnet.viewer.timeline import Tracks
 from magnet.viewer.worker import Worker
 
+NOTHING = "from nothing"
 KINDS = ("none", "history", "self", "partner")
 WHAT = {
     "motion_control": "Choose whom to steer: the others answer to that person's way.",
@@ -31,6 +38,8 @@ class LiveApp(ViewerBase):
     Args:
         live: the engine; its model's people stand on `body`.
         ahead: frames generated ahead of what is seen.
+        examples: scenes to begin from, by name.
+        example: the one that `live` began from.
     """
 
     def __init__(
@@ -41,9 +50,12 @@ class LiveApp(ViewerBase):
         port: int = 8080,
         render: RenderOptions | None = None,
         ahead: int = 32,
+        examples: Mapping[str, Path] | None = None,
+        example: str | None = None,
     ) -> None:
         super().__init__(body, render or RenderOptions(), host, port, "magnet live")
-        self.live = live
+        self.live, self.examples = live, dict(examples or {})
+        self.example = example or NOTHING
         self.version = live.version
         self.clock = Clock(live.scene.frames, live.scene.fps, growing=True, loop=False)
         self.worker = Worker(live, ahead, self._refused, self._made)
@@ -53,12 +65,16 @@ class LiveApp(ViewerBase):
         with self.server.atomic():
             self._cast()
             self.frame_all()
+            add_guide(self.server)
             self.add_timeline()
             self._add_model()
             self.steering = Steering(self)
             self.keys = KeyframePanel(self)
             self.add_render_controls(ghosts=None)
             self.add_saving()
+        self.worker.paused = True  # until somebody looks
+        self.server.on_client_connect(self._rest)
+        self.server.on_client_disconnect(self._rest)
         self.draw()
         self.worker.start()
 
@@ -82,7 +98,7 @@ class LiveApp(ViewerBase):
         self.views[0].set_visible(True)
 
     def before_draw(self) -> None:
-        """Take in what has been generated meanwhile."""
+        """Add what has been generated meanwhile."""
         with self.lock:
             scene = self.live.scene
             if self.version != self.live.version:
@@ -97,6 +113,17 @@ class LiveApp(ViewerBase):
                 self.clock.frames = scene.frames
                 self.slider.max = scene.frames - 1
             self.worker.watch(self.clock.frame)
+
+    def tracks(self) -> Tracks:
+        """Those of everybody, with the keyframes."""
+        keys = tuple((key.agent, key.frame) for key in self.live.keys)
+        return dataclasses.replace(super().tracks(), keys=keys)
+
+    def places_in_sight(self, frame: int) -> Array:
+        """Everybody, and the handles of goals and keyframes."""
+        goals = [*self.live.settings.goals.values(), *(key.goal for key in self.live.keys)]
+        handles = np.array([[goal.x, 0.0, goal.z] for goal in goals]).reshape(-1, 3)
+        return np.concatenate([super().places_in_sight(frame), handles])
 
     def caption(self, frame: int) -> str:
         """What the panel says about a frame."""
@@ -143,6 +170,7 @@ class LiveApp(ViewerBase):
             block = gui.add_slider("tokens at a time", 1, 4, 1, 2, hint="a token is 4 frames")
             running = gui.add_checkbox("generate", True)
             number = gui.add_slider("how many people", 1, slots, 1, people)
+            example = gui.add_dropdown("example", (NOTHING, *self.examples), initial_value=self.example)
             anew = gui.add_button("Start anew", icon="refresh")
             again = gui.add_button("Restart from this frame", icon="player-track-prev")
 
@@ -163,7 +191,8 @@ class LiveApp(ViewerBase):
             try:
                 self.steering.nobody()
                 self.keys.clear()
-                self.live.begin(int(number.value))
+                start = None if example.value == NOTHING else Scene.load(self.examples[example.value])
+                self.live.begin(int(number.value), start)
                 with self.lock:
                     self.again = 0
                     self.clock.play(True)
@@ -180,7 +209,13 @@ class LiveApp(ViewerBase):
 
         for control in (task, steps, kind, weight, smooth, offset, block, running):
             control.on_update(apply)
+
+        def many(_: Any) -> None:
+            example.value = NOTHING  # an example has as many people as it has
+
         anew.on_click(begin)
+        example.on_update(lambda event: begin(event) if event.client_id is not None else None)
+        number.on_update(many)
         again.on_click(restart)
         self.apply, self.task, self.running = apply, task, running
         apply()
@@ -190,8 +225,8 @@ class LiveApp(ViewerBase):
         super().set_loop(on)
         self._rest()
 
-    def _rest(self) -> None:
-        self.worker.paused = self.clock.loop or not self.running.value
+    def _rest(self, _: Any = None) -> None:
+        self.worker.paused = self.clock.loop or not self.running.value or not self.watched()
         self.worker.wake()
 
     def steered(self, agent: int) -> None:

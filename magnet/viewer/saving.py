@@ -12,8 +12,8 @@ from magnet.export import formats
 from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
 
-FORMATS = tuple(suffix.removeprefix(".") for suffix in formats.WRITTEN)
-"""What a take can be saved as."""
+FORMATS = tuple(s.removeprefix(".") for s in formats.WRITTEN if s not in (".fbx", *formats.USD))
+"""What a take can be saved as; what needs Blender, or a package that few have, is written by `magnet export`."""
 
 
 def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:

@@ -133,11 +133,15 @@ class SceneView:
         frames = torch.from_numpy(np.clip(now + back, 0, None))
         return scene.T_world_root[0, frames, :, :3, 3].cpu().numpy()
 
-    def centre(self, frame: int) -> Array:
-        """Middle of the group on the stage. -> (3,)"""
+    def places(self, frame: int) -> Array:
+        """Pelvises on the stage. -> (P, 3)"""
         scene = self.take.scene
         at = min(frame, scene.frames - 1)
-        return scene.T_world_root[0, at, :, :3, 3].mean(dim=0).cpu().numpy() + self.offset
+        return scene.T_world_root[0, at, :, :3, 3].cpu().numpy() + self.offset
+
+    def centre(self, frame: int) -> Array:
+        """Middle of the group on the stage. -> (3,)"""
+        return self.places(frame).mean(axis=0)
 
     def set_visible(self, on: bool) -> None:
         """Leave the stage, or come back."""

@@ -110,7 +110,6 @@ def walked(local: np.ndarray) -> Iterator[np.ndarray]:
 
 
 WRONG = {
-    ("duet.npz", "out.fbx"): "nothing writes .fbx; .*let Blender convert it",
     ("duet.npz", "out.xyz"): r"nothing writes .xyz; use .npz, .bvh",
     ("none.npz", "out.glb"): "none.npz: no such file",
     ("duet.npz", "out.glb", "--person", "2"): "--person 2: the scene has 0, 1",

@@ -85,7 +85,7 @@ def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
     ("words", "message"),
     [
         ("BVH", "say where to: --out FILE"),
-        ("BVH --out a.fbx", "nothing writes .fbx"),
+        ("BVH --out a.obj", "nothing writes .obj"),
         ("BVH --out a.npz --context 400", "the files hold 48 frames"),
         ("BVH --out a.npz --people 1", "expected at least 2, as many as IN holds"),
         ("BVH --out a.npz --people 3", "joint_future reads motion of person 2, of whom no file tells"),

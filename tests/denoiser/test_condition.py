@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from magnet.api import Model
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
+from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene, concatenate
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
@@ -79,6 +82,48 @@ def test_samples_follow_it_too_for_whole_scenes_and_for_each_step(taught):
         truth = model.normalizer.normalize(model.tokenize(scene)[0])
         away = (tokens[:, None] - truth)[..., own].square().flatten(2).mean(-1)
         assert away.argmin(dim=1).tolist() == [0, 0, 1, 1], "two samples of each"
+
+
+@pytest.mark.parametrize("name", ["generation", "agentic_sync"])
+def test_classifier_free_guidance_is_what_two_runs_of_the_network_say(taught, name: str, monkeypatch):
+    """In one batch, for every view: weight 0 is the condition alone, and a scene without one is not guided."""
+    model, scene = taught
+    cond, context = torch.tensor([[1.0], [torch.nan]]), 0 if name == "generation" else 8
+
+    def made(weight: float) -> Scene:
+        options = SamplerOptions(steps=3, guidance=Guidance(cond_weight=weight))
+        generator = torch.Generator().manual_seed(2)
+        stats = SamplingStats()
+        out = generate(model, scene, registry.get(name)(), context, FRAMES - context, 1, options, generator,
+                       stats=stats, cond=cond)  # fmt: skip
+        evaluations.append(stats.evaluations)
+        return out
+
+    evaluations: list[float] = []
+    alone, guided = made(0.0), made(1.5)
+    assert evaluations[1] == 2 * evaluations[0]
+    denoise = model.denoise
+
+    def by_hand(noisy, levels, present, cond, *rest):
+        told, untold = denoise(noisy, levels, present, cond, *rest), denoise(noisy, levels, present, None, *rest)
+        return told + 1.5 * (told - untold)
+
+    monkeypatch.setattr(model, "denoise", by_hand)
+    expected = made(0.0)
+    torch.testing.assert_close(guided.T_world_root, expected.T_world_root, rtol=0, atol=1e-4)
+    torch.testing.assert_close(guided.T_world_root[1], alone.T_world_root[1], rtol=0, atol=1e-4)
+    assert (guided.T_world_root[0] - alone.T_world_root[0]).abs().max() > 1e-3
+
+
+def test_guidance_by_a_condition_needs_one_and_models_pass_it_on(taught):
+    denoiser, scene = taught
+    model = Model(denoiser, SamplerOptions(steps=2, guidance=Guidance(cond_weight=1.0)))
+    with pytest.raises(ValueError, match=r"guidance.cond_weight: got 1 and no condition to guide by; give `cond`"):
+        model.generate(people=2, frames=FRAMES, seed=0)
+    one, other, again = (model.generate(2, FRAMES, seed=0, cond=torch.tensor([[x]])) for x in (1.0, -1.0, 1.0))
+    assert torch.equal(one.T_world_root, again.T_world_root) and not torch.equal(one.T_world_root, other.T_world_root)
+    longer = [model.continue_(scene.select([0]), 8, seed=0, cond=torch.tensor([[x]])) for x in (1.0, -1.0)]
+    assert not torch.equal(longer[0].T_world_root, longer[1].T_world_root)
 
 
 def test_conditions_of_steps_behind_the_last_are_none(taught):

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from magnet.denoiser.options import SelfForcing
-from magnet.denoiser.self_forcing import with_self_forcing
-from magnet.motion.frames import from_9d, propagate_pairwise
+from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
+from magnet.motion.frames import canonical_frame, from_9d, inverse, propagate_pairwise
 from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.testing import random_scene, tiny_denoiser
 
@@ -73,3 +73,50 @@ def test_the_share_counts_scenes_and_the_seed_decides_which(model, scene):
     assert 0.15 < changed.double().mean() < 0.45
     assert torch.equal(made, shown(model, many, levels, share=0.3)[1])
     assert torch.equal(shown(model, many, levels, share=0.0)[1], truth)
+
+
+def test_displaced_people_come_back_and_their_poses_stay(scene):
+    long = random_scene(16, 160, 2, torch.Generator().manual_seed(0))
+    moved = displaced_at_first(long, 0.5, torch.Generator().manual_seed(1))
+    assert torch.equal(moved.body_rot, long.body_rot)
+    off = canonical_frame(moved.T_world_root)[..., :3, 3] - canonical_frame(long.T_world_root)[..., :3, 3]
+    assert torch.equal(moved.T_world_root[..., 1, 3], long.T_world_root[..., 1, 3])
+    far = off.norm(dim=-1)  # (B, T, P)
+    changed = far[:, 0, 0] > 0
+    assert 3 <= int(changed.sum()) <= 13
+    assert float(far[~changed].max()) == 0
+    assert 0.03 < float(far[changed, 0].mean()) < 0.3
+    assert bool((far.diff(dim=1) < 1e-5).all()), "nobody goes further away"
+    assert float(far.diff(dim=1).abs().max()) < 0.02, "nobody jumps"
+
+
+def test_displaced_people_turn_about_themselves(scene):
+    moved = displaced_at_first(scene, 1.0, torch.Generator().manual_seed(1))
+    turned = inverse(scene.T_world_root) @ moved.T_world_root
+    assert float(turned[:, 0, :, 0, 0].max()) < 1 - 1e-5  # everybody is turned
+    up = scene.T_world_root[..., 1, :3] - moved.T_world_root[..., 1, :3]
+    assert float(up.abs().max()) < 1e-5  # about the vertical
+
+
+def test_no_share_changes_nothing(scene):
+    assert displaced_at_first(scene, 0.0, torch.Generator().manual_seed(1)) is scene
+
+
+def test_made_pasts_replace_a_share_and_do_not_count(model, scene):
+    made = MadePasts(scene.select([0, 1]), PAST, 0.5)
+    batch = random_scene(32, 4 * N, 3, torch.Generator().manual_seed(5))
+    mixed, own = with_made_pasts(batch, made, torch.Generator().manual_seed(1))
+    count = int(own[:, 0].sum())
+    assert 8 <= count <= 24
+    assert torch.equal(own.sum(dim=1), torch.cat([torch.zeros(32 - count), torch.full((count,), PAST)]).long())
+    kept = {x.tobytes() for x in mixed.betas[: 32 - count].numpy()}
+    assert kept <= {x.tobytes() for x in batch.betas.numpy()}
+    assert all(any(torch.equal(row, each) for each in scene.T_world_root[:2]) for row in mixed.T_world_root[-count:])
+
+
+def test_what_the_model_made_is_shown_clean_and_does_not_count(model, scene):
+    generator = torch.Generator().manual_seed(3)
+    all_made = model.losses(scene, generator, torch.ones(4, N, dtype=torch.bool))
+    assert float(all_made["latent"]) == float(all_made["delta"]) == float(all_made["pairwise"]) == 0
+    half = torch.arange(N).expand(4, N) < PAST
+    assert float(model.losses(scene, generator, half)["latent"]) > 0

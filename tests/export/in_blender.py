@@ -1,8 +1,8 @@
 """Run by Blender's Python, which knows nothing of magnet: where Blender puts bones and vertices of a file.
 
-    python in_blender.py FILE.glb|.bvh|.fbx OUT.json FRAME,FRAME... [AS.fbx]
+    python in_blender.py FILE.glb|.bvh|.fbx OUT.json FRAME,FRAME...
 
-Positions are turned from Blender's z up to y up. With AS.fbx the file is converted as docs/export.md says.
+Positions are turned from Blender's z up to y up.
 """
 
 import json
@@ -43,17 +43,9 @@ def seen(first: int, frames: list[int]) -> dict:
 
 
 def main() -> None:
-    path, out, frames, *fbx = sys.argv[1:]
+    path, out, frames = sys.argv[1:]
     opened(path)
     Path(out).write_text(json.dumps(seen(0 if path.endswith(".glb") else 1, [int(f) for f in frames.split(",")])))
-    if fbx:
-        bpy.context.scene.frame_end = int(max(action.frame_range[1] for action in bpy.data.actions))
-        bpy.ops.export_scene.fbx(
-            filepath=fbx[0],
-            object_types={"ARMATURE", "MESH"},
-            add_leaf_bones=False,
-            bake_anim_simplify_factor=0.0,
-        )
 
 
 main()

@@ -27,12 +27,14 @@ def test_what_can_be_read_back_holds_the_same_joints(name, smplx, duet: Scene, b
     assert (body.joints(got.scene) - body.joints(duet)).abs().max() < 1e-3
 
 
-@pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s not in (".mp4",)])
+@pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s not in (".mp4", ".fbx")])
 def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_path: Path):
+    if suffix in formats.USD:
+        pytest.importorskip("pxr", reason="usd-core is not installed")
     written = formats.write(duet.slice(0, 3), tmp_path / f"deep/a{suffix}", body, style="skeleton")
     assert written and all(path.exists() and path.suffix == suffix for path in written)
     begins = {".npz": b"PK", ".bvh": b"HIERARCHY", ".glb": b"glTF", ".csv": b"scene,frame", ".gif": b"GIF89a",
-              ".webp": b"RIFF", ".png": b"\x89PNG"}  # fmt: skip
+              ".webp": b"RIFF", ".png": b"\x89PNG", ".usdc": b"PXR-USDC", ".usda": b"#usda"}  # fmt: skip
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
@@ -124,8 +126,8 @@ def test_what_cannot_be_read_or_written_is_named(duet: Scene, body: Body, tmp_pa
     for paths in ([], ["a.glb"], ["a.npz", "b.bvh"]):
         with pytest.raises(ValueError, match=r"expected \.npz or \.bvh files, all of one kind"):
             formats.read(paths)
-    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.fbx'; use \.npz"):
-        formats.write(duet, tmp_path / "a.fbx", body)
+    with pytest.raises(ValueError, match=r"cannot write a file with suffix '\.obj'; use \.npz"):
+        formats.write(duet, tmp_path / "a.obj", body)
     formats.write(duet.repeat(2), tmp_path / "two.npz", body)
     with pytest.raises(ValueError, match="holds 2 scenes; several files are several people"):
         formats.read([tmp_path / "two.npz", tmp_path / "two.npz"])
@@ -201,4 +203,4 @@ def test_a_new_format_is_a_function_and_a_line(duet, tmp_path, body, monkeypatch
     assert cli.main(["export", str(scene), str(tmp_path / "b.way")]) == 0
     assert len((tmp_path / "b.way").read_text().split()) == duet.agents
     with pytest.raises(ValueError, match=r"use .*\.way"):
-        formats.write(duet, tmp_path / "a.fbx", body)
+        formats.write(duet, tmp_path / "a.obj", body)

@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_glb
+from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.export.glb import influences, linear, unbroken, vertex_normals
+from magnet.export.naming import recognised
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -49,8 +51,7 @@ class Opened:
     def world(self, seconds: float) -> list[Floats]:
         """World matrix of every node at a time."""
         moved: dict[tuple[int, str], Floats] = {}
-        (animation,) = self.gltf.animations
-        for channel in animation.channels:
+        for animation, channel in [(each, channel) for each in self.gltf.animations for channel in each.channels]:
             sampler = animation.samplers[channel.sampler]
             times, values = self.numbers(sampler.input)[:, 0], self.numbers(sampler.output)
             at = np.clip(seconds, times[0], times[-1])
@@ -91,18 +92,52 @@ class Opened:
         return (blended @ np.concatenate([rest, np.ones((len(rest), 1))], axis=1)[..., None])[:, :3, 0]
 
 
-def test_joints_and_skin_are_the_bodys_within_a_tenth_of_a_millimetre(trio: Scene, body: Body, tmp_path: Path):
-    opened = Opened(save_glb(trio, tmp_path / "trio.glb", body))
+@pytest.mark.parametrize(
+    "bones",
+    [BoneOptions(), BoneOptions("vrm", root="none"), BoneOptions("mixamo", clips="person")],
+    ids=lambda bones: f"{bones.names}-{bones.root}-{bones.clips}",
+)
+def test_joints_and_skin_are_the_bodys_within_a_tenth_of_a_millimetre(
+    trio: Scene, body: Body, tmp_path: Path, bones: BoneOptions
+):
+    opened = Opened(save_glb(trio, tmp_path / "trio.glb", body, bones))
+    assert [clip.name for clip in opened.gltf.animations] == (
+        ["motion"] if bones.clips == "scene" else ["person_0", "person_1", "person_2"]
+    )
     joints, vertices = body.joints(trio)[0].numpy(), body.vertices(trio)[0]
     assert [node.name for node in opened.people()] == [f"person_{p}_body" for p in range(3)]
     for frame in (0, 11, 23):
         matrices = opened.world(frame / 30)
         for person, node in enumerate(opened.people()):
             skin = opened.gltf.skins[node.skin]
-            assert [opened.gltf.nodes[j].name for j in skin.joints] == list(JOINT_NAMES)
-            found = np.stack([matrices[j][:3, 3] for j in skin.joints])
+            names = [opened.gltf.nodes[j].name for j in skin.joints]
+            assert names == [*bone_names(bones.names), *(["root"] if bones.root == "floor" else [])]
+            found = np.stack([matrices[j][:3, 3] for j in skin.joints[:22]])
             assert np.abs(found - joints[frame, person]).max() < 1e-4
             assert np.abs(opened.skinned(node, matrices) - vertices[frame, person].numpy()).max() < 1e-4
+
+
+def test_the_root_bone_walks_on_the_floor_and_faces_where_the_pelvis_does(trio: Scene, body: Body, tmp_path: Path):
+    opened = Opened(save_glb(trio, tmp_path / "trio.glb", body))
+    roots = [number for number, node in enumerate(opened.gltf.nodes) if node.name == "root"]
+    assert len(roots) == 3
+    for frame in (0, 23):
+        matrices = opened.world(frame / 30)
+        for person, number in enumerate(roots):
+            T_world_pelvis = trio.T_world_root[0, frame, person].numpy()
+            assert np.abs(matrices[number][[0, 2], 3] - T_world_pelvis[[0, 2], 3]).max() < 1e-5
+            assert np.abs(matrices[number][1, :3] - [0, 1, 0]).max() < 1e-6 and abs(matrices[number][1, 3]) < 1e-6
+            left = T_world_pelvis[[0, 2], 0] / np.linalg.norm(T_world_pelvis[[0, 2], 0])
+            assert np.abs(matrices[number][[0, 2], 0] - left).max() < 1e-4
+
+
+@pytest.mark.parametrize("names", ["smplx", "vrm", "mixamo"])
+def test_names_of_bones_are_understood_by_the_reader_of_other_programs_files(names: Any):
+    found = bone_names(names)
+    assert len(set(found)) == 22
+    recognised_as = recognised(list(found)).joints
+    needed = {j for j, name in enumerate(JOINT_NAMES) if name.split("_")[-1] in ("hip", "knee", "ankle", "elbow")}
+    assert needed and all(recognised_as[j] == j for j in needed)
 
 
 def test_there_is_a_keyframe_for_every_frame(trio: Scene, body: Body, tmp_path: Path):
@@ -110,7 +145,7 @@ def test_there_is_a_keyframe_for_every_frame(trio: Scene, body: Body, tmp_path: 
     (animation,) = opened.gltf.animations
     times = opened.numbers(animation.samplers[0].input)[:, 0]
     assert np.abs(times - np.arange(24) / 30).max() < 1e-6
-    assert len(animation.channels) == 3 * 23
+    assert len(animation.channels) == 3 * (2 + 23)  # of the bone on the floor: where it is and where it faces
     assert all(opened.gltf.accessors[sampler.output].count == 24 for sampler in animation.samplers)
 
 
@@ -148,6 +183,8 @@ def test_trimesh_opens_it_and_finds_everybody_at_rest(trio: Scene, body: Body, t
     opened = trimesh.load(save_glb(trio, tmp_path / "trio.glb", body))
     assert sorted(opened.geometry) == [f"person_{p}_body" for p in range(3)]
     resting = body.v_template + torch.einsum("vck,pk->pvc", body.shapedirs, trio.betas[0])
+    lowest = resting[..., 1].amin(dim=1)
+    resting[..., 1] -= lowest[:, None]  # everybody stands on the floor at rest
     for person in range(3):
         mesh = opened.geometry[f"person_{person}_body"]
         assert mesh.faces.shape == tuple(body.faces.shape) and mesh.is_watertight
@@ -156,7 +193,7 @@ def test_trimesh_opens_it_and_finds_everybody_at_rest(trio: Scene, body: Body, t
     nodes = {name: opened.graph.get(name)[0][:3, 3] for name in opened.graph.nodes}
     for person, rest in enumerate(body.rest_joints(trio.betas[0]).numpy()):
         there = np.stack([nodes[f"{name}_{person}" if person else name] for name in JOINT_NAMES])
-        assert np.abs(there - rest).max() < 1e-5
+        assert np.abs(there - rest - [0, -float(lowest[person]), 0]).max() < 1e-5
 
 
 def test_weights_sum_to_one_exactly(body: Body):

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from magnet.cli import main, view
+from magnet.cli.view import arguments_of, sampler_options
 from magnet.export.page.rig import VIEWS
 from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
 from magnet.viewer import server
 
 
@@ -126,3 +128,12 @@ def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
     assert main(["view", str(path), "--record", str(tmp_path / "r.npz"), "--html", str(tmp_path / "a.html")]) == 2
     assert "record first" in capsys.readouterr().err
     assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_live_begins_so_that_it_holds_unless_something_is_said() -> None:
+    """Steady and apart from the couple that comes along; a sampler that is named is taken as it is."""
+    assert sampler_options(arguments_of(["--live"])) == SamplerOptions.preset("steady", steps=10, apart="light")
+    assert sampler_options(arguments_of(["--live", "--steps", "16"])).steps == 16
+    assert sampler_options(arguments_of(["--live", "--sampler", "paper"])) == SamplerOptions.preset("paper")
+    assert sampler_options(arguments_of(["a.npz", "--record", "b.npz"])) == SamplerOptions(steps=10)
+    assert arguments_of(["--live"]).people is None

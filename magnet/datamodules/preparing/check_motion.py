@@ -1,4 +1,4 @@
-"""What no recording of people can be: the wrong units, up axis or frame rate, found in the motion itself."""
+"""Wrong units, up axes and frame rates, found in the motion itself."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def usable(recording: Recording) -> Bools:
 
 
 def filled(array: Array, valid: Bools) -> Array:
-    """Frames that are not valid hold a valid one's numbers, the last before or else the first. (T, P, ...)"""
+    """Fill invalid frames with the last valid frame before them, or else the first one. (T, P, ...)"""
     if valid.all():
         return array
     T = len(valid)
@@ -89,7 +89,7 @@ def filled(array: Array, valid: Bools) -> Array:
 
 
 def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
-    """Axis-angle vectors (T, P, 22, 3) are in radians.
+    """Check that axis-angle vectors (T, P, 22, 3) are in radians.
 
     Raises:
         DataError: too many are longer than a full turn; says where the longest is.
@@ -123,7 +123,7 @@ def up_vector(joints: Array, valid: Bools) -> Array:
 
 
 def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) -> None:
-    """The declared up axis is the one along which heads are over ankles, of all six. joints: (T, P, 22, 3)
+    """Check that heads are above ankles along the declared up axis. joints: (T, P, 22, 3)
 
     Args:
         declared: by the reader, or by the user.
@@ -153,7 +153,7 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
 
 
 def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
-    """Translations are in metres, as the bodies are that they move. joints (T, P, 22, 3), pelvis (T, P, 3), y up
+    """Check that translations are in metres, as bodies are. joints (T, P, 22, 3), pelvis (T, P, 3), y up
 
     Raises:
         DataError: people are too far from each other, from the floor or from where they were.
@@ -177,7 +177,7 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
 
 
 def check_apart(transl: Array, valid: Bools) -> None:
-    """Translations (T, P, 3), before shapes put pelvises in different places, keep people apart.
+    """Check that translations (T, P, 3) alone keep people apart, before their shapes move pelvises.
 
     Raises:
         DataError: they put everybody into one place.
@@ -191,7 +191,7 @@ def check_apart(transl: Array, valid: Bools) -> None:
 
 
 def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
-    """Positions (T, P, M, 3) are in metres: trunks have a person's length.
+    """Check that positions (T, P, M, 3) are in metres: trunks have a person's length.
 
     Raises:
         DataError: they have not, or hips and shoulders are not among the joints.
@@ -214,7 +214,7 @@ def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
 
 
 def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
-    """Frames at which somebody is suddenly elsewhere. pelvis (T, P, 3) -> (number,) first frame after each jump
+    """Frames at which somebody jumps elsewhere. pelvis (T, P, 3) -> (number,) first frame after each jump
 
     Raises:
         DataError: there are so many that speeds themselves are wrong.
@@ -232,7 +232,7 @@ def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
 
 
 def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None:
-    """People move as fast as people do, so that the declared frame rate is the true one. joints of `WALKING`, y up
+    """Check the declared frame rate by how fast people move. joints of `WALKING`, y up
 
     A rate that is too high shows in the pelvis, in drops faster than falling, and in short footsteps; one that is too
     low shows in long footsteps alone, where somebody walks.

@@ -1,7 +1,7 @@
-"""What is wrong with one person for some frames although every number is finite: found by person and frame.
+"""Faults of one person in some frames although every number is finite.
 
-Bodies that nobody has, numbers far beyond any motion, everything at zero, somebody who is frozen while the others
-move, joints that jump. Takes keep their other frames.
+Impossible bodies, numbers far beyond any motion, everything at zero, somebody who is frozen while the others move,
+joints that jump. Takes keep their other frames.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ AGAIN = "leave the take out, or take the file as it was published"
 
 @dataclass(frozen=True)
 class Flag:
-    """One person for some frames: what is wrong with them there."""
+    """A fault of one person during some frames."""
 
     person: int
     start: int
@@ -70,10 +70,10 @@ def who(person: int, names: Sequence[str]) -> str:
 
 
 def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
-    """Shape numbers (P, 10) are somebody's.
+    """Check that shape numbers (P, 10) are possible.
 
     Raises:
-        DataError: one is further from the mean than anybody's.
+        DataError: one is too far from the mean.
     """
     size = np.abs(betas).max(axis=1)
     if wrong := np.flatnonzero(~(size <= SHAPE)).tolist():
@@ -85,7 +85,7 @@ def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
 
 
 def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
-    """Bodies at rest (P, 22, 3) are of a size that people have.
+    """Check that bodies at rest (P, 22, 3) have a possible size.
 
     Raises:
         DataError: one is not.
@@ -102,7 +102,7 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
 
 
 def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
-    """Frames that are still valid, less those whose numbers are no motion; and which these are.
+    """Valid frames without those whose numbers are no motion, and flags for the latter.
 
     Args:
         recording: as read.
@@ -153,7 +153,7 @@ def _far(places: Array) -> Bools:
 
 
 def frozen(still_place: Bools, still_pose: Bools, valid: Bools) -> list[Flag]:
-    """Who is held where others move.
+    """Flags people who are held still while others move.
 
     Args:
         still_place: (T - 1, P) whether the pelvis is where it was in the frame before.

@@ -1,4 +1,4 @@
-"""One take of a download to one part on disk: what the worker processes of `prepare` do."""
+"""One take of a download converted to one part on disk: the work of `prepare`'s processes."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class PrepareJob:
 
 
 def content(value: Any) -> str:
-    """An option's value as text: of a file or folder what it is called and holds, so that its place is no part of it.
+    """An option's value as text; of a file or folder its name and content, but not where it lies.
 
     Raises:
         ValueError: no such file or folder.
@@ -148,7 +148,8 @@ def content(value: Any) -> str:
 
 
 def take_key(take: Take, root: Path, settings: dict[str, Any]) -> str:
-    """Name of a take's part: another size or time of a file, one that came or went, another setting: another part."""
+    """Name of a take's part. It changes with the sizes and times of its files, with files that come or go, and with
+    settings."""
     files: list[list[str | int]] = []
     for path in (*take.files, *take.also):
         try:
@@ -163,7 +164,7 @@ def take_key(take: Take, root: Path, settings: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class ConvertedTake:
-    """What one take became."""
+    """The result of converting one take."""
 
     error: str | None
     notes: tuple[str, ...]
@@ -182,7 +183,7 @@ class ConvertedTake:
         )
 
     def save(self, path: Path) -> None:
-        """All of it or nothing."""
+        """Write it, all or nothing."""
         facts = {name: getattr(self, name) for name in ("error", "notes", "names", "frames", "people", "persons")}
         text = np.array(json.dumps(facts))
 

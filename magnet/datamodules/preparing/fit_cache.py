@@ -1,4 +1,4 @@
-"""Whole takes fitted to a body once, each a file in a folder, named by all that it was made from."""
+"""Cache of whole takes fitted to a body: a file per take, whose name holds a hash of all that it was made from."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class FitCache:
         return Scene.load(self.file(take)) if self.file(take).exists() else None
 
     def lacking(self, takes: Sequence[Take]) -> list[Take]:
-        """Those of which it is not known what becomes of them."""
+        """Those that have neither a fit nor an error yet."""
         return [take for take in takes if not (self.file(take).exists() or "error" in self.report(take))]
 
     def fill(self, title: str, takes: Sequence[Take]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""People recorded with gendered bodies, as people of the one body that trains."""
+"""Shapes of gendered bodies converted to the one body of training."""
 
 from __future__ import annotations
 

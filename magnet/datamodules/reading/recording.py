@@ -1,4 +1,4 @@
-"""What a data set's reader gives: takes as its files hold them, before `canonicalize`."""
+"""Readers of data sets and what they give: takes as files hold them, before `canonicalize`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class PosedSkeleton(Protocol):
 
 
 class FitHints(Protocol):
-    """What a recording knows of joints besides their places; it depends on the body that is fitted."""
+    """What a recording tells of the rotations of joints; it depends on the body that is fitted."""
 
     def __call__(self, rest: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations from a body's rest pose, and weights of the positions.

@@ -1,4 +1,4 @@
-"""One person of ReMoCap: joint positions in a csv file, and the proof that joints and units are what they seem."""
+"""One person of ReMoCap: joint positions in a csv file, and the check of its joints and units against the BVH."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _misfit(header: BvhSkeleton, table: _Table) -> float:
 
 
 def _proof(folder: Path, header: BvhSkeleton, table: _Table, scale: float) -> str:
-    """Find the Euler order by which rotations and offsets lead to the positions.
+    """Find the Euler order with which rotations and offsets give the positions.
 
     Raises:
         DataError: none leads there within 1 cm.

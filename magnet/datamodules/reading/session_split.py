@@ -1,4 +1,4 @@
-"""Sessions to train, val and test so that each number of people has its share of each split: whole sessions only."""
+"""Whole sessions divided into train, val and test so that each split has its share of every number of people."""
 
 from __future__ import annotations
 

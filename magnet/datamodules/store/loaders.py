@@ -23,7 +23,7 @@ Cursor = tuple[int, int]
 
 
 class Prefetcher:
-    """Batches that threads begin before they are asked for. What is asked for decides; what was begun in vain is lost.
+    """Computes batches in threads before they are asked for. Those that are never asked for are dropped.
 
     Args:
         make: a cursor's batch; depends on the cursor alone, and may be called by several threads at once.
@@ -37,7 +37,7 @@ class Prefetcher:
         self.threads: ThreadPoolExecutor | None = None
 
     def get(self, cursor: Cursor) -> Any:
-        """The batch of a cursor. Whatever went wrong when it was made is raised here."""
+        """The batch of a cursor. An error while it was made is raised here."""
         if self.begun and self.begun[0][0] != cursor:  # a state was loaded
             self._forget()
         self._begin(cursor, 1)
@@ -50,7 +50,7 @@ class Prefetcher:
             raise
 
     def close(self) -> None:
-        """End the threads, once they have done what they are at; the next batch that is asked for begins new ones."""
+        """End the threads after their current batches; the next batch that is asked for starts new ones."""
         self._forget()
         if self.threads is not None:
             self.threads.shutdown()
@@ -62,7 +62,7 @@ class Prefetcher:
         self.begun.clear()
 
     def _begin(self, cursor: Cursor, count: int) -> None:
-        """Have so many batches under way."""
+        """Begin batches until `depth` are in progress."""
         self.threads = self.threads or ThreadPoolExecutor(self.depth, thread_name_prefix="read-ahead")
         while len(self.begun) < count:
             cursor = self.after(self.begun[-1][0]) if self.begun else cursor

@@ -94,7 +94,7 @@ class SplitData:
 
 @dataclass(frozen=True)
 class RawBatch:
-    """A batch as it lies on disk: what one process reads ahead, and another device decodes."""
+    """A batch as it lies on disk: read ahead on the CPU, decoded on the device."""
 
     windows: WindowIndex
     raw: Tensor  # (B, T, P, bytes of a row) uint8
@@ -112,7 +112,7 @@ class MappedStore(MemoryStore):
     Args:
         data: the clips; at least one.
         max_agents: slots P of every batch.
-        spread: let each process read a length of every source of its own, where there are enough clips.
+        spread: let each process read its own part of every source, where there are enough clips.
 
     Raises:
         ValueError: a clip has more people than slots.
@@ -152,10 +152,10 @@ class MappedStore(MemoryStore):
         return self.bad[clip] if clip in self.bad else np.ones(int(self.length[clip]), dtype=bool)
 
     def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
-        """Which process reads each clip: every source cut into equally likely lengths, one a process. (C,)
+        """Which process reads each clip: every source is cut into parts of equal probability, one per process. (C,)
 
-        A process reads from the shards of its lengths alone, of which it shares the first and the last with its
-        neighbours. None where clips are too few for loads within a tenth of each other: then all draw from all.
+        A process reads the shards of its parts alone, and shares the first and the last with its neighbours. None
+        where clips are too few for loads that differ by less than a tenth: then all processes draw from all clips.
         """
         owner = np.zeros(len(mass), dtype=np.int64)
         for source in set(self.sources):

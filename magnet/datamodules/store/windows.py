@@ -1,4 +1,4 @@
-"""Which windows a batch shows: random ones to train on, fixed ones to score, composed ones of either kind."""
+"""Windows of a batch: random ones for training, fixed ones for evaluation, composed ones of either kind."""
 
 from __future__ import annotations
 

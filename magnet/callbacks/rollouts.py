@@ -1,0 +1,164 @@
+"""Pasts that the model has really made, with recorded continuations behind them, for training to go on from."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from magnet.baselines.nearest_neighbour import NearestNeighbour
+from magnet.checks import require_number, require_whole
+from magnet.denoiser.module import Denoiser
+from magnet.denoiser.self_forcing import MadePasts
+from magnet.generation.blending import smoothstep
+from magnet.generation.rollout import generate
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
+from magnet.motion.resample import slerp
+from magnet.motion.scene import Scene, cat_time, concatenate
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.options import SamplerOptions
+from magnet.seeding import derive
+from magnet.tasks import registry
+
+COMPARED = 16
+"""Frames at the end of a made past that the recorded continuation is chosen by."""
+
+BLEND = 8
+"""Frames over which poses go over from the made past to the recorded continuation."""
+
+
+class RollOuts(Callback):
+    """Rolls the model out now and then, and lets training go on from what it made (ours).
+
+    A model that has only seen recorded pasts does not know what to do where it has led people itself. So some scenes of
+    the batch are continued by the sampler over several windows; behind the last of it comes the training stretch whose
+    beginning is nearest, moved there, with what still differs eased out. Such scenes replace a share of the batch. The
+    made past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.)
+
+    Args:
+        share: of the batch's scenes.
+        every: training steps from one roll-out to the next.
+        scenes: how many are rolled out at a time.
+        frames: fewest and most frames that are rolled out.
+        steps: denoising steps of the sampler.
+        return_frames: over so many frames people come back to where the recorded continuation has them.
+        stretches: how many training stretches are kept to choose from.
+    """
+
+    def __init__(
+        self,
+        share: float = 0.25,
+        every: int = 200,
+        scenes: int = 24,
+        frames: tuple[int, int] = (32, 128),
+        steps: int = 8,
+        return_frames: int = 32,
+        stretches: int = 2000,
+    ) -> None:
+        require_number("share", share, 0, 1)
+        counts = {"every": every, "scenes": scenes, "steps": steps, "stretches": stretches}
+        for name, value in {**counts, "return_frames": return_frames, "frames": frames[0]}.items():
+            require_whole(name, value, 1)
+        if frames[1] < frames[0]:
+            raise ValueError(f"frames: got {frames}, expected the fewest first")
+        self.share, self.every, self.scenes, self.frames, self.stretches = share, every, scenes, frames, stretches
+        self.sampler, self.return_frames = SamplerOptions(steps=steps), return_frames
+        self.task = registry.get("joint_future")()
+        self.kept: list[Scene] = []
+        self.filled = -1
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        if not isinstance(pl_module, Denoiser) or not isinstance(batch, Scene):
+            raise ValueError("RollOuts: only a Denoiser can be rolled out; leave the callback out of this training")
+        self.keep(batch)
+        due = self.filled < 0 or trainer.global_step - self.filled >= self.every
+        if not due or sum(each.scenes for each in self.kept) < min(4 * self.scenes, self.stretches):
+            return
+        self.filled = trainer.global_step
+        seed = derive(pl_module.hparams["seed"], "roll-outs", trainer.global_step, pl_module.global_rank)
+        generator = torch.Generator(device=pl_module.device).manual_seed(seed)
+        precision = trainer.precision_plugin.forward_context()
+        pl_module.made_pasts = self.rolled_out(pl_module, batch, generator, precision)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.kept, self.filled = [], -1
+        if isinstance(pl_module, Denoiser):
+            pl_module.made_pasts = None
+
+    def keep(self, batch: Scene) -> None:
+        """Remember a batch's stretches, and forget the oldest."""
+        self.kept.append(batch.to("cpu"))
+        while sum(each.scenes for each in self.kept[1:]) >= self.stretches:
+            self.kept.pop(0)
+
+    @torch.no_grad()
+    def rolled_out(
+        self,
+        model: Denoiser,
+        batch: Scene,
+        generator: torch.Generator,
+        precision: AbstractContextManager[None] | None = None,
+    ) -> MadePasts | None:
+        """Scenes as long as the batch's, whose first half the model has made; None: nobody here can be continued.
+
+        `precision` is the context in which the model runs; None: as it is.
+        """
+        frames = batch.frames
+        past = frames // 2 // TOKEN_FRAMES * TOKEN_FRAMES
+        near = NearestNeighbour(concatenate(self.kept).slice(0, COMPARED + frames - past))
+        people = torch.tensor([int(n) in near.stretches for n in batch.present.sum(dim=1)])
+        whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()
+        chosen = whole.nonzero()[: self.scenes, 0]
+        if not len(chosen):
+            return None
+        low, high = (-(-count // TOKEN_FRAMES) * TOKEN_FRAMES for count in self.frames)
+        draw = torch.rand((), generator=generator, device=generator.device)
+        more = low + int(draw * ((high - low) // TOKEN_FRAMES + 1)) * TOKEN_FRAMES
+        start = batch.select(chosen).slice(0, past)
+        training = model.training
+        model.eval()
+        with precision or nullcontext():
+            made = generate(model, start, self.task, past, more, 1, self.sampler, generator)
+        model.train(training)
+        made = made.slice(made.frames - past)
+        behind = near(made.slice(past - COMPARED).to("cpu"), frames - past).to(made.device)
+        return MadePasts(cat_time([made, eased(made, behind, self.return_frames)]), past // TOKEN_FRAMES, self.share)
+
+
+def eased(made: Scene, behind: Scene, frames: int) -> Scene:
+    """A recorded continuation that begins where and as a made past ends, and comes back to itself.
+
+    Places come back over some frames, poses over `BLEND`.
+
+    Args:
+        made: (B, T, P) the past.
+        behind: (B, T', P) the continuation, at about the right place.
+        frames: over so many frames people come back.
+    """
+    T_world_last = canonical_frame(made.T_world_root[:, -1:])
+    T_world_can = canonical_frame(behind.T_world_root)
+    # Where each person is expected at the continuation's first frame, if it goes on as the continuation does there.
+    T_now_next = inverse(T_world_can[:, :1]) @ T_world_can[:, 1:2]
+    yaw, ground = to_planar(T_world_can)
+    begin_yaw, begin = to_planar(T_world_last @ T_now_next)
+    left = 1 - smoothstep((_count(behind.frames, ground) / frames).clamp(max=1))[:, None]
+    turn = torch.atan2((begin_yaw - yaw[:, :1]).sin(), (begin_yaw - yaw[:, :1]).cos())
+    T_world_new = from_planar(yaw + turn * left, ground + (begin - ground[:, :1]) * left[..., None])
+    T_world_root = T_world_new.to(behind.T_world_root) @ inverse(T_world_can) @ behind.T_world_root
+    share = smoothstep(((_count(behind.frames, ground) + 1) / (BLEND + 1)).clamp(max=1))
+    T_can_last = (inverse(T_world_last) @ made.T_world_root[:, -1:]).expand_as(T_world_root)
+    T_can_root = inverse(T_world_new.to(T_world_root)) @ T_world_root
+    tilt = slerp(T_can_last[..., :3, :3], T_can_root[..., :3, :3], share[:, None])
+    height = torch.lerp(T_can_last[..., 1, 3], T_can_root[..., 1, 3], share[:, None].to(T_can_root))
+    T_can_root = T_can_root.clone()
+    T_can_root[..., :3, :3], T_can_root[..., 1, 3] = tilt, height
+    last = made.body_rot[:, -1:].expand_as(behind.body_rot)
+    body_rot = slerp(last, behind.body_rot, share[:, None, None])
+    return behind.replace(body_rot=body_rot, T_world_root=T_world_new.to(T_can_root) @ T_can_root)
+
+
+def _count(frames: int, like: Tensor) -> Tensor:
+    return torch.arange(frames, device=like.device, dtype=like.dtype)

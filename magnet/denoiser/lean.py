@@ -1,0 +1,241 @@
+"""The transformer as it is sampled with: the same numbers to rounding, in half of the time on a CPU.
+
+`Transformer` is written to be read and trained. Here its weights are packed once for the processor's matrix products
+(oneDNN), tables take the place of sines, only people who are there are computed, and in the last block only tokens that
+are asked for. A row of a packed product does not depend on how many rows there are, so neither do samples.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
+from magnet.packing import Kept, linear_of, norm_of
+from magnet.sampling.noise import LEVELS
+
+if TYPE_CHECKING:
+    pass
+
+Precision = Literal["float32", "bf16"]
+
+
+class LeanBlock:
+    """`TransformerBlock` with packed weights, for tokens whose times are turned by given complex numbers."""
+
+    def __init__(self, block: TransformerBlock, dtype: torch.dtype) -> None:
+        width = block.out.in_features
+        self.heads, self.each = block.heads, width // block.heads
+        weight, bias = block.qkv.weight.detach(), block.qkv.bias.detach()
+        # A turn rotates channels d and d + half of a head: put side by side they are one complex number.
+        half = self.each // 2
+        pairs = torch.arange(self.each).view(2, half).T.flatten()
+        order = (torch.arange(self.heads)[:, None] * self.each + pairs).flatten() if block.rope_heads else None
+        keep = torch.arange(width) if order is None else order
+        rows = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
+        weight, bias = weight[rows], bias[rows]
+        self.qkv = linear_of(weight, bias, dtype)
+        self.query = linear_of(weight[:width], bias[:width], dtype)
+        self.key_value = linear_of(weight[width:], bias[width:], dtype)
+        self.out = linear_of(block.out.weight, block.out.bias, dtype)
+        first, last = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
+        self.first, self.last = (linear_of(layer.weight, layer.bias, dtype) for layer in (first, last))
+        self.norm_attention, self.norm_mlp = (norm_of(n, dtype) for n in (block.norm_attention, block.norm_mlp))
+
+    def __call__(self, x: Tensor, turn: Tensor | None, sees: Tensor | None, rows: Tensor | None = None) -> Tensor:
+        """x (B, L, d), turn (L, D / 2) complex or None, sees as for `TransformerBlock` -> (B, L or rows, d)
+
+        With `rows` (r,) int only these are computed.
+        """
+        if rows is None:
+            made = self.qkv(x).unflatten(-1, (3, self.heads, self.each))
+            both, value = made[:, :, :2], made[:, :, 2]
+            query, key = (both if turn is None else turned(both, turn[:, None, None])).unbind(2)
+        else:
+            key, value = self.key_value(x).unflatten(-1, (2, self.heads, self.each)).unbind(2)
+            x = x[:, rows]
+            query = self.query(x).unflatten(-1, (self.heads, self.each))
+            sees = None if sees is None else sees[rows]
+            if turn is not None:
+                query, key = turned(query, turn[rows][:, None]), turned(key, turn[:, None])
+        query, key, value = (each.transpose(1, 2) for each in (query, key, value))
+        looked = F.scaled_dot_product_attention(query, key, value, attn_mask=sees).transpose(1, 2).flatten(-2)
+        x = self.norm_attention(self.out(looked, plus=x))
+        return self.norm_mlp(self.last(self.first(x, gelu=True), plus=x))
+
+
+def turned(x: Tensor, turn: Tensor) -> Tensor:
+    """Neighbouring channels turned as one complex number. (..., D), complex (..., D / 2) -> (..., D)"""
+    pairs = torch.view_as_complex(x.float().unflatten(-1, (-1, 2)))
+    return torch.view_as_real(pairs * turn).flatten(-2).to(x.dtype)
+
+
+class LeanTransformer:
+    """A `Transformer` frozen for sampling.
+
+    Args:
+        network: what it computes; changes of its weights afterwards are not seen.
+        precision: `bf16` holds the weights of the blocks in bfloat16; what goes in and out stays float32.
+    """
+
+    def __init__(self, network: Transformer, precision: Precision = "float32") -> None:
+        self.options, self.layout = network.options, network.layout
+        o, device = network.options, network.out_proj.weight.device
+        if network.out_proj.weight.dtype != torch.float32:
+            raise ValueError(f"weights are {network.out_proj.weight.dtype}, expected float32; bf16 is made here")
+        self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+        steps = torch.arange(LEVELS + 1, device=device)
+        self.levels, self.slots = sinusoids(steps, o.level_width), sinusoids(steps, o.slot_width)
+        self.agent = None if network.agent is None else network.agent.detach().clone()
+        layers = list(network.in_proj)
+        self.entry = [
+            linear_of(x.weight, x.bias, torch.float32) if isinstance(x, nn.Linear) else plain_layer(x) for x in layers
+        ]
+        self.blocks = [LeanBlock(block, self.dtype) for block in network.blocks]  # type: ignore[arg-type]
+        self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
+        self.condition = network.condition if o.cond_dim else None
+
+    def __call__(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        cond: Tensor | None = None,
+        wanted: Tensor | None = None,
+    ) -> Tensor:
+        """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero."""
+        B, N, _, _ = noisy.shape
+        entered = self._entered(noisy, levels, present)
+        finished = torch.zeros_like(noisy)
+        extra = None
+        if self.condition is not None:
+            extra = self.condition(cond, B, N)
+        elif cond is not None:
+            raise ValueError(f"cond: got {tuple(cond.shape)}, expected none: the model has network.cond_dim 0")
+        for rows, slots in seats(present):
+            x = entered[rows][:, :, slots] if rows is not None else entered[:, :, slots]
+            for layer in self.entry:
+                x = layer(x)
+            if extra is not None:
+                x = x + (extra if len(extra) == 1 or rows is None else extra[rows])
+            asked = None if wanted is None else wanted[:, slots].flatten().nonzero()[:, 0]
+            y = self._blocks(x.flatten(1, 2), N, x.shape[2], asked)
+            answer = self.exit(y)
+            if asked is not None:
+                whole = answer.new_zeros(len(x), N * x.shape[2], answer.shape[-1])
+                whole[:, asked] = answer
+                answer = whole
+            answer = answer.unflatten(1, (N, -1))
+            if rows is None:
+                finished[:, :, slots] = answer
+            else:
+                finished[rows[:, None], :, torch.arange(finished.shape[2], device=noisy.device)[slots]] = (
+                    answer.transpose(1, 2)
+                )
+        return finished
+
+    def _entered(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        """What goes into the first layer. -> (B, N, P, ...)"""
+        B, N, P, _ = noisy.shape
+        own = self.layout.group_levels(levels)
+        if not everybody(present):
+            there = self.layout.group_present(present)[:, None]
+            own, noisy = torch.where(there, own, LEVELS), torch.where(self.layout.spread(there), noisy, 0.0)
+        parts = [noisy, self.levels[own[..., 0]]]
+        if self.layout.slots:
+            parts.append(self.slots[own[..., 1:]].flatten(-2))
+        if self.agent is not None:
+            parts.append(self.agent.expand(B, N, P, -1))
+        return torch.cat(parts, dim=-1)
+
+    def _blocks(self, x: Tensor, steps: int, people: int, asked: Tensor | None) -> Tensor:
+        """All blocks. (B, N * people, d) -> (B, N * people or as many as are asked for, d)"""
+        o = self.options
+        sees = seen(steps, people, o.causal_block, x.device)
+        turn = None
+        if o.rope == "heads":
+            turn = turns(steps, people, o.width // o.heads, x.device)
+        elif o.rope == "hidden":
+            whole = turns(steps, people, o.width, x.device)
+            x = x + split_turned(x, whole)
+        x = x.to(self.dtype)
+        for block in self.blocks[:-1]:
+            x = block(x, turn, sees)
+        return self.blocks[-1](x, turn, sees, asked).float()
+
+
+def split_turned(x: Tensor, turn: Tensor) -> Tensor:
+    """Channels d and d + half turned as one complex number. (..., D), complex (..., D / 2) -> (..., D)"""
+    a, b = x.chunk(2, dim=-1)
+    return torch.cat([a * turn.real - b * turn.imag, a * turn.imag + b * turn.real], dim=-1)
+
+
+def plain_layer(layer: nn.Module) -> Callable[[Tensor], Tensor]:
+    return norm_of(layer, torch.float32) if isinstance(layer, nn.LayerNorm) else F.gelu
+
+
+def everybody(present: Tensor) -> bool:
+    """Whether every slot is taken; read on the CPU alone, where that waits for nothing."""
+    return present.device.type == "cpu" and bool(present.all())
+
+
+def seats(present: Tensor) -> list[tuple[Tensor | None, slice | Tensor]]:
+    """Scenes with equally many people, and the slots that these are in. present (B, P) -> [(rows, slots)]
+
+    Rows None: all of them, which then use the same slots.
+    """
+    key = present.detach().cpu().contiguous()
+    return _seats(key.numpy().tobytes(), *key.shape, present.device)
+
+
+@functools.lru_cache(maxsize=256)
+def _seats(present: bytes, B: int, P: int, device: torch.device) -> list[tuple[Tensor | None, slice | Tensor]]:
+    with torch.inference_mode(False):
+        there = torch.frombuffer(bytearray(present), dtype=torch.bool).view(B, P)
+        if bool((there == there[0]).all()):
+            slots = there[0].nonzero()[:, 0]
+            if not len(slots):
+                return []
+            if int(slots[-1]) == len(slots) - 1:
+                return [(None, slice(0, len(slots)))]
+            return [(None, slots.to(device))]
+        found: list[tuple[Tensor | None, slice | Tensor]] = []
+        for row in there.unique(dim=0):
+            rows, slots = (there == row).all(dim=1).nonzero()[:, 0], row.nonzero()[:, 0]
+            if len(slots):
+                found.append((rows.to(device), slots.to(device)))
+        return found
+
+
+@functools.lru_cache(maxsize=64)
+def turns(steps: int, people: int, width: int, device: torch.device, base: float = 10_000.0) -> Tensor:
+    """What each token's channels are turned by, as `rotate` has it. -> (steps * people, width / 2) complex"""
+    with torch.inference_mode(False):
+        half = width // 2
+        frequency = base ** (-torch.arange(half, device=device, dtype=torch.float32) / half)
+        time = torch.arange(steps, device=device).repeat_interleave(people)
+        angle = time[:, None].float() * frequency
+        return torch.complex(angle.cos(), angle.sin())
+
+
+@functools.lru_cache(maxsize=64)
+def seen(steps: int, people: int, block: int, device: torch.device) -> Tensor | None:
+    """`block_causal` of these tokens; None: everything is seen."""
+    if not block:
+        return None
+    with torch.inference_mode(False):
+        return block_causal(torch.arange(steps, device=device).repeat_interleave(people), block)
+
+
+FULL: Kept[LeanTransformer] = Kept(LeanTransformer)  # type: ignore[arg-type]
+HALF: Kept[LeanTransformer] = Kept(lambda network: LeanTransformer(network, "bf16"))  # type: ignore[arg-type]
+
+
+def lean(network: Transformer, precision: Precision = "float32") -> LeanTransformer:
+    """The lean form of a network of float32 weights, made once and again after they have changed."""
+    return (HALF if precision == "bf16" else FULL).of(network)

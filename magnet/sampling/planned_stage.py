@@ -1,0 +1,237 @@
+"""A stage whose steps are planned once: what `run_stage` does, bit for bit, with less work in each step.
+
+What follows from the plan alone (levels, factors of the solver, views) is worked out for all steps before the first
+one and kept for the next stage like it. Only token steps that the stage changes are touched.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import partners
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling.guidance import DenoiseFn, Guidance
+from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, half_log_snr
+from magnet.sampling.schedule import Stage
+from magnet.sampling.solvers import History
+
+
+@dataclass(frozen=True)
+class Views:
+    """What each agent sees where some are hidden; agents that see the same share a view (V of them).
+
+    Attributes:
+        levels: (S, V, W, P) int, as shown.
+        unknown: (V, W, P, 1 + slots) bool, shown as mask noise.
+        source: (W, P, 1 + slots) int, the view that each group is read from.
+    """
+
+    levels: Tensor
+    unknown: Tensor
+    source: Tensor
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """All that the steps of a stage need and that motion does not change. Rows are those that the stage changes.
+
+    Attributes:
+        rows: which rows of the window.
+        levels: (S, W, P) int before each step.
+        views: where somebody is hidden.
+        numbers: (S, 6, rows, P, 1 + slots): share of the extrapolation; then the square roots of the signal and of the
+            noise before; factors of old and new noise; the square root of the signal after.
+        stays, ends: (S, rows, P, 1 + slots) bool, whose level stays, and who becomes clean.
+        draws: for each step the (row, level) pairs that new noise is drawn for, and where several levels share a row.
+        last: (rows, P, 1 + slots) int, levels at which each group was predicted last, -1 where it never was.
+    """
+
+    rows: slice
+    levels: Tensor
+    views: Views | None
+    numbers: Tensor
+    stays: Tensor
+    ends: Tensor
+    draws: tuple[tuple[tuple[int, int, Tensor | None], ...], ...]
+    last: Tensor
+
+
+def run_planned_stage(
+    denoise: DenoiseFn,
+    stage: Stage,
+    tokens: Tensor,
+    mask_noise: Tensor,
+    present: Tensor,
+    layout: TokenLayout,
+    progress: Callable[[int], None] | None,
+    guidance: Guidance,
+    noise: NoiseStream | None = None,
+    first: int = 0,
+    history: History | None = None,
+) -> Tensor:
+    """As `magnet.sampling.sampler.run_stage`, without smoothing guidance. tokens (B, W, P, D) -> (B, W, P, D)"""
+    B, W, P, _ = tokens.shape
+    eta = noise.eta if noise is not None else 0.0
+    plan = plan_of(stage, layout, eta, history, tokens.device)
+    groups, rows = layout.groups(tokens.device), plan.rows
+    tokens = tokens.clone()
+    part = tokens[:, rows]
+    views, shown = plan.views, tokens
+    if views is not None:
+        V = views.levels.shape[1]
+        unknown, source = views.unknown[..., groups], views.source[rows][..., groups]
+        source = source.expand(B, 1, *source.shape)
+        present = present[:, None].expand(B, V, P).flatten(0, 1)
+        hidden_noise = mask_noise[:, None].expand(B, V, *mask_noise.shape[1:]).flatten(0, 1)
+    for step in range(len(plan.levels)):
+        if views is None:
+            levels = plan.levels[step].expand(B, W, P)
+            clean = guidance.predict(denoise, shown, levels, present, mask_noise, layout)[:, rows]
+        else:
+            seen = torch.where(unknown, mask_noise[:, None], shown[:, None]).flatten(0, 1)
+            levels = views.levels[step].expand(B, V, W, P).flatten(0, 1)
+            each = guidance.predict(denoise, seen, levels, present, hidden_noise, layout).unflatten(0, (B, V))
+            clean = each[:, :, rows].gather(1, source)[:, 0]
+        numbers, stays, ends = (
+            plan.numbers[step][..., groups],
+            plan.stays[step][..., groups],
+            plan.ends[step][..., groups],
+        )
+        carry, signal, left, old, new, signal_after = numbers
+        ahead = clean
+        if history is not None:
+            ahead = clean + carry * (clean - history.clean[:, rows])
+            history.clean[:, rows] = torch.where(stays, history.clean[:, rows], clean)
+        rest = old * ((part - signal * ahead) / left)
+        if noise is not None and eta:
+            rest = rest + new * noise.drawn(first + rows.start, len(plan.last), plan.draws[step])
+        moved = torch.where(ends, ahead, signal_after * ahead + rest)
+        part = torch.where(stays, part, moved)
+        tokens[:, rows] = part
+        if progress is not None:
+            progress(1)
+    if history is not None:
+        history.levels[rows] = plan.last[..., groups]
+    return tokens
+
+
+def plan_of(stage: Stage, layout: TokenLayout, eta: float, history: History | None, device: torch.device) -> StagePlan:
+    """The plan of a stage; that of a stage like an earlier one is not made again."""
+    begins, ends = (row - stage.start for row in stage.active)
+    levels = stage.levels.cpu().contiguous()
+    hidden = None if stage.visibility is None else (~stage.visibility).cpu().contiguous()
+    before = None
+    if history is not None:
+        firsts = torch.searchsorted(layout.groups(device), torch.arange(1 + layout.slots, device=device))
+        before = history.levels[begins:ends][..., firsts].cpu().contiguous()
+    return _plan(
+        (levels.numpy().tobytes(), tuple(levels.shape)),
+        None if hidden is None else hidden.numpy().tobytes(),
+        None if before is None else before.numpy().tobytes(),
+        (begins, ends),
+        layout,
+        eta,
+        device,
+    )
+
+
+@functools.lru_cache(maxsize=128)
+def _plan(
+    levels: tuple[bytes, tuple[int, ...]],
+    hidden: bytes | None,
+    before: bytes | None,
+    changed: tuple[int, int],
+    layout: TokenLayout,
+    eta: float,
+    device: torch.device,
+) -> StagePlan:
+    with torch.inference_mode(False):
+        table = torch.frombuffer(bytearray(levels[0]), dtype=torch.int16).view(levels[1]).long()
+        _, W, P = table.shape
+        slots, rows, count = 1 + layout.slots, slice(*changed), changed[1] - changed[0]
+        views = source = None
+        if hidden is not None:
+            concealed = torch.frombuffer(bytearray(hidden), dtype=torch.bool).view(P, W, P)
+            kinds, view_of = concealed.unique(dim=0, return_inverse=True)
+            shown = torch.where(kinds, LEVELS, table[:, None])  # (S + 1, V, W, P)
+            unknown = layout.group_levels(torch.where(kinds, LEVELS, 0)) == LEVELS
+            source = views_to_read(concealed, view_of, layout)
+            views = Views(shown[:-1].to(device), unknown.to(device), source.to(device))
+            each = layout.group_levels(shown)
+            group = each.gather(1, source.expand(len(each), 1, *source.shape))[:, 0]
+        else:
+            group = layout.group_levels(table)
+        group = group[:, rows]  # (S + 1, rows, P, 1 + slots)
+        past = torch.full((count, P, slots), -1)
+        if before is not None:
+            past = torch.frombuffer(bytearray(before), dtype=torch.long).view(count, P, slots).clone()
+        numbers, draws = [], []
+        for now, after in pairwise(group):
+            moves = now != after
+            carry = carried_share(now, after, past) if before is not None else torch.zeros(now.shape)
+            numbers.append(torch.stack([carry, *step_numbers(now, after, eta)]))
+            draws.append(draws_of(now, moves, layout, device))
+            past = torch.where(moves, now, past)
+        stays, ends = group[:-1] == group[1:], group[1:] == 0
+        return StagePlan(
+            rows,
+            table[:-1].to(device),
+            views,
+            torch.stack(numbers).to(device),
+            stays.to(device),
+            ends.to(device),
+            tuple(draws),
+            past.to(device),
+        )
+
+
+def carried_share(now: Tensor, after: Tensor, past: Tensor) -> Tensor:
+    """How far `magnet.sampling.solvers.carried_on` extrapolates; 0 where it does not. (...) int each -> (...)"""
+    length = half_log_snr(after) - half_log_snr(now)
+    since = torch.where(past == LEVELS, length, half_log_snr(now) - half_log_snr(past.clamp_min(0)))
+    share = (length / (2 * since)).clamp(max=1.0)
+    return torch.where((now != after) & (after > 0) & (past >= 0), share, 0.0)
+
+
+def step_numbers(now: Tensor, after: Tensor, eta: float) -> tuple[Tensor, ...]:
+    """The factors of `magnet.sampling.noise.ddim_step`. (...) int each -> five of (...)"""
+    a_now, a_after = alpha_bar(now), alpha_bar(after)
+    left = (1 - a_now).clamp_min(1e-12)
+    renewed = torch.zeros_like(left)
+    old = (1 - a_after).sqrt()
+    if eta:
+        renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
+        old = (1 - a_after - renewed.square()).clamp_min(0).sqrt()
+    return a_now.sqrt(), left.sqrt(), old, renewed, a_after.sqrt()
+
+
+def draws_of(
+    now: Tensor, moves: Tensor, layout: TokenLayout, device: torch.device
+) -> tuple[tuple[int, int, Tensor | None], ...]:
+    """What new noise a step needs: (row, level, which numbers (P, D) have it, None: all that move)."""
+    found = []
+    for row in moves.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
+        levels = now[row][moves[row]].unique().tolist()
+        for level in levels:
+            where = layout.spread(now[row] == level).to(device) if len(levels) > 1 else None
+            found.append((row, level, where))
+    return tuple(found)
+
+
+def views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tensor:
+    """The view that each group of each token is read from. hidden (P, W, P), view_of (P,) -> (W, P, 1 + slots) int"""
+    P, W = hidden.shape[:2]
+    own = view_of.expand(W, P)[..., None]
+    if not layout.slots:
+        return own
+    partner = partners(P, hidden.device)  # (P, slots)
+    unseen = hidden.transpose(0, 1)  # (W, P viewer, P viewed)
+    agent = torch.arange(P, device=hidden.device)[:, None]
+    blind = unseen[:, agent, partner] & ~unseen[:, partner, agent]  # who sees one is not seen
+    return torch.cat([own, torch.where(blind, view_of[partner], own)], dim=-1)

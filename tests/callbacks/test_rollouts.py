@@ -1,0 +1,97 @@
+"""Training that goes on from what the model has made."""
+
+import pytest
+import torch
+
+from magnet.callbacks import RollOuts
+from magnet.callbacks.rollouts import eased
+from magnet.motion.frames import canonical_frame
+from magnet.motion.rotations import geodesic
+from magnet.testing import random_scene, tiny_denoiser
+from tests.denoiser.test_module import data, trainer
+
+FRAMES = 64
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Roll-outs of a small model, and the batch they began in."""
+    model = tiny_denoiser(max_agents=3, window=FRAMES // 4)
+    people = torch.tensor([[True, True, False], [True, True, True], [True, False, False]]).repeat(4, 1)
+    batch = random_scene(12, FRAMES, 3, torch.Generator().manual_seed(0), present=people)
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2, stretches=12)
+    rolling.keep(batch)
+    return batch, rolling.rolled_out(model, batch, torch.Generator().manual_seed(1)), model
+
+
+def test_they_are_as_long_as_training_scenes_and_keep_who_is_there(made):
+    batch, pasts, _ = made
+    assert (pasts.scenes.scenes, pasts.scenes.frames, pasts.past) == (4, FRAMES, FRAMES // 8)
+    assert torch.equal(pasts.scenes.present, batch.present[:4])
+    assert torch.equal(pasts.scenes.betas, batch.betas[:4])
+    assert pasts.scenes.T_world_root.isfinite().all()
+
+
+def test_the_past_is_made_and_what_follows_is_recorded(made):
+    """Only recorded poses come after the seam, and only made ones before it."""
+    batch, pasts, _ = made
+    recorded = batch.body_rot.flatten(0, 2)[:, 0]  # one joint's rotations
+
+    def found(pose: torch.Tensor) -> bool:
+        return bool((geodesic(recorded, pose) < 1e-3).any())
+
+    assert not found(pasts.scenes.body_rot[0, FRAMES // 4, 0, 0])
+    assert found(pasts.scenes.body_rot[0, -1, 0, 0])
+
+
+def test_nothing_is_rolled_out_where_nobody_has_been_seen(made):
+    batch, _, model = made
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
+    rolling.keep(batch.select([2, 5]))  # scenes of one person alone
+    assert rolling.rolled_out(model, batch.select([0, 1]), torch.Generator().manual_seed(1)) is None
+
+
+@pytest.mark.parametrize("frames", [8, 24])
+def test_a_continuation_begins_where_the_past_ended_and_comes_back(frames: int):
+    scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
+    past, behind = scene.slice(0, 8), scene.slice(12)  # 4 frames are missing between them
+    joined = eased(past, behind, frames)
+    torch.testing.assert_close(joined.T_world_root[:, frames:], behind.T_world_root[:, frames:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(joined.body_rot[:, 8:], behind.body_rot[:, 8:], atol=1e-4, rtol=0)
+    own = canonical_frame(joined.T_world_root)[..., :3, 3]
+    last = canonical_frame(past.T_world_root[:, -1:])[..., :3, 3]
+    there = canonical_frame(behind.T_world_root)[..., :3, 3]
+    assert float((own[:, :1] - last).norm(dim=-1).max()) < 1.5 * float(there.diff(dim=1).norm(dim=-1).max())
+    turned = geodesic(past.body_rot[:, -1], joined.body_rot[:, 0])
+    assert float(turned.mean()) < 0.3 * float(geodesic(past.body_rot[:, -1], behind.body_rot[:, 0]).mean())
+
+
+def test_a_continuation_that_fits_stays_as_it_is():
+    scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
+    still = scene.frames_at(torch.zeros(48, dtype=torch.long))
+    joined = eased(still.slice(0, 8), still.slice(8), 16)
+    torch.testing.assert_close(joined.T_world_root, still.slice(8).T_world_root, atol=1e-5, rtol=0)
+    torch.testing.assert_close(joined.body_rot, still.slice(8).body_rot, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_training_with_it_rolls_out_as_often_as_asked(tmp_path, precision):
+    model = tiny_denoiser(max_agents=3)
+    rolling = RollOuts(share=0.5, every=2, scenes=2, frames=(8, 8), steps=1, stretches=8)
+    seen: list[object] = []
+    plain = rolling.rolled_out
+
+    def counted(*parts):
+        seen.append(plain(*parts))
+        return seen[-1]
+
+    rolling.rolled_out = counted
+    trainer(4, default_root_dir=tmp_path, callbacks=[rolling], precision=precision).fit(model, datamodule=data())
+    assert len(seen) == 2 and all(each is not None for each in seen)
+    assert model.made_pasts is None, "a model that is trained keeps none of it"
+
+
+@pytest.mark.parametrize("wrong", [{"share": 2.0}, {"every": 0}, {"frames": (40, 20)}])
+def test_wrong_options_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        RollOuts(**wrong)

@@ -1,0 +1,106 @@
+"""The lean form of the transformer gives the network's numbers, to rounding."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.denoiser.lean import LeanTransformer, lean
+from magnet.denoiser.options import TransformerOptions
+from magnet.denoiser.transformer import Transformer
+from magnet.motion.tokens import TokenLayout
+
+SMALL = {"width": 32, "layers": 3, "heads": 2, "dropout": 0.0}
+
+
+def network(agents: int = 3, **options: Any) -> Transformer:
+    torch.manual_seed(0)
+    layout = TokenLayout(8, agents, options.get("pairwise", True))
+    made = Transformer(layout, TransformerOptions(**{**SMALL, **options})).eval()
+    for weight in made.parameters():  # norms and biases that a fresh network leaves at one and zero
+        torch.nn.init.normal_(weight, std=0.2)
+    return made
+
+
+def question(made: Transformer, B: int, N: int, present: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    P = made.layout.agents
+    noisy = torch.randn(B, N, P, made.layout.width, generator=generator)
+    levels = torch.randint(0, 1001, (B, N, P), generator=generator)
+    return noisy, levels, torch.ones(B, P, dtype=torch.bool) if present is None else present
+
+
+KINDS: list[dict[str, Any]] = [{}, {"rope": "heads"}, {"rope": "none"}, {"rope": "heads", "causal_block": 2}]
+PRESENT = {
+    "all": torch.ones(4, 3, dtype=torch.bool),
+    "a free slot": torch.tensor([[True, True, False]] * 4),
+    "gaps": torch.tensor([[True, False, True]] * 4),
+    "mixed": torch.tensor([[True, False, True], [True, True, True], [False, True, False], [True, False, True]]),
+    "nobody": torch.tensor([[True, True, True], [False, False, False], [True, True, True], [True, False, False]]),
+}
+
+
+@pytest.mark.parametrize("present", PRESENT.values(), ids=PRESENT.keys())
+@pytest.mark.parametrize(
+    "options", [{}, {"rope": "heads"}, {"rope": "none"}, {"rope": "heads", "causal_block": 2}], ids=str
+)
+@torch.no_grad()
+def test_the_lean_form_predicts_what_the_network_does(options: dict[str, Any], present: Tensor) -> None:
+    made = network(**options)
+    asked = question(made, 4, 5, present)
+    expected, got = made(*asked), LeanTransformer(made)(*asked)
+    there = present[:, None, :, None]
+    torch.testing.assert_close(torch.where(there, got, 0), torch.where(there, expected, 0), rtol=1e-4, atol=1e-5)
+    assert not got[~present[:, None].expand(4, 5, 3)].any()
+    half = LeanTransformer(made, "bf16")(*asked)
+    off = (half - expected)[there.expand_as(half)].norm() / expected[there.expand_as(half)].norm()
+    assert 1e-5 < off < 0.05
+
+
+@pytest.mark.parametrize("options", [{"agent_embedding": False}, {"pairwise": False}, {"cond_dim": 4}], ids=str)
+@torch.no_grad()
+def test_every_part_can_be_left_out_or_added(options: dict[str, Any]) -> None:
+    made = network(**options)
+    asked = question(made, 2, 4)
+    cond = torch.randn(2, 4, 4) if options.get("cond_dim") else None
+    torch.testing.assert_close(LeanTransformer(made)(*asked, cond), made(*asked, cond), rtol=1e-4, atol=1e-5)
+    if cond is None:
+        with pytest.raises(ValueError, match="cond: got"):
+            LeanTransformer(made)(*asked, torch.randn(2, 4))
+
+
+@pytest.mark.parametrize("causal_block", [0, 2])
+@torch.no_grad()
+def test_tokens_that_are_not_asked_for_cost_nothing_in_the_last_block_and_are_zero(causal_block: int) -> None:
+    made = LeanTransformer(network(causal_block=causal_block, rope="heads"))
+    asked = question(made, 2, 6)  # type: ignore[arg-type]
+    wanted = torch.zeros(6, 3, dtype=torch.bool)
+    wanted[3, 1] = wanted[5] = True
+    whole, some = made(*asked), made(*asked, None, wanted)
+    torch.testing.assert_close(some[:, wanted], whole[:, wanted], rtol=1e-4, atol=1e-5)
+    assert not some[:, ~wanted].any()
+
+
+@torch.no_grad()
+def test_a_scene_does_not_depend_on_what_else_is_in_the_batch() -> None:
+    made = LeanTransformer(network())
+    noisy, levels, present = question(made, 4, 5)  # type: ignore[arg-type]
+    whole = made(noisy, levels, present)
+    for scene in range(4):
+        one = slice(scene, scene + 1)
+        torch.testing.assert_close(made(noisy[one], levels[one], present[one]), whole[one], rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_it_is_made_once_and_again_when_weights_change() -> None:
+    made = network()
+    first = lean(made)
+    assert lean(made) is first and lean(made, "bf16") is lean(made, "bf16") is not first
+    made.out_proj.weight.mul_(2)
+    asked = question(made, 1, 4)
+    torch.testing.assert_close(lean(made)(*asked), made(*asked), rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="expected float32"):
+        lean(made.bfloat16())

@@ -1,0 +1,68 @@
+"""USD, opened and posed by Pixar's own library: joints where the body's are, skin where its vertices are."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.body import Body
+from magnet.export.bones import BoneOptions
+from magnet.export.usd import joint_paths, save_usd
+from magnet.testing import random_scene
+
+
+def posed(path: Path, frame: int) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """World positions of each person's joints, and vertices as UsdSkel skins them."""
+    from pxr import Usd, UsdGeom, UsdSkel, Vt
+
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    cache, found = UsdSkel.Cache(), []
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdSkel.Root):
+            continue
+        root = UsdSkel.Root(prim)
+        cache.Populate(root, Usd.PrimDefaultPredicate)
+        (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+        query = cache.GetSkelQuery(binding.GetSkeleton())
+        places = query.ComputeJointSkelTransforms(Usd.TimeCode(frame))
+        names = [name.rpartition("/")[2] for name in query.GetJointOrder()]
+        (skinning,) = binding.GetSkinningTargets()
+        points = Vt.Vec3fArray(UsdGeom.Mesh(skinning.GetPrim()).GetPointsAttr().Get())
+        assert skinning.ComputeSkinnedPoints(query.ComputeSkinningTransforms(Usd.TimeCode(frame)), points, frame)
+        joints = {name: np.array(m.ExtractTranslation()) for name, m in zip(names, places, strict=True)}
+        found.append((joints, np.array(points)))
+    return found
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
+def test_pixars_library_poses_joints_and_skin_where_the_body_has_them(suffix: str, body: Body, tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    scene = random_scene(1, 9, 2, torch.Generator().manual_seed(4))
+    bones = BoneOptions(root="none") if suffix == ".usda" else BoneOptions()
+    path = save_usd(scene, tmp_path / f"duo{suffix}", body, bones)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    joints, vertices = body.joints(scene)[0].numpy(), body.vertices(scene)[0].numpy()
+    for frame in (0, 8):
+        people = posed(path, frame)
+        assert len(people) == 2
+        for person, (found, points) in enumerate(people):
+            assert ("root" in found) == (bones.root == "floor")
+            there = np.stack([place for name, place in found.items() if name != "root"])
+            assert np.abs(there - joints[frame, person]).max() < 1e-4
+            assert np.abs(points - vertices[frame, person]).max() < 1e-4
+
+
+def test_without_the_package_the_extra_is_named(body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(ImportError, match=r"pip install \"magnet-motion\[usd\]\""):
+        save_usd(random_scene(1, 4, 1, torch.Generator().manual_seed(4)), tmp_path / "a.usda", body)
+
+
+def test_joints_have_names_that_usd_takes() -> None:
+    assert joint_paths(["mixamorig:Hips"]) == ["mixamorig_Hips"]

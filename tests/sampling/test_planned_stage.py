@@ -1,0 +1,119 @@
+"""A planned stage gives what the plain loop gives, bit for bit, and makes nothing anew in its steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.motion.tokens import TokenLayout
+from magnet.sampling import planned_stage
+from magnet.sampling.grid import Grid
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.noise import NoiseStream
+from magnet.sampling.sampler import begin, run_stage
+from magnet.sampling.schedule import MaskSchedule, Stage
+from magnet.sampling.solvers import History
+from magnet.tasks import registry
+
+P, N, B = 3, 20, 2
+LAYOUT = TokenLayout(6, P)
+
+
+def predict(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+    """A network that mixes everything that it is shown."""
+    seen = noisy * present[:, None, :, None] + 1e-3 * levels[..., None]
+    return (seen + 0.3 * seen.mean(dim=(1, 2), keepdim=True)).sin()
+
+
+def schedule(task: str, **fields: Any) -> MaskSchedule:
+    grid = Grid(N, P, 0 if task == "generation" else 4, steps=4, window=8)
+    return registry.get(task)(**fields).schedule(grid)
+
+
+def sampled(plan: MaskSchedule, plain: bool, guidance: Guidance, eta: float, steps_back: bool) -> tuple[Tensor, Any]:
+    generator = torch.Generator().manual_seed(3)
+    stream = NoiseStream((B, P, LAYOUT.width), generator, eta=eta)
+    noise, mask_noise = stream.draw(N)
+    truth = torch.randn(B, N, P, LAYOUT.width, generator=generator)
+    tokens = begin(truth, noise, plan.known, LAYOUT)
+    history = History.empty(tokens) if steps_back else None
+    present = torch.ones(B, P, dtype=torch.bool)
+    run = run_stage if plain else planned_stage.run_planned_stage
+    for stage in plan.stages:
+        window = slice(stage.start, stage.stop)
+        kept = None if history is None else history.window(window)
+        args = (tokens[:, window], mask_noise[:, window], present, LAYOUT, None, guidance, stream, stage.start, kept)
+        tokens[:, window] = run(predict, stage, *args)
+    return tokens, history
+
+
+@pytest.mark.parametrize("task", [*registry.names(), "half a turn"])
+@pytest.mark.parametrize("way", ["plain", "new noise", "guided", "history"])
+@torch.no_grad()
+def test_every_task_is_sampled_as_by_the_plain_loop(task: str, way: str) -> None:
+    plan = schedule("agentic_async", offset=0.5) if task == "half a turn" else schedule(task)
+    guidance = Guidance("self") if way == "guided" else Guidance()
+    how = guidance, float(way != "plain"), way == "history"
+    (plain, before), (planned, now) = sampled(plan, True, *how), sampled(plan, False, *how)
+    assert torch.equal(plain, planned)
+    if before is not None:
+        assert torch.equal(before.levels, now.levels)
+        seen = before.levels >= 0
+        assert torch.equal(before.clean[:, seen], now.clean[:, seen])
+
+
+def test_a_stage_like_an_earlier_one_is_not_planned_again() -> None:
+    one, other = schedule("motion_control").stages[-2:]
+    assert one.start < other.start
+    plans = [planned_stage.plan_of(stage, LAYOUT, 1.0, None, torch.device("cpu")) for stage in (one, other)]
+    assert plans[0] is plans[1]
+
+
+class Counting(torch.utils._python_dispatch.TorchDispatchMode):
+    """Counts operators, and those that would make a GPU and the CPU wait for each other."""
+
+    WAITS = ("_local_scalar_dense", "nonzero", "_unique", "unique_dim", "masked_select", "equal", "is_nonzero")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operators, self.waits = 0, []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func._schema.name.removeprefix("aten::")
+        self.operators += 1
+        self.waits += [name] if name.startswith(self.WAITS) else []
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("task", ["joint_future", "motion_control", "agentic_sync"])
+@torch.no_grad()
+def test_steps_wait_for_nothing_and_are_few_operators(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = schedule(task)
+    sampled(plan, False, Guidance(), 1.0, True)  # everything is planned
+
+    def counted(stage: Stage) -> Counting:
+        tokens, mode = torch.zeros(B, *stage.levels.shape[1:], LAYOUT.width), Counting()
+        present, calls = torch.ones(B, P, dtype=torch.bool), []
+
+        def denoise(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+            if not calls:  # what was planned before the first step was planned on the host
+                mode.operators, mode.waits = 0, []
+            calls.append(1)
+            return noisy
+
+        stream = NoiseStream((B, P, LAYOUT.width), torch.Generator(), eta=1.0)
+        monkeypatch.setattr(torch, "Generator", None)  # none is made
+        args = (tokens, tokens, present, LAYOUT, None, Guidance(), stream, 0, History.empty(tokens))
+        with mode:
+            planned_stage.run_planned_stage(denoise, stage, *args)
+        monkeypatch.undo()
+        return mode
+
+    stage = plan.stages[-1]
+    mode, steps = counted(stage), len(stage.levels) - 1
+    assert not mode.waits
+    draws = sum(len(row) for row in planned_stage.plan_of(stage, LAYOUT, 1.0, None, torch.device("cpu")).draws)
+    assert mode.operators < 10 + 45 * steps + 8 * draws, (mode.operators, steps, draws)

@@ -1,0 +1,99 @@
+"""The tracks along the bottom: what is given, what is generated, keyframes and now, each where it belongs."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from magnet.export.page.palette import pale
+from magnet.export.page.takes import take
+from magnet.testing import random_scene
+from magnet.viewer.timeline import EDGE, NOW, Tracks, drawn
+
+COLOURS = np.array([[10, 20, 30], [200, 100, 50]], dtype=np.uint8)
+
+
+def bars(svg: str, colour: str) -> list[float]:
+    """Left and right edges in per cent of the rectangles of a colour, one after the other."""
+    found = ElementTree.fromstring(svg).iter("rect")
+    return [
+        edge
+        for r in found
+        if r.get("fill") == colour
+        for edge in (float(r.get("x")[:-1]), float(r.get("x")[:-1]) + float(r.get("width")[:-1]))
+    ]
+
+
+def named(colour: np.ndarray) -> str:
+    return "#" + bytes(colour.tolist()).hex()
+
+
+def test_each_person_has_a_track_of_given_and_generated_frames_and_keyframes() -> None:
+    known = np.zeros((100, 2), dtype=bool)
+    known[:25] = True
+    known[40:50, 1] = True
+    svg = drawn(Tracks(known, COLOURS, keys=((1, 196),)), now=150, fps=30.0)  # a keyframe later than all there is
+    faint = pale(COLOURS)
+    assert bars(svg, named(faint[0])) == pytest.approx([0, 12.5])
+    assert bars(svg, named(COLOURS[0])) == pytest.approx([12.5, 50])
+    assert bars(svg, named(faint[1])) == pytest.approx([0, 12.5, 20, 25])
+    assert bars(svg, named(COLOURS[1])) == pytest.approx([12.5, 20, 25, 50])
+    assert bars(svg, NOW)[0] == 75.0
+    assert re.findall(r'<svg x="([\d.]+)%"', svg) == ["99.00"]
+
+
+def test_the_timeline_is_as_wide_as_the_picture_and_nothing_happens_while_nobody_looks(body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    viewer = Viewer([take("dance", random_scene(1, 24, 2, torch.Generator().manual_seed(1)))], body, port=0)
+    try:
+        sent = viewer.sent
+        viewer.run(seconds=0.2)
+        assert viewer.clock.at == 0.0 and viewer.sent == sent
+        viewer.timeline.fit(1000)
+        viewer.timeline.fit(0)
+        assert viewer.timeline.width == 1000
+    finally:
+        viewer.stop()
+    assert EDGE > 0
+
+
+def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, monkeypatch) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(1))
+    roots = scene.T_world_root.clone()
+    roots[:, :, :, :3, 3] = torch.tensor([[0.0, 0.9, 0.0], [0.0, 0.9, 0.0]])
+    roots[:, 12:, 0, 0, 3], roots[:, 12:, 1, 0, 3] = -3.0, 3.0
+    viewer = Viewer([take("dance", scene.replace(T_world_root=roots))], body, port=0)
+
+    class Client:
+        def __init__(self) -> None:
+            self.camera = SimpleNamespace(
+                position=np.array([0.0, 0.85, 4.0]), look_at=np.zeros(3), fov=0.7, aspect=1.5, image_height=100
+            )
+
+        def atomic(self):
+            return viewer.server.atomic()
+
+    client = Client()
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: client})
+    try:
+        viewer.clock.seek(2)
+        viewer.draw()
+        near = np.linalg.norm(client.camera.position - np.array([0.0, 0.85, 0.0]))
+        viewer.clock.seek(20)
+        viewer.draw()
+        far = client.camera.position - np.array([0.0, 0.85, 0.0])
+    finally:
+        viewer.stop()
+    assert near == pytest.approx(4.0, rel=0.1)
+    assert np.linalg.norm(far) * np.sin(0.35) >= 3.0
+    assert np.allclose(far / np.linalg.norm(far), [0, 0, 1])  # on the line that it looked along
