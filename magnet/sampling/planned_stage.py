@@ -10,6 +10,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -20,6 +21,16 @@ from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, half_log_snr
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
+
+
+class Correct(Protocol):
+    """Changes what a step predicts.
+
+    clean (B V, W, P, D) tokens of V views, the levels now (V, W, P) they were predicted at, what each view hides
+    (V, W, P) bool or None, and the token step that the window begins with -> (B V, W, P, D)
+    """
+
+    def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,7 @@ def run_planned_stage(
     noise: NoiseStream | None = None,
     first: int = 0,
     history: History | None = None,
+    correct: Correct | None = None,
 ) -> Tensor:
     """As `magnet.sampling.sampler.run_stage`, without smoothing guidance. tokens (B, W, P, D) -> (B, W, P, D)"""
     B, W, P, _ = tokens.shape
@@ -92,12 +104,17 @@ def run_planned_stage(
     for step in range(len(plan.levels)):
         if views is None:
             levels = plan.levels[step].expand(B, W, P)
-            clean = guidance.predict(denoise, shown, levels, present, mask_noise, layout)[:, rows]
+            clean = guidance.predict(denoise, shown, levels, present, mask_noise, layout)
+            if correct is not None:
+                clean = correct(clean, plan.levels[step][None], None, first)
+            clean = clean[:, rows]
         else:
             seen = torch.where(unknown, mask_noise[:, None], shown[:, None]).flatten(0, 1)
             levels = views.levels[step].expand(B, V, W, P).flatten(0, 1)
-            each = guidance.predict(denoise, seen, levels, present, hidden_noise, layout).unflatten(0, (B, V))
-            clean = each[:, :, rows].gather(1, source)[:, 0]
+            each = guidance.predict(denoise, seen, levels, present, hidden_noise, layout)
+            if correct is not None:
+                each = correct(each, views.levels[step], views.unknown[..., 0], first)
+            clean = each.unflatten(0, (B, V))[:, :, rows].gather(1, source)[:, 0]
         numbers, stays, ends = (
             plan.numbers[step][..., groups],
             plan.stays[step][..., groups],

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch import Tensor
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream
-from magnet.sampling.planned_stage import run_planned_stage, views_to_read
+from magnet.sampling.planned_stage import Correct, run_planned_stage, views_to_read
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver, solver_step
 
@@ -21,16 +20,6 @@ StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was
 decentralized (`Stage.decentralized`). Returns the tokens with the finished ones made self-consistent: latents moved to
 their nearest codes, transforms recomputed from world poses."""
-
-
-class Correct(Protocol):
-    """Changes what a step predicts.
-
-    clean (B V, W, P, D) tokens of V views, the levels now (V, W, P) they were predicted at, what each view hides
-    (V, W, P) bool or None, and the token step that the window begins with -> (B V, W, P, D)
-    """
-
-    def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor: ...
 
 
 @torch.no_grad()

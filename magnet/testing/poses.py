@@ -165,3 +165,7 @@ class OtherNoise(NoiseStream):
     def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
         there = self.tokens[first : first + len(levels), :, None]
         return torch.where(there, super().step_noise(first, levels, moves), self.plain.step_noise(first, levels, moves))
+
+    def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
+        there = self.tokens[first : first + rows, :, None]
+        return torch.where(there, super().drawn(first, rows, draws), self.plain.drawn(first, rows, draws))
