@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.frames import rigid
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -23,7 +23,7 @@ def random_scene(
 
     def smooth(*shape: int, scale: float) -> Tensor:
         """A few slow sine waves along the second axis."""
-        time = torch.linspace(0, frames / 30, frames).view(1, -1, *[1] * (len(shape) - 2))
+        time = torch.linspace(0, frames / FPS, frames).view(1, -1, *[1] * (len(shape) - 2))
         wave = torch.zeros(shape)
         for frequency in (0.3, 0.7, 1.3):
             size = torch.randn(shape[0], 1, *shape[2:], generator=generator)
