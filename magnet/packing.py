@@ -39,8 +39,9 @@ def linear_of(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> Linear:
     product = torch.ops.mkldnn._linear_pointwise
 
     def fast(x: Tensor, gelu: bool = False, plus: Tensor | None = None) -> Tensor:
+        x = x.to(dtype)  # autocast makes some of what comes in half as precise
         if plus is not None:
-            return product.binary(x, plus, packed, bias, "add")
+            return product.binary(x, plus.to(dtype), packed, bias, "add")
         return product.default(x, packed, bias, *(("gelu", [], "none") if gelu else ("none", [], "")))
 
     return fast

@@ -34,6 +34,8 @@ for example:
 
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("export", __doc__, EPILOG)
+    options.add_argument("out", **scene_files.OUT)
+    scene_files.add_body(options)
     options.add_argument("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
     options.add_argument(
         "--person", type=int, action="append", default=[], metavar="N", help="only this person, from 0; may be repeated"
@@ -78,12 +80,8 @@ def parser() -> argparse.ArgumentParser:
         help="how people look; light, a body of few vertices, is for .html",
     )
     pictures.add_argument("--title", help="written above")
-    bvh = options.add_argument_group("reading .bvh of other programs")
-    bvh.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
-    bvh.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
-    bvh.add_argument(
-        "--keep_floor", action="store_true", help="leave people at the height they were recorded at; .npz too"
-    )
+    bvh = options.add_argument_group("reading .bvh and .npz of other programs")
+    scene_files.add_origin(bvh)
     bvh.add_argument(
         "--joint", action="append", default=[], metavar="OURS=THEIRS", help="left_hip=Thigh_L, where names say nothing"
     )

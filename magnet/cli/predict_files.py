@@ -53,15 +53,8 @@ def meant(arguments: Sequence[str]) -> bool:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser(
-        "magnet predict",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    options.add_argument("inputs", nargs="*", metavar="IN", help="a .npz or .bvh file; several are several people")
-    options.add_argument("--out", nargs="+", metavar="OUT", help="file to write; its suffix says what")
+    options = scene_files.parser_of("predict", __doc__, EPILOG, inputs="*")
+    options.add_argument("--out", nargs="+", **scene_files.OUT)
     what = options.add_argument_group("what is sampled")
     what.add_argument("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
     what.add_argument("--task.FIELD", metavar="VALUE", help="an option of the task")
@@ -84,11 +77,8 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--sampler", metavar="PRESET", default="default", help="default, steady or paper")
     how.add_argument("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
     files = options.add_argument_group("files")
-    files.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
-    files.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
-    files.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of the legs)")
-    files.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
-    files.add_argument("--keep_floor", action="store_true", help="leave people at the height they were recorded at")
+    scene_files.add_body(files)
+    scene_files.add_origin(files)
     return options
 
 

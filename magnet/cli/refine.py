@@ -28,6 +28,8 @@ for example:
 
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("refine", __doc__, EPILOG)
+    options.add_argument("out", **scene_files.OUT)
+    scene_files.add_body(options)
     options.add_argument(
         "--apart",
         choices=("light", "firm"),

@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magnet.export.formats import Read, Reading
 
+Options = argparse.ArgumentParser | argparse._ArgumentGroup
 
-def parser_of(command: str, description: str | None, epilog: str) -> argparse.ArgumentParser:
-    """A parser that knows IN, OUT, --body and --trim."""
+
+def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> argparse.ArgumentParser:
+    """A parser that knows IN."""
     options = argparse.ArgumentParser(
         f"magnet {command}",
         description=description,
@@ -20,11 +22,24 @@ def parser_of(command: str, description: str | None, epilog: str) -> argparse.Ar
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    options.add_argument("inputs", nargs="+", metavar="IN", help="a .npz or .bvh file; several are several people")
-    options.add_argument("out", metavar="OUT", help="file to write; its suffix says what")
+    options.add_argument("inputs", nargs=inputs, metavar="IN", help="a .npz or .bvh file; several are several people")
+    return options
+
+
+def add_body(options: Options) -> None:
+    """--body and --trim, which say how several files become one scene."""
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
-    return options
+
+
+def add_origin(options: Options) -> None:
+    """--in_unit, --up and --keep_floor, for files of other programs."""
+    options.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs)")
+    options.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point); y or z for .npz")
+    options.add_argument("--keep_floor", action="store_true", help="leave people at the height they were recorded at")
+
+
+OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
 def path_to_write(out: str) -> Path:

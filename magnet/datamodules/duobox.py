@@ -15,6 +15,11 @@ from magnet.datamodules.reading.recording import DataError, Reader, Recording, T
 from magnet.datamodules.registry import register_data
 from magnet.unpickle import load_object_npy, load_pickle
 
+from magnet.body.joints import (  # isort: skip
+    HEAD, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP,
+    R_KNEE, R_SHOULDER, R_WRIST, SPINE1, SPINE3,
+)  # fmt: skip
+
 RATE = 120.0
 THINNING, UNIT, SKIPPED = 4, 4, 4
 """120 to 30 fps; frames that the authors' parts are multiples of; frames before their first, whose speed is unknown."""
@@ -31,9 +36,10 @@ MOTIVE = (
 )  # fmt: skip
 PARENTS = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
 MAP = {
-    0: "Hips", 1: "LeftUpLeg", 2: "RightUpLeg", 3: "Spine", 4: "LeftLeg", 5: "RightLeg", 7: "LeftFoot", 8: "RightFoot",
-    9: "Spine1", 10: "LeftToeBase", 11: "RightToeBase", 12: "Neck", 15: "Head", 16: "LeftArm", 17: "RightArm",
-    18: "LeftForeArm", 19: "RightForeArm", 20: "LeftHand", 21: "RightHand",
+    PELVIS: "Hips", L_HIP: "LeftUpLeg", R_HIP: "RightUpLeg", SPINE1: "Spine", L_KNEE: "LeftLeg", R_KNEE: "RightLeg",
+    L_ANKLE: "LeftFoot", R_ANKLE: "RightFoot", SPINE3: "Spine1", L_FOOT: "LeftToeBase", R_FOOT: "RightToeBase",
+    NECK: "Neck", HEAD: "Head", L_SHOULDER: "LeftArm", R_SHOULDER: "RightArm", L_ELBOW: "LeftForeArm",
+    R_ELBOW: "RightForeArm", L_WRIST: "LeftHand", R_WRIST: "RightHand",
 }  # fmt: skip
 """Our joint: MOTIVE's, the 19 pairs of DuoBox's authors (reactmotion/utils/skeleton.py): the pelvis and 18 more.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -47,10 +48,25 @@ class LeanBlock:
         self.first, self.last = (linear_of(layer.weight, layer.bias, dtype) for layer in (first, last))
         self.norm_attention, self.norm_mlp = (norm_of(n, dtype) for n in (block.norm_attention, block.norm_mlp))
 
-    def __call__(self, x: Tensor, turn: Tensor | None, sees: Tensor | None, rows: Tensor | None = None) -> Tensor:
-        """x (B, L, d), turn (L, D / 2) complex or None, sees as for `TransformerBlock` -> (B, L or rows, d)
+    def __call__(
+        self,
+        x: Tensor,
+        turn: Tensor | None,
+        sees: Tensor | None,
+        rows: Tensor | None = None,
+        before: tuple[Tensor, Tensor] | None = None,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """One block, and the keys and values of its tokens.
 
-        With `rows` (r,) int only these are computed.
+        Args:
+            x: (B, L, d).
+            turn: (L, D / 2) complex, or None.
+            sees: (L, M + L) bool, or None.
+            rows: (r,) int, which tokens are wanted; None: all.
+            before: keys and values (B, M, heads, D) of tokens in front of these.
+
+        Returns:
+            (B, L or r, d), and keys and values (B, M + L, heads, D).
         """
         if rows is None:
             made = self.qkv(x).unflatten(-1, (3, self.heads, self.each))
@@ -63,16 +79,35 @@ class LeanBlock:
             sees = None if sees is None else sees[rows]
             if turn is not None:
                 query, key = turned(query, turn[rows][:, None]), turned(key, turn[:, None])
-        query, key, value = (each.transpose(1, 2) for each in (query, key, value))
-        looked = F.scaled_dot_product_attention(query, key, value, attn_mask=sees).transpose(1, 2).flatten(-2)
+        if before is not None:
+            key, value = torch.cat([before[0], key], dim=1), torch.cat([before[1], value], dim=1)
+        q, k, v = (each.transpose(1, 2) for each in (query, key, value))
+        looked = F.scaled_dot_product_attention(q, k, v, attn_mask=sees).transpose(1, 2).flatten(-2)
         x = self.norm_attention(self.out(looked, plus=x))
-        return self.norm_mlp(self.last(self.first(x, gelu=True), plus=x))
+        return self.norm_mlp(self.last(self.first(x, gelu=True), plus=x)), (key, value)
 
 
 def turned(x: Tensor, turn: Tensor) -> Tensor:
     """Neighbouring channels turned as one complex number. (..., D), complex (..., D / 2) -> (..., D)"""
     pairs = torch.view_as_complex(x.float().unflatten(-1, (-1, 2)))
     return torch.view_as_real(pairs * turn).flatten(-2).to(x.dtype)
+
+
+@dataclass
+class Memory:
+    """Keys and values of token steps that do not change from call to call, where attention is causal by block.
+
+    Earlier blocks do not see later ones, so what was computed of them once holds for all calls.
+
+    Attributes:
+        steps: so many first token steps, whole blocks.
+        blocks: (group of scenes, transformer block) -> keys and values (B, steps * people, heads, D).
+        answers: (B, steps, P, D) what was predicted of them.
+    """
+
+    steps: int
+    blocks: dict[tuple[int, int], tuple[Tensor, Tensor]] = field(default_factory=dict)
+    answers: Tensor | None = None
 
 
 class LeanTransformer:
@@ -107,37 +142,60 @@ class LeanTransformer:
         present: Tensor,
         cond: Tensor | None = None,
         wanted: Tensor | None = None,
+        memory: Memory | None = None,
     ) -> Tensor:
-        """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero."""
+        """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero.
+
+        With a `memory`, what this was last asked with it must have been the same but for the tokens behind it.
+        """
         B, N, _, _ = noisy.shape
-        entered = self._entered(noisy, levels, present)
+        begins, ends = self._span(N, wanted, memory)
+        entered = self._entered(noisy[:, begins:ends], levels[:, begins:ends], present)
         finished = torch.zeros_like(noisy)
-        extra = None
-        if self.condition is not None:
-            extra = self.condition(cond, B, N)
-        elif cond is not None:
-            raise ValueError(f"cond: got {tuple(cond.shape)}, expected none: the model has network.cond_dim 0")
-        for rows, slots in seats(present):
+        extra = self._extra(cond, B, N)
+        if extra is not None and extra.shape[1] > 1:
+            extra = extra[:, begins:ends]
+        for group, (rows, slots) in enumerate(seats(present)):
             x = entered[rows][:, :, slots] if rows is not None else entered[:, :, slots]
             for layer in self.entry:
                 x = layer(x)
             if extra is not None:
                 x = x + (extra if len(extra) == 1 or rows is None else extra[rows])
-            asked = None if wanted is None else wanted[:, slots].flatten().nonzero()[:, 0]
-            y = self._blocks(x.flatten(1, 2), N, x.shape[2], asked)
+            asked = None if wanted is None else wanted[begins:ends, slots].flatten().nonzero()[:, 0]
+            y = self._blocks(x, begins, asked, memory, group)
             answer = self.exit(y)
             if asked is not None:
-                whole = answer.new_zeros(len(x), N * x.shape[2], answer.shape[-1])
+                whole = answer.new_zeros(len(x), x.shape[1] * x.shape[2], answer.shape[-1])
                 whole[:, asked] = answer
                 answer = whole
-            answer = answer.unflatten(1, (N, -1))
+            answer = answer.unflatten(1, (ends - begins, -1))
             if rows is None:
-                finished[:, :, slots] = answer
+                finished[:, begins:ends, slots] = answer
             else:
-                finished[rows[:, None], :, torch.arange(finished.shape[2], device=noisy.device)[slots]] = (
-                    answer.transpose(1, 2)
-                )
+                finished[rows[:, None], begins:ends, slots] = answer.transpose(1, 2)
+        if memory is not None:
+            if begins and memory.answers is not None:
+                finished[:, :begins] = memory.answers
+            memory.answers = finished[:, : memory.steps].clone()
         return finished
+
+    def _span(self, N: int, wanted: Tensor | None, memory: Memory | None) -> tuple[int, int]:
+        """Which token steps are computed: behind those that are remembered, up to the last that a wanted one sees."""
+        block = self.options.causal_block
+        if memory is not None and (not block or memory.steps % block):
+            raise ValueError(f"memory of {memory.steps} token steps: expected whole blocks of network.causal_block")
+        begins = memory.steps if memory is not None and memory.blocks else 0
+        if not block or wanted is None or not bool(wanted.any()):
+            return begins, N
+        last = int(wanted.any(dim=1).nonzero()[-1])
+        return begins, max(min((last // block + 1) * block, N), begins)
+
+    def _extra(self, cond: Tensor | None, B: int, N: int) -> Tensor | None:
+        if self.condition is not None:
+            return self.condition(cond, B, N)
+        if cond is not None:
+            raise ValueError(f"cond: got {tuple(cond.shape)}, expected none: the model has network.cond_dim 0")
+        return None
 
     def _entered(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """What goes into the first layer. -> (B, N, P, ...)"""
@@ -153,20 +211,27 @@ class LeanTransformer:
             parts.append(self.agent.expand(B, N, P, -1))
         return torch.cat(parts, dim=-1)
 
-    def _blocks(self, x: Tensor, steps: int, people: int, asked: Tensor | None) -> Tensor:
-        """All blocks. (B, N * people, d) -> (B, N * people or as many as are asked for, d)"""
-        o = self.options
+    def _blocks(self, x: Tensor, begins: int, asked: Tensor | None, memory: Memory | None, group: int) -> Tensor:
+        """All blocks, of token steps from `begins` on. (B, n, p, d) -> (B, n * p or as many as are asked for, d)"""
+        o, people = self.options, x.shape[2]
+        steps, skipped = begins + x.shape[1], begins * people
+        x = x.flatten(1, 2)
         sees = seen(steps, people, o.causal_block, x.device)
+        sees = None if sees is None else sees[skipped:]
         turn = None
         if o.rope == "heads":
-            turn = turns(steps, people, o.width // o.heads, x.device)
+            turn = turns(steps, people, o.width // o.heads, x.device)[skipped:]
         elif o.rope == "hidden":
-            whole = turns(steps, people, o.width, x.device)
-            x = x + split_turned(x, whole)
+            x = x + split_turned(x, turns(steps, people, o.width, x.device)[skipped:])
         x = x.to(self.dtype)
-        for block in self.blocks[:-1]:
-            x = block(x, turn, sees)
-        return self.blocks[-1](x, turn, sees, asked).float()
+        for number, block in enumerate(self.blocks):
+            before = None if memory is None else memory.blocks.get((group, number))
+            x, pair = block(x, turn, sees, asked if number == len(self.blocks) - 1 else None, before)
+            if memory is not None and before is None:
+                keys, values = pair
+                kept = memory.steps * people
+                memory.blocks[group, number] = keys[:, :kept].clone(), values[:, :kept].clone()
+        return x.float()
 
 
 def split_turned(x: Tensor, turn: Tensor) -> Tensor:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from magnet.motion.frames import partners
-from magnet.motion.planar import nine_of, rotate_ground, yaw_ground
+from magnet.motion.planar import nine_of, rotate_ground, unit_of
 from magnet.motion.pose_graph import Planar, solve_pose_graph
-from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.normalizer import Normalizer
 
@@ -56,74 +59,158 @@ class PairwisePosterior(nn.Module):
             normalizer: how tokens are normalized.
 
         Returns:
-            (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s.
+            (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s; deltas shown clean are `noisy`'s.
         """
-        layout = self.layout
-        group_levels = layout.group_levels(levels)
-        latent, deltas, predicted = layout.unpack(normalizer.denormalize(clean))
-        shown = shown_clean(noisy, group_levels, layout, normalizer)
-        _, shown_deltas, shown_pairs = layout.unpack(shown)
-        known = (levels == 0)[..., None, None]
-        deltas = torch.where(known, shown_deltas, deltas)
-        solved = self._fused(deltas, predicted, shown_pairs, group_levels, present, normalizer)
-        packed = normalizer.normalize(layout.pack(latent, *(each.to(clean.dtype) for each in solved)))
-        pairs = layout.group_present(present)[..., 1:]
-        met = torch.cat([pairs.any(dim=-1, keepdim=True), pairs], dim=-1)[:, None]
-        return torch.where(layout.spread(met), packed, clean)
+        people = SlotsInUse.of(present, self.layout)
+        group_levels = people.layout.group_levels(people.levels(levels))  # (B, N, P, P) of those in use
+        mean, std = (people.transforms(each.expand_as(clean[:, :1])) for each in (normalizer.mean, normalizer.std))
+        predicted, given = people.transforms(clean), people.transforms(noisy)
+        # Clean tokens estimated from the noisy ones alone; at level K they tell nothing.
+        scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)[..., None, None]
+        shown, told = given / scale * std + mean, predicted * std + mean
+        deltas = torch.where((group_levels[..., :1] == 0)[..., None], shown[..., 0, :, :], told[..., 0, :, :])
+        told = torch.cat([deltas[..., None, :, :], told[..., 1:, :, :]], dim=-3)
+        weights = self._weights(group_levels, people.together, normalizer)
+        fused = frames_fused(_frames(told), _frames(shown), weights).to(clean.dtype)
+        fused = fused.unflatten(1, (-1, TOKEN_FRAMES)).permute(0, 1, 3, 4, 2, 5)
+        met = torch.cat([people.together.any(dim=-1, keepdim=True), people.together], dim=-1)[:, None, ..., None, None]
+        return people.with_transforms(clean, torch.where(met, (fused - mean) / std, predicted))
 
-    def _fused(
-        self,
-        deltas: Tensor,
-        predicted: Tensor,
-        shown: Tensor,
-        group_levels: Tensor,
-        present: Tensor,
-        normalizer: Normalizer,
-    ) -> tuple[Tensor, Tensor]:
-        """Posterior means in 9-D, as tokens hold them. -> deltas (B, N, P, 4, 9), pairs (B, N, P, P - 1, 4, 9)"""
-        step = yaw_ground(by_frame(deltas))
-        own = group_levels[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
-        pair_levels = group_levels[..., 1:].repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P, P - 1)
-        there = self.layout.group_present(present)[:, None, :, 1:]
-        deltas_known = own == 0
-        delta_ground = precision(torch.where(deltas_known, SHARPEST, self._at(self.log_delta_ground, own)))
-        delta_yaw = precision(torch.where(deltas_known, SHARPEST, self._at(self.log_delta_yaw, own)))
+    def _weights(self, group_levels: Tensor, together: Tensor, normalizer: Normalizer) -> Weights:
+        """How much each thing counts in each frame. group_levels (B, N, P, P), together (B, P, P - 1)"""
+        table = self._precisions(normalizer)
+        pairs = table[:4, group_levels[..., 1:]] * together[:, None]  # (4, B, N, P, P - 1)
+        total = pairs[:2] + pairs[2:]
+        share = pairs[2:] / total.clamp_min(1e-9)
+        own = group_levels[..., 0]
+        delta = table[4:6, own].repeat_interleave(TOKEN_FRAMES, dim=2)  # (2, B, T, P)
         # Where the window stands in the world is arbitrary: the first frame's deltas tie nobody to anything.
-        first = torch.zeros_like(delta_yaw[:, :1])
-        delta_yaw, delta_ground = (torch.cat([first, each[:, 1:]], dim=1) for each in (delta_yaw, delta_ground))
-        bent = torch.maximum(own, torch.nn.functional.pad(own[:, :-1], (0, 0, 1, 0)))
-        smooth = [precision(self._at(each, bent)) for each in (self.log_bend_yaw, self.log_bend_ground)]
-        guess = yaw_ground(pairwise_by_frame(predicted))
-        seen = yaw_ground(pairwise_by_frame(shown))
-        ground_noise, yaw_noise = shown_deviation(pair_levels, self.layout, normalizer)
-        weights = {
-            "yaw": (precision(self._at(self.log_pair_yaw, pair_levels)) * there, precision(yaw_noise) * there),
-            "ground": (precision(self._at(self.log_pair_ground, pair_levels)) * there, precision(ground_noise) * there),
-        }
-        turned = torch.atan2((seen[0] - guess[0]).sin(), (seen[0] - guess[0]).cos())
-        total_yaw = weights["yaw"][0] + weights["yaw"][1]
-        yaw = guess[0] + turned * weights["yaw"][1] / total_yaw.clamp_min(1e-9)
-        total = weights["ground"][0] + weights["ground"][1]
-        share = (weights["ground"][1] / total.clamp_min(1e-9))[..., None]
-        ground = guess[1] + share * (seen[1] - guess[1])
-        start = heading_at_start(yaw, step[0], total_yaw, present.int().argmax(dim=1))
-        zero = torch.zeros_like(start)[..., None].expand(*start.shape, 2)
-        solved_yaw, solved = solve_pose_graph(
-            Planar(*step, delta_yaw, delta_ground, *smooth), Planar(yaw, ground, total_yaw, total), start, zero
-        )
-        partner = partners(self.layout.agents, deltas.device)
-        apart = solved_yaw[:, :, partner] - solved_yaw[..., None]
-        away = rotate_ground(-solved_yaw[..., None], solved[:, :, partner] - solved[:, :, :, None])
-        turn = solved_yaw[:, 1:] - solved_yaw[:, :-1]
-        move = rotate_ground(-solved_yaw[:, :-1], solved[:, 1:] - solved[:, :-1])
-        led = torch.cat([by_frame(deltas)[:, :1].double(), nine_of(turn, move)], dim=1)
-        return by_token(led), pairwise_by_token(nine_of(apart, away))
+        delta = F.pad(delta[:, :, 1:], (0, 0, 1, 0))
+        own = own.repeat_interleave(TOKEN_FRAMES, dim=1)
+        smooth = table[6:, torch.maximum(own, F.pad(own[:, :-1], (0, 0, 1, 0)))]
+        total, share = torch.stack([total, share]).repeat_interleave(TOKEN_FRAMES, dim=3)
+        return Weights(delta, smooth, total, share)
 
-    def _at(self, knots: Tensor, levels: Tensor) -> Tensor:
-        """A learnt deviation at some levels. levels (...) int -> (...)"""
-        place = levels.float() * ((KNOTS - 1) / LEVELS)
-        low = place.long().clamp(max=KNOTS - 2)
-        return torch.lerp(knots[low], knots[low + 1], place - low).exp()
+    def _precisions(self, normalizer: Normalizer) -> Tensor:
+        """Precisions by level: of predicted and of shown pairwise transforms, of deltas and of how their error changes,
+        each of yaws and of ground positions. -> (8, K + 1) float64"""
+        knots = torch.stack(
+            [
+                *(self.log_pair_yaw, self.log_pair_ground),
+                *(self.log_delta_yaw, self.log_delta_ground),
+                *(self.log_bend_yaw, self.log_bend_ground),
+            ]
+        )
+        log = F.interpolate(knots.double()[None], size=LEVELS + 1, mode="linear", align_corners=True)[0]
+        pair, delta, bend = (-2 * log).exp().split(2)
+        delta = torch.cat([torch.full_like(delta[:, :1], SHARPEST**-2), delta[:, 1:]], dim=1)  # level 0: shown clean
+        return torch.cat([pair, shown_precisions(self.layout, normalizer), delta, bend])
+
+
+@dataclass(frozen=True)
+class SlotsInUse:
+    """Where a batch's people are: as many slots of each scene as the fullest needs, those with people first.
+
+    Attributes:
+        layout: of tokens with so many slots, P below.
+        slots: (B, P) int.
+        groups: (B, P, P) int, an agent's own group and those of its partners.
+        together: (B, P, P - 1) bool, whether an agent and its partner are both present.
+    """
+
+    layout: TokenLayout
+    slots: Tensor
+    groups: Tensor
+    together: Tensor
+
+    @classmethod
+    def of(cls, present: Tensor, layout: TokenLayout) -> SlotsInUse:
+        # On a GPU all slots: counting people would have to wait for it.
+        most = max(2, int(present.sum(dim=1).max())) if present.device.type == "cpu" else layout.agents
+        slots = (~present).int().argsort(dim=1, stable=True)[:, :most]
+        own, other = slots[..., None], slots[:, partners(most, present.device)]
+        groups = torch.cat([torch.zeros_like(own), other + (other < own)], dim=-1)
+        small = replace(layout, agents=most)
+        return cls(small, slots, groups, small.group_present(present.gather(1, slots))[..., 1:])
+
+    def levels(self, levels: Tensor) -> Tensor:
+        """(B, N, P of the batch) -> (B, N, P)"""
+        return levels.gather(2, self.slots[:, None].expand(-1, levels.shape[1], -1))
+
+    def transforms(self, tokens: Tensor) -> Tensor:
+        """(B, N, P of the batch, D) -> deltas and pairwise transforms of those in use, (B, N, P, P, 4, 9)"""
+        return self._by_group(tokens)[self._where(tokens.shape[1])]
+
+    def with_transforms(self, tokens: Tensor, transforms: Tensor) -> Tensor:
+        """Tokens (B, N, P of the batch, D) with other transforms."""
+        tokens = tokens.clone()
+        self._by_group(tokens)[self._where(tokens.shape[1])] = transforms
+        return tokens
+
+    def _by_group(self, tokens: Tensor) -> Tensor:
+        return tokens[..., self.layout.latent :].unflatten(-1, (-1, TOKEN_FRAMES, 9))
+
+    def _where(self, steps: int) -> tuple[Tensor, ...]:
+        scene, step = (torch.arange(count, device=self.slots.device) for count in (len(self.slots), steps))
+        return scene[:, None, None, None], step[:, None, None], self.slots[:, None, :, None], self.groups[:, None]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each thing counts; the first of each two for yaws, the other for ground positions. All float64.
+
+    Attributes:
+        delta: (2, B, T, P) precision of deltas.
+        smooth: (2, B, T, P) precision of how their error changes from frame to frame.
+        pair: (2, B, T, P, P - 1) precision of pairwise transforms, shown and predicted together.
+        share: (2, B, T, P, P - 1) what of that is the shown ones'.
+    """
+
+    delta: Tensor
+    smooth: Tensor
+    pair: Tensor
+    share: Tensor
+
+
+def frames_fused(told: Tensor, shown: Tensor, weights: Weights) -> Tensor:
+    """Posterior means: one motion, by what a network told and what it was shown.
+
+    Args:
+        told: (B, T, P, P, 9); the first of an agent's P transforms are its deltas, the others lead to its partners.
+        shown: (B, T, P, P, 9); its deltas are not read.
+        weights: of both.
+
+    Returns:
+        (B, T, P, P, 9) float64. The first frame's deltas are those told.
+    """
+    turns, moves = (torch.stack([told[..., i : i + 3 : 2], shown[..., i : i + 3 : 2]]).double() for i in (0, 6))
+    yaw = torch.atan2(-turns[0, ..., 1], turns[0, ..., 0])
+    guess, seen = turns[..., 1:, :]
+    cross = guess[..., 1] * seen[..., 0] - guess[..., 0] * seen[..., 1]
+    turned = torch.atan2(cross, (guess * seen).sum(dim=-1))
+    pair_yaw = yaw[..., 1:] + weights.share[0] * turned
+    pair_ground = torch.lerp(moves[0, ..., 1:, :], moves[1, ..., 1:, :], weights.share[1, ..., None])
+    start = heading_at_start(pair_yaw, yaw[..., 0], weights.pair[0])
+    heading, place = solve_pose_graph(
+        Planar(yaw[..., 0], moves[0, ..., 0, :], *weights.delta, *weights.smooth),
+        Planar(pair_yaw, pair_ground, *weights.pair),
+        start,
+        torch.zeros_like(start)[..., None].expand(-1, -1, 2),
+    )
+    pose = torch.cat([heading[..., None], place], dim=-1)
+    # From the frame before to this one, and from an agent to its partners.
+    before, here = torch.cat([pose[:, :1], pose[:, :-1]], dim=1)[..., None, :], pose[..., None, :]
+    others = pose[:, :, partners(pose.shape[2], pose.device)]
+    origin = torch.cat([before, here.expand_as(others)], dim=-2)
+    gap = torch.cat([here, others], dim=-2) - origin
+    nine = nine_of(gap[..., 0], rotate_ground(-origin[..., 0], gap[..., 1:]))
+    nine[:, 0, :, 0] = told[:, 0, :, 0].double()
+    return nine
+
+
+def _frames(tokens: Tensor) -> Tensor:
+    """(B, N, P, P, 4, 9) -> (B, T, P, P, 9)"""
+    return tokens.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)
 
 
 def deviation(value: float) -> nn.Parameter:
@@ -131,43 +218,26 @@ def deviation(value: float) -> nn.Parameter:
     return nn.Parameter(torch.full((KNOTS,), value).log())
 
 
-def shown_clean(noisy: Tensor, group_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> Tensor:
-    """Clean tokens estimated from the noisy ones alone, in real units; at level K they tell nothing."""
-    scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)
-    return normalizer.denormalize(noisy / layout.spread(scale))
+def shown_precisions(layout: TokenLayout, normalizer: Normalizer) -> Tensor:
+    """Precisions of pairwise transforms that are shown, by level: 1 / rad^2, 1 / m^2. -> (2, K + 1) float64
 
-
-def shown_deviation(pair_levels: Tensor, layout: TokenLayout, normalizer: Normalizer) -> tuple[Tensor, Tensor]:
-    """Standard deviation of what is shown of pairwise transforms. (...) int -> metres (...), radians (...)
-
-    A heading is read off four of the nine numbers (`yaw_ground`): about a turn, their noise of standard deviation s in
-    each leaves s / sqrt(2) radians.
+    A heading is read off two of the nine numbers: about a turn, their noise of standard deviation s in each leaves
+    s / sqrt(2) radians, for there are two more that say the same.
     """
-    alpha = alpha_bar(pair_levels)
-    noise = ((1 - alpha) / alpha.clamp_min(1e-6)).sqrt()
-    first = layout.latent + 9 * TOKEN_FRAMES
-    std = normalizer.std[first : first + 9]
-    cosine, sine = std[[0]].square().mean(), std[[2]].square().mean()
-    turning = noise * ((cosine + sine) / 2).sqrt()
-    moving = noise * std[[6, 8]].square().mean().sqrt()
-    return moving.clamp_min(SHARPEST), (turning * (1 + turning.square()).sqrt()).clamp_min(SHARPEST)
+    alpha = alpha_bar(torch.arange(LEVELS + 1, device=normalizer.std.device)).double()
+    noise = (1 - alpha) / alpha.clamp_min(1e-6)
+    std = normalizer.std[layout.latent + 9 * TOKEN_FRAMES :][:9].double()
+    turning = noise * std[:3:2].square().sum() / 2
+    moving = noise * std[6::2].square().mean()
+    return torch.stack([turning * (1 + turning), moving]).clamp_min(SHARPEST**2).reciprocal()
 
 
-def precision(deviation: Tensor) -> Tensor:
-    return deviation.double().square().reciprocal()
+def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor) -> Tensor:
+    """Headings at the start that fit pairwise headings roughly, so that what is left is far from a half turn.
 
-
-def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor, anchor: Tensor) -> Tensor:
-    """Initial headings that roughly fit the pairwise headings, so that residuals stay far from a half turn.
-
-    yaw, weight (B, T, P, P - 1), delta_yaw (B, T, P), anchor (B,) somebody present in each scene -> (B, P), 0 for the
-    anchor
+    yaw, weight (B, T, P, P - 1), delta_yaw (B, T, P) -> (B, P), 0 for the first agent, who must be present
     """
-    B, _, P, _ = yaw.shape
-    scene, partner = torch.arange(B, device=yaw.device), partners(P, yaw.device)[anchor]  # (B, P - 1)
     along = delta_yaw.cumsum(dim=1)
-    others = along.gather(2, partner[:, None].expand(-1, along.shape[1], -1))
-    offset = yaw[scene, :, anchor] - others + along[scene, :, anchor][..., None]  # (B, T, P - 1)
-    w = weight[scene, :, anchor]
-    mean = torch.atan2((w * offset.sin()).sum(dim=1), (w * offset.cos()).sum(dim=1))
-    return torch.zeros(B, P, dtype=mean.dtype, device=yaw.device).scatter(1, partner, mean)
+    offset = yaw[:, :, 0] - along[..., 1:] + along[..., :1]  # (B, T, P - 1)
+    total = (weight[:, :, 0, :, None] * unit_of(offset)).sum(dim=1)
+    return F.pad(torch.atan2(total[..., 1], total[..., 0]), (1, 0))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from magnet.denoiser.lean import lean
+from magnet.denoiser.lean import Memory, lean
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
@@ -276,7 +276,12 @@ class Rollout:
         self._left = len(stage.levels) - 1
         # A token that is known may hold pairwise transforms to somebody who is not.
         begins, ends = (self.model.layout.group_levels(levels) for levels in stage.levels[[0, -1]])
-        self._asked = torch.nn.functional.pad((begins != ends).any(dim=-1), (0, 0, 0, stage.ahead))
+        changes = (begins != ends).any(dim=-1)
+        self._asked = torch.nn.functional.pad(changes, (0, 0, 0, stage.ahead))
+        # Where attention is causal, what lies before the first change is the same in all steps of a stage.
+        block = self.model.network.causal_block
+        still = int(changes.any(dim=1).int().argmax()) // block * block if block else 0
+        self._memory = Memory(still) if still else None
 
     def _network(self) -> Callable[..., Tensor]:
         """What predicts: the transformer as it was trained, or its lean form."""
@@ -288,7 +293,8 @@ class Rollout:
         self._left -= 1
         if self._left == 0 and self.expected.most:
             self._asked[len(self._asked) - self._ahead :] = True
-        return functools.partial(lean(network, precision), wanted=None if whole else self._asked)
+        asked = None if whole else self._asked
+        return functools.partial(lean(network, precision), wanted=asked, memory=self._memory)
 
     def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""

@@ -5,6 +5,7 @@ frames to each other, pairwise transforms relate agents to each other, and each 
 Errors of predicted deltas are alike in neighbouring frames (somebody walks a little too fast for a while), so a
 correction may be asked to be smooth: then high frequencies come from the deltas, and low ones from the pairs.
 Headings are solved first, then positions with those headings: two linear systems in closed form, without iterations.
+Frames are tied to the two before them only, so runs of frames are eliminated at once, in few and batched operations.
 """
 
 from __future__ import annotations
@@ -13,12 +14,19 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magnet.motion.frames import partners
-from magnet.motion.planar import rotate_ground
+from magnet.motion.planar import rotate_by, unit_of
 
 GAUGE = 1e-6
 """Small precision of the integrated deltas, which decides where nothing else determines a position."""
+
+DENSE = 64
+"""Up to so many unknowns a system is factored whole; larger ones are reduced first."""
+
+RUN = 4
+"""Blocks of two frames in a run, all but the last of which are eliminated at once."""
 
 
 @dataclass(frozen=True)
@@ -60,106 +68,159 @@ def solve_pose_graph(deltas: Planar, pairs: Planar, start_yaw: Tensor, start_gro
     """
     start_yaw, start_ground = start_yaw.double(), start_ground.double()
     partner = partners(deltas.yaw.shape[2], deltas.yaw.device)
+    # The matrices depend on precisions only, so that of headings and that of positions are factored together.
+    held = torch.stack([deltas.yaw_precision, deltas.ground_precision]).double()
+    smooth = [0 * deltas.yaw_precision if s is None else s for s in (deltas.yaw_smoothness, deltas.ground_smoothness)]
+    tied = torch.stack([pairs.yaw_precision, pairs.ground_precision]).double()
+    systems = factor(*_in_twos(*_bands(held, torch.stack(smooth).double(), tied, partner)))
     yaw = start_yaw[:, None] + deltas.yaw.double().cumsum(dim=1)
     off = pairs.yaw.double() - (yaw[:, :, partner] - yaw[..., None])
     off = torch.atan2(off.sin(), off.cos())
-    correction = _correct(deltas.yaw_precision, deltas.yaw_smoothness, pairs.yaw_precision, off[..., None])
-    yaw = yaw + correction[..., 0]
-    before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
-    ground = start_ground[:, None] + rotate_ground(before, deltas.ground.double()).cumsum(dim=1)
-    seen = rotate_ground(yaw[..., None], pairs.ground.double())
+    yaw = yaw + _corrections(systems[0], tied[0], off[..., None], partner)[..., 0]
+    unit = unit_of(yaw)
+    before = torch.cat([unit_of(start_yaw)[:, None], unit[:, :-1]], dim=1)
+    ground = start_ground[:, None] + rotate_by(before, deltas.ground.double()).cumsum(dim=1)
+    seen = rotate_by(unit[:, :, :, None], pairs.ground.double())
     away = seen - (ground[:, :, partner] - ground[:, :, :, None])
-    return yaw, ground + _correct(deltas.ground_precision, deltas.ground_smoothness, pairs.ground_precision, away)
+    return yaw, ground + _corrections(systems[1], tied[1], away, partner)
 
 
-def _correct(delta_precision: Tensor, smoothness: Tensor | None, pair_precision: Tensor, off: Tensor) -> Tensor:
+def _corrections(system: BlockTridiagonal, tied: Tensor, off: Tensor, partner: Tensor) -> Tensor:
     """Correction of each agent's integrated path in each frame.
 
-    delta_precision, smoothness (B, T, P), pair_precision (B, T, P, P - 1), off (B, T, P, P - 1, C), how far each
-    pairwise transform is from the integrated paths -> (B, T, P, C)
+    tied (B, T, P, P - 1) precisions, off (B, T, P, P - 1, C), how far each pairwise transform is from the integrated
+    paths -> (B, T, P, C)
     """
-    B, T, P = delta_precision.shape
-    delta, pair = delta_precision.double(), pair_precision.double()
-    partner = partners(P, delta.device)
-    pull = pair[..., None] * off
+    B, T, P, _, C = off.shape
+    pull = tied[..., None] * off
     right = (-pull.sum(dim=3)).index_add(2, partner.flatten(), pull.flatten(2, 3))
-    # Ordered pairs both ways as one symmetric matrix a frame: (B, T, P, P).
-    tie = torch.zeros(B, T, P, P, dtype=delta.dtype, device=delta.device).scatter(3, partner.expand(B, T, P, -1), pair)
-    tie = tie + tie.transpose(2, 3)
-    own = delta + _ahead(delta, 1) + GAUGE
-    if smoothness is None:
-        return solve_block_tridiagonal(_tied(own, tie), torch.diag_embed(-delta), right)
-    # (c[t] - 2 c[t - 1] + c[t - 2])^2, each times smoothness[t]: frames are coupled with the two before them.
-    bend = torch.nn.functional.pad(smoothness.double()[:, 2:], (0, 0, 2, 0))[:, :T]
-    own = own + bend + 4 * _ahead(bend, 1) + _ahead(bend, 2)
-    return _solve_in_twos(_tied(own, tie), -delta - 2 * bend - 2 * _ahead(bend, 1), bend, right)
+    right = pad(right, (0, 0, 0, 0, 0, T % 2))
+    return system.solve(right.view(B, -1, 2 * P, C)).view(B, -1, P, C)[:, :T]
 
 
-def _tied(own: Tensor, tie: Tensor) -> Tensor:
-    """own (B, T, P) and what ties agents to each other (B, T, P, P) -> each frame's own block (B, T, P, P)"""
-    return torch.diag_embed(own + tie.sum(dim=3)) - tie
+def _bands(held: Tensor, smooth: Tensor, tied: Tensor, partner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The matrix whose solutions are corrections: each frame is tied to the two before it.
+
+    held, smooth (..., T, P) precisions of deltas and of their changes, tied (..., T, P, P - 1) of pairs -> each frame's
+    own block (..., T, P, P), and what ties agents to themselves one and two frames before, (..., T, P) each
+    """
+    P = held.shape[-1]
+    # Ordered pairs both ways as one symmetric matrix a frame: (..., T, P, P).
+    both = torch.zeros(*held.shape, P, dtype=held.dtype, device=held.device)
+    both = both.scatter(-1, partner.expand(tied.shape), tied)
+    both = both + both.transpose(-1, -2)
+    # (c[t] - 2 c[t - 1] + c[t - 2])^2, each times smooth[t]
+    bend = torch.cat([torch.zeros_like(smooth[..., :2, :]), smooth[..., 2:, :]], dim=-2)[..., : held.shape[-2], :]
+    bend_next, bend_after = _ahead(bend, 1), _ahead(bend, 2)
+    own = held + _ahead(held, 1) + bend + 4 * bend_next + bend_after + GAUGE + both.sum(dim=-1)
+    return torch.diag_embed(own) - both, -held - 2 * (bend + bend_next), bend
 
 
 def _ahead(frames: Tensor, count: int) -> Tensor:
-    """Each frame's value some frames later, 0 beyond the end. (B, T, P) -> same"""
-    return torch.nn.functional.pad(frames[:, count:], (0, 0, 0, count))[:, : frames.shape[1]]
+    """Each frame's value some frames later, 0 beyond the end. (..., T, P) -> same"""
+    return pad(frames[..., count:, :], (0, 0, 0, count))[..., : frames.shape[-2], :]
 
 
-def _solve_in_twos(diagonal: Tensor, before: Tensor, second: Tensor, right: Tensor) -> Tensor:
-    """Solve a system that couples each frame with the two before it, as one of blocks of two frames.
+def _in_twos(own: Tensor, before: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Bands of single frames as blocks of two, which are tied to the block before only; an odd frame is paired with
+    one that is tied to nothing.
 
-    diagonal (B, T, P, P), before and second (B, T, P), what couples an agent with itself one and two frames before,
-    right (B, T, P, C) -> (B, T, P, C)
+    own (..., T, P, P), before and second (..., T, P) -> (..., T / 2, 2 P, 2 P) each: own blocks, ties
     """
-    B, T, P = right.shape[:3]
-    if T % 2:  # one frame more, tied to nothing
-        eye = torch.eye(P, dtype=diagonal.dtype, device=diagonal.device).expand(B, 1, P, P)
-        diagonal = torch.cat([diagonal, eye], dim=1)
-        before, second, right = (torch.cat([x, torch.zeros_like(x[:, :1])], dim=1) for x in (before, second, right))
+    if own.shape[-3] % 2:
+        own = _with_unit_blocks(own, 1)
+        before, second = (pad(each, (0, 0, 0, 1)) for each in (before, second))
     near, far = torch.diag_embed(before), torch.diag_embed(second)
-    nothing = torch.zeros_like(near[:, ::2])
-    upper = torch.cat([diagonal[:, ::2], near[:, 1::2]], dim=3)
-    lower = torch.cat([near[:, 1::2], diagonal[:, 1::2]], dim=3)
-    lead = torch.cat([far[:, ::2], near[:, ::2]], dim=3)
-    tail = torch.cat([nothing, far[:, 1::2]], dim=3)
-    blocks = torch.cat([upper, lower], dim=2), torch.cat([lead, tail], dim=2)
-    solved = solve_block_tridiagonal(*blocks, right.unflatten(1, (-1, 2)).flatten(2, 3))
-    return solved.unflatten(2, (2, P)).flatten(1, 2)[:, :T]
+    inside, nothing = near[..., 1::2, :, :], torch.zeros_like(far[..., 1::2, :, :])
+    upper = torch.cat([own[..., ::2, :, :], inside], dim=-1)
+    lower = torch.cat([inside, own[..., 1::2, :, :]], dim=-1)
+    lead = torch.cat([far[..., ::2, :, :], near[..., ::2, :, :]], dim=-1)
+    tail = torch.cat([nothing, far[..., 1::2, :, :]], dim=-1)
+    return torch.cat([upper, lower], dim=-2), torch.cat([lead, tail], dim=-2)
 
 
-def solve_block_tridiagonal(diagonal: Tensor, before: Tensor, right: Tensor) -> Tensor:
-    """Solve a symmetric positive definite system whose blocks couple neighbouring frames only, by cyclic reduction.
+def _with_unit_blocks(blocks: Tensor, count: int) -> Tensor:
+    """Blocks (..., T, P, P) with some more at the end that are tied to nothing."""
+    unit = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device)
+    return torch.cat([blocks, unit.expand(*blocks.shape[:-3], count, -1, -1)], dim=-3)
 
-    Every second frame is eliminated at once, so that T frames take log2 T rounds of batched small products.
+
+@dataclass(frozen=True)
+class BlockTridiagonal:
+    """A factored symmetric positive definite matrix, whose blocks are tied to neighbouring ones only; see `factor`.
+
+    Attributes:
+        inner: Cholesky factors of what is eliminated: the whole matrix (..., T P, T P), or the first blocks of each run
+            (..., S, (RUN - 1) P, (RUN - 1) P).
+        reach: (..., S, (RUN - 1) P, 2 P) how these follow the last block of the run before and that of their own; None:
+            nothing is left.
+        rest: what is left, the last block of each run.
+    """
+
+    inner: Tensor
+    reach: Tensor | None = None
+    rest: BlockTridiagonal | None = None
+
+    def __getitem__(self, index: int) -> BlockTridiagonal:
+        """One of several matrices that were factored together."""
+        if self.reach is None or self.rest is None:
+            return BlockTridiagonal(self.inner[index])
+        return BlockTridiagonal(self.inner[index], self.reach[index], self.rest[index])
+
+    def solve(self, right: Tensor) -> Tensor:
+        """(..., T, P, C) -> (..., T, P, C)"""
+        if self.reach is None or self.rest is None:
+            return torch.cholesky_solve(right.flatten(-3, -2), self.inner).view(right.shape)
+        T, P = right.shape[-3:-1]
+        runs = pad(right, (0, 0, 0, 0, 0, -T % RUN)).unflatten(-3, (-1, RUN))
+        first = runs[..., :-1, :, :].flatten(-3, -2)
+        carried = self.reach.transpose(-1, -2) @ first
+        onto = pad(carried[..., 1:, :P, :], (0, 0, 0, 0, 0, 1)) + carried[..., P:, :]
+        last = self.rest.solve(runs[..., -1, :, :] - onto)
+        around = torch.cat([pad(last, (0, 0, 0, 0, 1, -1)), last], dim=-2)
+        first = torch.cholesky_solve(first, self.inner) - self.reach @ around
+        both = torch.cat([first.unflatten(-2, (-1, P)), last.unsqueeze(-3)], dim=-3)
+        return both.flatten(-4, -3)[..., :T, :, :]
+
+
+def factor(diagonal: Tensor, before: Tensor) -> BlockTridiagonal:
+    """Factor a symmetric positive definite matrix whose blocks are tied to neighbouring ones only.
+
+    All but the last block of each run are eliminated at once, which leaves a matrix of the same kind: T blocks take
+    log T rounds of batched products, each by a factor of `RUN` smaller.
 
     Args:
-        diagonal: (B, T, P, P) each frame's own block.
-        before: (B, T, P, P) block that ties a frame to the one before it; that of the first frame is not read.
-        right: (B, T, P, C).
-
-    Returns:
-        (B, T, P, C).
+        diagonal: (..., T, P, P) each block on the diagonal.
+        before: (..., T, P, P) what ties a block to the one before it; that of the first is not read.
     """
-    T = diagonal.shape[1]
-    if T == 1:
-        return torch.linalg.solve(diagonal, right)
-    before = torch.cat([torch.zeros_like(before[:, :1]), before[:, 1:]], dim=1)
-    if T % 2:  # one frame more, tied to nothing
-        eye = torch.eye(diagonal.shape[-1], dtype=diagonal.dtype, device=diagonal.device)
-        diagonal = torch.cat([diagonal, eye.expand_as(diagonal[:, :1])], dim=1)
-        before, right = (torch.cat([each, torch.zeros_like(each[:, :1])], dim=1) for each in (before, right))
-    lead, tail = before[:, 0::2], before[:, 1::2]  # into even frames from odd ones, into odd frames from even ones
-    inverse = torch.linalg.inv(diagonal[:, 1::2])
-    # What an even frame gets from the odd frame behind it, and from the odd frame ahead of it.
-    ahead = tail.transpose(-1, -2) @ inverse
-    behind = lead[:, 1:] @ inverse[:, :-1]
-    odd = right[:, 1::2]
-    kept = diagonal[:, 0::2] - ahead @ tail
-    kept_right = right[:, 0::2] - ahead @ odd
-    kept = torch.cat([kept[:, :1], kept[:, 1:] - behind @ lead[:, 1:].transpose(-1, -2)], dim=1)
-    kept_right = torch.cat([kept_right[:, :1], kept_right[:, 1:] - behind @ odd[:, :-1]], dim=1)
-    tied = torch.cat([torch.zeros_like(lead[:, :1]), -behind @ tail[:, :-1]], dim=1)
-    even = solve_block_tridiagonal(kept, tied, kept_right)
-    following = torch.cat([lead[:, 1:].transpose(-1, -2) @ even[:, 1:], torch.zeros_like(even[:, :1])], dim=1)
-    between = inverse @ (odd - tail @ even - following)
-    return torch.stack([even, between], dim=2).flatten(1, 2)[:, :T]
+    T, P = diagonal.shape[-3:-1]
+    if T * P <= DENSE or T == 1:
+        return BlockTridiagonal(_cholesky(_whole(diagonal, before)))
+    if T % RUN:
+        diagonal = _with_unit_blocks(diagonal, -T % RUN)
+        before = pad(before, (0, 0, 0, 0, 0, -T % RUN))
+    before = torch.cat([torch.zeros_like(before[..., :1, :, :]), before[..., 1:, :, :]], dim=-3)
+    diagonal, before = diagonal.unflatten(-3, (-1, RUN)), before.unflatten(-3, (-1, RUN))
+    inner = _cholesky(_whole(diagonal[..., :-1, :, :], before[..., :-1, :, :]))
+    # What ties the first blocks of a run to the last one of the run before and to that of their own.
+    entry, leave = before[..., 0, :, :], before[..., -1, :, :].transpose(-1, -2)
+    further = (RUN - 2) * P
+    ties = torch.cat([pad(entry, (0, 0, 0, further)), pad(leave, (0, 0, further, 0))], dim=-1)
+    reach = torch.cholesky_solve(ties, inner)
+    left = ties.transpose(-1, -2) @ reach
+    onto = pad(left[..., 1:, :P, :P], (0, 0, 0, 0, 0, 1)) + left[..., P:, P:]
+    return BlockTridiagonal(inner, reach, factor(diagonal[..., -1, :, :] - onto, -left[..., P:, :P]))
+
+
+def _cholesky(matrix: Tensor) -> Tensor:
+    # Without checks, for which a GPU would have to be waited for: GAUGE makes all of these positive definite.
+    return torch.linalg.cholesky_ex(matrix).L
+
+
+def _whole(diagonal: Tensor, before: Tensor) -> Tensor:
+    """The matrix that blocks stand for. (..., T, P, P) x 2 -> (..., T P, T P)"""
+    size = diagonal.shape[-3] * diagonal.shape[-1]
+    below = torch.diag_embed(before[..., 1:, :, :].movedim(-3, -1), offset=-1, dim1=-4, dim2=-2)
+    own = torch.diag_embed(diagonal.movedim(-3, -1), dim1=-4, dim2=-2)
+    below, own = (each.reshape(*diagonal.shape[:-3], size, size) for each in (below, own))
+    return own + below + below.transpose(-1, -2)

@@ -8,8 +8,9 @@ import roma
 import torch
 from torch import Tensor
 
+from magnet.body import load_body
 from magnet.motion.frames import rigid
-from magnet.motion.scene import Scene
+from magnet.motion.scene import FPS, Scene
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -23,7 +24,7 @@ def random_scene(
 
     def smooth(*shape: int, scale: float) -> Tensor:
         """A few slow sine waves along the second axis."""
-        time = torch.linspace(0, frames / 30, frames).view(1, -1, *[1] * (len(shape) - 2))
+        time = torch.linspace(0, frames / FPS, frames).view(1, -1, *[1] * (len(shape) - 2))
         wave = torch.zeros(shape)
         for frequency in (0.3, 0.7, 1.3):
             size = torch.randn(shape[0], 1, *shape[2:], generator=generator)
@@ -45,6 +46,15 @@ def random_scene(
         present=torch.ones(scenes, agents, dtype=torch.bool),
     )
     return scene if present is None else without_absent(scene.replace(present=present))
+
+
+def standing_people(frames: int = 60, agents: int = 2, apart: float = 1.0) -> Tensor:
+    """Joints of people of average shape who stand still in the T pose, in a row. -> (1, T, P, 22, 3) metres"""
+    body = load_body("open")
+    rest = body.rest_joints(torch.zeros(10))
+    rest = rest - torch.tensor([0.0, float(body.v_template[:, 1].min()), 0.0])
+    aside = apart * torch.arange(agents)[:, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    return (rest + aside).expand(1, frames, agents, -1, 3)
 
 
 def without_absent(scene: Scene) -> Scene:

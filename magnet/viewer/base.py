@@ -11,6 +11,7 @@ import numpy as np
 
 from magnet.body.base import Body
 from magnet.export.page.rig import VIEWS, Array
+from magnet.motion.scene import FPS
 from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scene_view import RenderOptions, SceneView
@@ -18,7 +19,7 @@ from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start
 from magnet.viewer.timeline import Timeline, Tracks
 
-RATE = 30.0
+RATE = FPS
 """Frames a second that are sent at most."""
 SETTLES = 0.3
 """Seconds after which a slider that was moved is taken to be let go."""
@@ -48,7 +49,7 @@ class ViewerBase:
         self.body = body
         self.server = start(host, port, title)
         self.port = self.server.get_port()
-        self.clock = Clock(1, 30.0)
+        self.clock = Clock(1, FPS)
         self.render = render
         self.views: list[SceneView] = []
         self.lock = threading.RLock()

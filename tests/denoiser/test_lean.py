@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.denoiser.lean import LeanTransformer, lean
+from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
@@ -104,3 +104,44 @@ def test_it_is_made_once_and_again_when_weights_change() -> None:
     torch.testing.assert_close(lean(made)(*asked), made(*asked), rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="expected float32"):
         lean(made.bfloat16())
+
+
+@pytest.mark.parametrize("rope", ["heads", "hidden"])
+@pytest.mark.parametrize("block", [1, 2, 4])
+@pytest.mark.parametrize("present", [PRESENT["all"], PRESENT["mixed"]], ids=["all", "mixed"])
+@torch.no_grad()
+def test_with_a_memory_it_predicts_what_it_does_without(block: int, rope: str, present: Tensor) -> None:
+    """Denoising steps change the tokens from the fifth on: what lies before is computed once."""
+    made = LeanTransformer(network(causal_block=block, rope=rope))
+    noisy, levels, _ = question(made, 4, 10)  # type: ignore[arg-type]
+    still = 5 // block * block
+    memory = Memory(still)
+    wanted = torch.zeros(10, 3, dtype=torch.bool)
+    wanted[5:7] = True
+    for step in range(3):
+        noisy, levels = noisy.clone(), levels.clone()
+        noisy[:, 5:] += 1.0
+        levels[:, 5:] = (levels[:, 5:] - 100 * step).clamp(min=0)
+        plain = made(noisy, levels, present)
+        cached = made(noisy, levels, present, None, wanted if step else None, memory)
+        counts = wanted.clone() if step else torch.ones_like(wanted)
+        counts[:still] = True  # remembered
+        torch.testing.assert_close(cached[:, counts], plain[:, counts], rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_a_memory_spares_what_it_holds_and_needs_causal_attention(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = LeanTransformer(network(causal_block=2))
+    noisy, levels, present = question(made, 1, 10)  # type: ignore[arg-type]
+    rows: list[int] = []
+    first = made.blocks[0].qkv
+    monkeypatch.setattr(made.blocks[0], "qkv", lambda x: (rows.append(x.shape[1]), first(x))[1])
+    memory, wanted = Memory(6), torch.zeros(10, 3, dtype=torch.bool)
+    wanted[6] = True
+    for _ in range(3):
+        made(noisy, levels, present, None, wanted, memory)
+    assert rows == [8 * 3, 2 * 3, 2 * 3], "all but what nobody sees, then the block that changes alone"
+    with pytest.raises(ValueError, match="whole blocks"):
+        made(noisy, levels, present, None, wanted, Memory(3))
+    with pytest.raises(ValueError, match="whole blocks"):
+        LeanTransformer(network())(noisy, levels, present, None, wanted, Memory(4))

@@ -1,15 +1,17 @@
 """Pairwise transforms as their posterior: never worse than what is shown, for any number of people."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.pairwise_posterior import PairwisePosterior
+from magnet.denoiser.pairwise_posterior import KNOTS, SHARPEST, PairwisePosterior
 from magnet.motion.frames import from_9d, propagate_pairwise
 from magnet.motion.planar import yaw_ground
+from magnet.motion.pose_graph import GAUGE
 from magnet.motion.tokens import by_frame, pairwise_by_frame
-from magnet.sampling.noise import LEVELS, add_noise
+from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
 from magnet.testing import random_scene, reordered, tiny_denoiser
 
 Shown = tuple[Tensor, Tensor, Tensor]
@@ -147,6 +149,115 @@ def test_people_are_alike_in_whichever_slots_they_are(model: Denoiser):
     tokens = [reordered(each, order, model.layout) for each in (guess, noisy)]
     moved = posterior(*tokens, levels[:, :, order], present[:, order], model.normalizer)
     assert torch.allclose(reordered(plain, order, model.layout), moved, atol=1e-3)
+
+
+def turned(yaw: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Ground vectors (x, z) turned about the vertical: z goes towards x."""
+    x, z = ground[..., 0], ground[..., 1]
+    return np.stack([np.cos(yaw) * x + np.sin(yaw) * z, np.cos(yaw) * z - np.sin(yaw) * x], axis=-1)
+
+
+def dense_corrections(delta: np.ndarray, bend: np.ndarray, pair: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Weighted least squares, a row for each term. delta, bend (T, n), pair (T, n, n), off (T, n, n, C) -> (T, n, C)"""
+    T, n = delta.shape
+    rows, weights, wanted = [np.eye(T * n)], [np.full(T * n, GAUGE)], [np.zeros((T * n, off.shape[-1]))]
+
+    def add(weight: float, to: np.ndarray, *terms: tuple[int, int, float]) -> None:
+        rows.append(np.zeros((1, T * n)))
+        for t, p, coefficient in terms:
+            rows[-1][0, t * n + p] = coefficient
+        weights.append(np.array([weight]))
+        wanted.append(to[None])
+
+    zero = np.zeros(off.shape[-1])
+    for t in range(T):
+        for p in range(n):
+            if t > 0:
+                add(delta[t, p], zero, (t, p, 1), (t - 1, p, -1))
+            if t > 1:
+                add(bend[t, p], zero, (t, p, 1), (t - 1, p, -2), (t - 2, p, 1))
+            for q in set(range(n)) - {p}:
+                add(pair[t, p, q], off[t, p, q], (t, q, 1), (t, p, -1))
+    A, root = np.concatenate(rows), np.sqrt(np.concatenate(weights))[:, None]
+    return np.linalg.lstsq(root * A, root * np.concatenate(wanted), rcond=None)[0].reshape(T, n, -1)
+
+
+def dense_posterior(
+    posterior: PairwisePosterior, told: np.ndarray, shown: np.ndarray, levels: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Headings (T, n) and positions (T, n, 2) of n people, all present.
+
+    told, shown (T, n, n, 3) yaw and ground of T_p_q, on the diagonal of T_prev_now; levels (T, n); noise (T, n, n, 2)
+    deviations of what is shown of yaws and of ground positions
+    """
+    n = levels.shape[1]
+    pair_levels = np.maximum(levels[:, :, None], levels[:, None])
+
+    def weight(name: str, at: np.ndarray) -> np.ndarray:
+        knots = getattr(posterior, f"log_{name}").detach().double().numpy()
+        return np.exp(-2 * np.interp(at, np.linspace(0, LEVELS, KNOTS), knots))
+
+    bent = np.maximum(levels, np.concatenate([0 * levels[:1], levels[:-1]]))
+    terms = []
+    for i, kind in enumerate(("yaw", "ground")):
+        delta = np.where(levels == 0, SHARPEST**-2, weight(f"delta_{kind}", levels))
+        own, given = weight(f"pair_{kind}", pair_levels), noise[..., i] ** -2
+        terms.append((delta, weight(f"bend_{kind}", bent), own + given, given / (own + given)))
+    self = np.arange(n)
+    deltas = np.where((levels == 0)[..., None], shown[:, self, self], told[:, self, self])
+    around = shown[..., 0] - told[..., 0]
+    pair_yaw = told[..., 0] + terms[0][3] * np.angle(np.exp(1j * around))
+    pair_ground = told[..., 1:] + terms[1][3][..., None] * (shown - told)[..., 1:]
+    along = deltas[..., 0].cumsum(axis=0)
+    seen = terms[0][2][:, 0] * np.exp(1j * (pair_yaw[:, 0] - along + along[:, :1]))
+    start = np.where(self == 0, 0.0, np.angle(seen.sum(axis=0)))
+    yaw = start + along
+    off = np.angle(np.exp(1j * (pair_yaw - (yaw[:, None] - yaw[:, :, None]))))
+    yaw = yaw + dense_corrections(*terms[0][:3], off[..., None])[..., 0]
+    ground = turned(np.concatenate([start[None], yaw[:-1]]), deltas[..., 1:]).cumsum(axis=0)
+    off = turned(yaw[:, :, None], pair_ground) - (ground[:, None] - ground[:, :, None])
+    return yaw, ground + dense_corrections(*terms[1][:3], off)
+
+
+@pytest.mark.parametrize("people", [[0, 2], [0, 1, 2]])
+def test_it_is_the_answer_of_a_dense_least_squares(model: Denoiser, people: list[int]):
+    """Deviations, levels and tokens at random; a scene of three beside it, so that one with two has a free slot."""
+    generator = torch.Generator().manual_seed(3)
+    posterior, layout, normalizer = PairwisePosterior(model.layout), model.layout, model.normalizer
+    with torch.no_grad():
+        for log in posterior.parameters():
+            log += 0.5 * torch.randn(log.shape, generator=generator)
+    _, guess, _, levels, present = shown(model, 0, seed=4)
+    levels = torch.randint(1, LEVELS, levels.shape, generator=generator)
+    levels[:, :2], levels[:, 5] = 0, LEVELS
+    noisy = add_noise(guess, torch.randn(guess.shape, generator=generator), layout.spread(layout.group_levels(levels)))
+    present[0] = torch.isin(torch.arange(3), torch.tensor(people))
+    better = posterior(guess, noisy, levels, present, normalizer).detach()
+
+    def planar(tokens: Tensor) -> np.ndarray:
+        _, deltas, pairs = layout.unpack(tokens[:1].double())
+        yaw, ground = yaw_ground(torch.cat([by_frame(deltas)[:, :, :, None], pairwise_by_frame(pairs)], dim=3)[0])
+        each, whole = torch.cat([yaw[..., None], ground], dim=-1).numpy(), np.zeros((32, 3, 3, 3))
+        for p in range(3):
+            whole[:, p, [p, *(q for q in range(3) if q != p)]] = each[:, p]
+        return whole[:, people][:, :, people]
+
+    alpha = alpha_bar(layout.group_levels(levels)).double()
+    given = planar(normalizer.denormalize(noisy / layout.spread(alpha.sqrt().clamp_min(1e-3))))
+    own = levels[0].repeat_interleave(4, dim=0).numpy()[:, people]
+    share = alpha_bar(torch.from_numpy(np.maximum(own[:, :, None], own[:, None]))).double().numpy()
+    std = normalizer.std[layout.latent + 36 :][:9].double().numpy()
+    spread = np.sqrt((1 - share) / share.clip(1e-6))
+    turning = spread * np.sqrt((std[0] ** 2 + std[2] ** 2) / 2)
+    moving = spread * np.sqrt((std[6] ** 2 + std[8] ** 2) / 2)
+    noise = np.stack([turning * np.sqrt(1 + turning**2), moving], axis=-1).clip(SHARPEST)
+    yaw, ground = dense_posterior(posterior, planar(normalizer.denormalize(guess)), given, own, noise)
+    found, n = planar(normalizer.denormalize(better)), range(len(people))
+    for p in n:
+        origin = {q: (yaw[1:, p], ground[1:, p]) if q != p else (yaw[:-1, p], ground[:-1, p]) for q in n}
+        for q, (angle, place) in origin.items():
+            assert np.abs(np.exp(1j * (yaw[1:, q] - angle)) - np.exp(1j * found[1:, p, q, 0])).max() < 1e-5
+            assert np.abs(turned(-angle, ground[1:, q] - place) - found[1:, p, q, 1:]).max() < 1e-5
 
 
 def test_deviations_can_be_learnt(model: Denoiser):

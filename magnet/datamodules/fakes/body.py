@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.body.joints import WRISTS
 from magnet.synthesis.people import SOLE
 
 Kind = Literal["smplx", "smpl"]
@@ -87,7 +88,7 @@ def _joints(kind: Kind) -> tuple[NDArray, NDArray, NDArray]:
     dirs[:, 1, 0] += 0.012  # the whole body, so that J0 depends on the shape
     dirs[:, 2, 1] += 0.004
     if kind == "smpl":
-        hands = [int(np.flatnonzero(parents == wrist)[0]) for wrist in (20, 21)]
+        hands = [int(np.flatnonzero(parents == wrist)[0]) for wrist in WRISTS]
         keep = [*range(22), *hands]
-        return J[keep], dirs[keep], np.array([*parents[:22], 20, 21])
+        return J[keep], dirs[keep], np.array([*parents[:22], *WRISTS])
     return J, dirs, parents

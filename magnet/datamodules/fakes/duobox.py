@@ -15,13 +15,21 @@ from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
 from magnet.motion.scene import FPS
 
+from magnet.body.joints import (  # isort: skip
+    ANKLES, COLLARS, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE3, TOES, WRISTS,
+)  # fmt: skip
+
 NAMES = (
     "000_ma_jab_liu_defense", "001_liu_hook_ma_defense", "002_tian_jab_ma_defense", "003_liu_free_tian_free",
     "004_ma_hook_tian_defense", "005_tian_free_ma_free",
 )  # fmt: skip
 SHARE = 5
 """A take's test part is a fifth of it."""
-SOURCE = (0, 3, 9, 12, 15, 13, 16, 18, 20, 14, 17, 19, 21, 1, 4, 7, 10, 2, 5, 8, 11)
+LEG, ARM = (HIPS, KNEES, ANKLES, TOES), (COLLARS, SHOULDERS, ELBOWS, WRISTS)
+SOURCE = (
+    PELVIS, SPINE1, SPINE3, NECK, HEAD, *(pair[0] for pair in ARM), *(pair[1] for pair in ARM),
+    *(pair[0] for pair in LEG), *(pair[1] for pair in LEG),
+)  # fmt: skip
 """Our joint that stands in for each of MOTIVE's."""
 
 

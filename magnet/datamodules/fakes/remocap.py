@@ -21,9 +21,14 @@ from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
 from magnet.datamodules.reading.remocap_track import RATE
 from magnet.motion.scene import FPS
 
+from magnet.body.joints import (  # isort: skip
+    ANKLES, COLLARS, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
+)  # fmt: skip
+
 SEQUENCES = (3, 8, 6, 5, 7, 9, 10, 16)
 TESTED = (6,)
 MILLIMETRES = 1000.0
+LEG, ARM = (HIPS, KNEES, ANKLES, TOES), (COLLARS, SHOULDERS, ELBOWS, WRISTS)
 CHANNELS = "ZXY"
 """Rotations in the order of the BVH; the csv lists X, Y and Z all the same."""
 
@@ -66,14 +71,12 @@ def skeleton(rest: np.ndarray) -> Joint:
     def beyond(joint: int, dx: float, dy: float = 0.0, dz: float = 0.0) -> np.ndarray:
         return rest[joint] + np.array([dx, dy, dz])
 
-    def leg(side: str, first: int) -> Joint:
-        joints = [first, first + 3, first + 6, first + 9]
+    def leg(side: str, joints: list[int]) -> Joint:
         names = [f"{side}{part}" for part in ("UpLeg", "Leg", "Foot", "ToeBase", "ToeBaseEnd")]
         places = [*(rest[j] for j in joints), beyond(joints[-1], 0, 0, 0.06)]
         return chain(names, [*joints, joints[-1]], places)[0]
 
-    def arm(side: str, collar: int, out: float) -> Joint:
-        joints = [collar, collar + 3, collar + 5, collar + 7]
+    def arm(side: str, joints: list[int], out: float) -> Joint:
         names = [f"{side}{part}" for part in ("Shoulder", "Arm", "ForeArm", "Hand")]
         top, hand = chain(names, joints, [rest[j] for j in joints])
         wrist = joints[-1]
@@ -84,13 +87,14 @@ def skeleton(rest: np.ndarray) -> Joint:
         hand.children.append(Joint(f"{side}HandEnd", wrist, beyond(wrist, out * 0.08)))
         return top
 
-    between, above = (rest[3] + rest[6]) / 2, (rest[9] + rest[12]) / 2
-    spine, chest = chain(["Spine", "Spine1", "Spine2", "Spine3"], [3, 3, 6, 9], [rest[3], between, rest[6], rest[9]])
-    head = chain(
-        ["Spine4", "Neck", "Head", "HeadEnd"], [9, 12, 15, 15], [above, rest[12], rest[15], beyond(15, 0, 0.2)]
-    )
-    chest.children += [head[0], arm("Left", 13, 1.0), arm("Right", 14, -1.0)]
-    return Joint("Hips", 0, rest[0], [spine, leg("Left", 1), leg("Right", 2)])
+    between, above = (rest[SPINE1] + rest[SPINE2]) / 2, (rest[SPINE3] + rest[NECK]) / 2
+    names, places = ["Spine", "Spine1", "Spine2", "Spine3"], [rest[SPINE1], between, rest[SPINE2], rest[SPINE3]]
+    spine, chest = chain(names, [SPINE1, SPINE1, SPINE2, SPINE3], places)
+    names, places = ["Spine4", "Neck", "Head", "HeadEnd"], [above, rest[NECK], rest[HEAD], beyond(HEAD, 0, 0.2)]
+    head, _ = chain(names, [SPINE3, NECK, HEAD, HEAD], places)
+    legs, arms = (list(zip(*pairs, strict=True)) for pairs in (LEG, ARM))
+    chest.children += [head, arm("Left", list(arms[0]), 1.0), arm("Right", list(arms[1]), -1.0)]
+    return Joint("Hips", PELVIS, rest[PELVIS], [spine, leg("Left", list(legs[0])), leg("Right", list(legs[1]))])
 
 
 def length(frames: int) -> int:

@@ -12,39 +12,45 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from magnet.body import PARENTS
 from magnet.body.fit import swing
 from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
 from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.rotations import geodesic
-from magnet.motion.scene import FPS
+from magnet.motion.scene import BODY_JOINTS, FPS
+
+from magnet.body.joints import (  # isort: skip
+    ANKLES, ELBOWS, HEAD, HIPS, KNEES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK,
+    PARENTS, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP, R_KNEE, R_SHOULDER, R_WRIST, SHOULDERS, SPINE1, SPINE2,
+    SPINE3, TOES, WRISTS,
+)  # fmt: skip
 
 ENDS = {
-    1: "lhipjoint", 2: "rhipjoint", 4: "lfemur", 5: "rfemur", 7: "ltibia", 8: "rtibia", 10: "lfoot", 11: "rfoot",
-    16: "lclavicle", 17: "rclavicle", 18: "lhumerus", 19: "rhumerus", 20: "lwrist", 21: "rwrist",
-    12: "lowerneck",
+    L_HIP: "lhipjoint", R_HIP: "rhipjoint", L_KNEE: "lfemur", R_KNEE: "rfemur", L_ANKLE: "ltibia", R_ANKLE: "rtibia",
+    L_FOOT: "lfoot", R_FOOT: "rfoot", L_SHOULDER: "lclavicle", R_SHOULDER: "rclavicle", L_ELBOW: "lhumerus",
+    R_ELBOW: "rhumerus", L_WRIST: "lwrist", R_WRIST: "rwrist", NECK: "lowerneck",
 }  # fmt: skip
 """Joint: the bone whose end it is. The spine's joints lie elsewhere in the two skeletons: only rotations are used.
 
 The bone `wrist` is the last third of the forearm: it lies in one line with `radius` and only rolls. The hand bends at
 its end, and so there is the wrist (`radius` ends 7 to 10 cm before it).
 """
-WEIGHT = {12: 0.1, 20: 3.0, 21: 3.0}
+WEIGHT = {NECK: 0.1, L_WRIST: 3.0, R_WRIST: 3.0}
 """The neck's joint differs too, and so only leans on the fit; dancers hold hands, so that wrists matter."""
 TOUCH, TOUCH_WEIGHT = 0.12, 25.0
 """Metres within which two people's wrists count as touching, and what their weights grow by."""
 TURNS = {
-    0: "root", 1: "lfemur", 2: "rfemur", 3: "lowerback", 4: "ltibia", 5: "rtibia", 6: "upperback", 7: "lfoot",
-    8: "rfoot", 9: "thorax", 10: "ltoes", 11: "rtoes", 12: "upperneck", 15: "head", 16: "lhumerus", 17: "rhumerus",
-    18: "lradius", 19: "rradius", 20: "lhand", 21: "rhand",
+    PELVIS: "root", L_HIP: "lfemur", R_HIP: "rfemur", SPINE1: "lowerback", L_KNEE: "ltibia", R_KNEE: "rtibia",
+    SPINE2: "upperback", L_ANKLE: "lfoot", R_ANKLE: "rfoot", SPINE3: "thorax", L_FOOT: "ltoes", R_FOOT: "rtoes",
+    NECK: "upperneck", HEAD: "head", L_SHOULDER: "lhumerus", R_SHOULDER: "rhumerus", L_ELBOW: "lradius",
+    R_ELBOW: "rradius", L_WRIST: "lhand", R_WRIST: "rhand",
 }  # fmt: skip
 """Joint: the bone whose rotation it takes."""
 LEG_SPREAD = 20.0
 """Degrees that CMU's rest pose has each leg out to the side, foot and toes with it."""
 ELBOW_PLANE = 30.0
 """Degrees that CMU's elbows bend upwards of forwards in the rest pose, where ours bend forwards."""
-LIMITS = {3: 60.0, 12: 80.0, 15: 50.0, 7: 80.0, 8: 80.0}
+LIMITS = {SPINE1: 60.0, NECK: 80.0, HEAD: 50.0, L_ANKLE: 80.0, R_ANKLE: 80.0}
 """Degrees between a joint's part of the body and its parent's beyond which the bone was recorded wrongly turned."""
 FLIP_MARGIN = 4
 """Frames at 30 fps in which a foot swings over into the wrong way round and back."""
@@ -62,7 +68,7 @@ def _about(letter: str, degrees: float) -> Tensor:
 
 def alignment(skeleton: AsfSkeleton, rest: Tensor) -> Tensor:
     """Rotation of each joint's part of the body from our rest pose to CMU's. rest (22, 3) -> (22, 3, 3)"""
-    aligned = torch.eye(3, dtype=torch.float64).repeat(22, 1, 1)
+    aligned = torch.eye(3, dtype=torch.float64).repeat(BODY_JOINTS, 1, 1)
     rest = rest.double()
 
     def align(joint: int, child: int, bone: str, first: Tensor) -> None:
@@ -72,11 +78,13 @@ def alignment(skeleton: AsfSkeleton, rest: Tensor) -> Tensor:
 
     for side, sign in ((0, 1.0), (1, -1.0)):
         spread = _about("z", sign * LEG_SPREAD)
-        for joint, child in ((1, 4), (4, 7), (7, 10)):
-            align(joint + side, child + side, TURNS[joint + side], spread)
-        aligned[10 + side] = spread
-        align(16 + side, 18 + side, TURNS[16 + side], _about("x", -ELBOW_PLANE))
-        align(18 + side, 20 + side, TURNS[18 + side], _about("x", -ELBOW_PLANE / 2))
+        hip, knee, ankle, toes = (pair[side] for pair in (HIPS, KNEES, ANKLES, TOES))
+        for joint, child in ((hip, knee), (knee, ankle), (ankle, toes)):
+            align(joint, child, TURNS[joint], spread)
+        aligned[toes] = spread
+        shoulder, elbow, wrist = (pair[side] for pair in (SHOULDERS, ELBOWS, WRISTS))
+        align(shoulder, elbow, TURNS[shoulder], _about("x", -ELBOW_PLANE))
+        align(elbow, wrist, TURNS[elbow], _about("x", -ELBOW_PLANE / 2))
     return aligned
 
 
@@ -86,23 +94,23 @@ def hints(recording: AmcRecording, rest: Tensor) -> Tensor:
     turned, _ = recording.world()
     world = torch.from_numpy(turned)
     aligned = alignment(recording.skeleton, rest)
-    known = torch.full((recording.frames, 22, 3, 3), torch.nan, dtype=torch.float64)
+    known = torch.full((recording.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
     for joint, bone in TURNS.items():
         known[:, joint] = world[:, names.index(bone)] @ aligned[joint]
-    for side, letter in ((0, "l"), (1, "r")):
+    for letter, elbow, wrist in zip("lr", ELBOWS, WRISTS, strict=True):
         forearm, hand = world[:, names.index(f"{letter}radius")], world[:, names.index(f"{letter}hand")]
         half, wrong = _half_roll(forearm.transpose(-1, -2) @ hand)
         # A forearm rolls along all its length: the elbow takes half of it, the wrist the rest.
-        known[:, 18 + side] = forearm @ half @ aligned[18 + side]
-        known[wrong, 20 + side] = torch.nan
+        known[:, elbow] = forearm @ half @ aligned[elbow]
+        known[wrong, wrist] = torch.nan
     for joint, limit in LIMITS.items():
         # Written so that a joint whose parent is not known is not known either.
         wrong = ~(geodesic(known[:, PARENTS[joint]], known[:, joint]) <= np.radians(limit))
-        if joint in (7, 8):
+        if joint in ANKLES:
             wrong = _widened(wrong, FLIP_MARGIN)
         known[wrong, joint] = torch.nan
-        if joint in (7, 8):
-            known[wrong, joint + 3] = torch.nan  # the toes went with the foot
+        if joint in ANKLES:
+            known[wrong, TOES[ANKLES.index(joint)]] = torch.nan  # the toes went with the foot
     return known
 
 
@@ -139,7 +147,7 @@ class CMUHints:
         turn = torch.stack([hints(recording, rest) for recording in self.recordings], dim=1)
         weights = torch.tensor([WEIGHT.get(j, 1.0) for j in joints], dtype=torch.float64)
         weights = weights * touching(self.targets, joints)
-        for ankle, ball in ((7, 10), (8, 11)):
+        for ankle, ball in zip(ANKLES, TOES, strict=True):
             # A foot turned the wrong way round has its ball on the wrong side.
             weights[:, :, joints.index(ball)] *= turn[:, :, ankle].isfinite().all(dim=-1).all(dim=-1)
         return turn, weights
@@ -191,7 +199,7 @@ def _seen(masked: np.ndarray, frames: int, fps: float) -> Tensor:
 def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
     """Weights that grow where wrists of two people come together. (T, P, M, 3) -> (T, P, M)"""
     grown = torch.ones(targets.shape[:3], dtype=targets.dtype)
-    wrists = [joints.index(20), joints.index(21)]
+    wrists = [joints.index(wrist) for wrist in WRISTS]
     for p in range(targets.shape[1]):
         others = [q for q in range(targets.shape[1]) if q != p]
         if others:
@@ -215,7 +223,7 @@ def check_rate(recording: AmcRecording) -> None:
     _, end = recording.resampled(FPS).world()
     names = recording.skeleton.names
     pelvis = np.diff(end[:, names.index("root")], axis=0) * FPS
-    wrists = np.diff(end[:, [names.index(ENDS[20]), names.index(ENDS[21])]], axis=0) * FPS
+    wrists = np.diff(end[:, [names.index(ENDS[L_WRIST]), names.index(ENDS[R_WRIST])]], axis=0) * FPS
     speed = float(np.percentile(np.linalg.norm(pelvis, axis=-1), 99))
     hand = float(np.percentile(np.linalg.norm(wrists, axis=-1), 99))
     fall = float(-np.percentile(np.diff(pelvis[:, 1]) * FPS, 1))

@@ -17,11 +17,17 @@ from magnet.datamodules.reading.fields import mapping
 from magnet.datamodules.reading.recording import DataError
 from magnet.unpickle import contents, load_pickle
 
+from magnet.body.joints import (  # isort: skip
+    HEAD, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP,
+    R_KNEE, R_SHOULDER, R_WRIST,
+)  # fmt: skip
+
 RATE = 50.0
 MAP = {
-    0: "Hips", 1: "LeftUpLeg", 2: "RightUpLeg", 4: "LeftLeg", 5: "RightLeg", 7: "LeftFoot", 8: "RightFoot",
-    10: "LeftToeBase", 11: "RightToeBase", 12: "Neck", 15: "Head", 16: "LeftArm", 17: "RightArm", 18: "LeftForeArm",
-    19: "RightForeArm", 20: "LeftHand", 21: "RightHand",
+    PELVIS: "Hips", L_HIP: "LeftUpLeg", R_HIP: "RightUpLeg", L_KNEE: "LeftLeg", R_KNEE: "RightLeg",
+    L_ANKLE: "LeftFoot", R_ANKLE: "RightFoot", L_FOOT: "LeftToeBase", R_FOOT: "RightToeBase", NECK: "Neck",
+    HEAD: "Head", L_SHOULDER: "LeftArm", R_SHOULDER: "RightArm", L_ELBOW: "LeftForeArm", R_ELBOW: "RightForeArm",
+    L_WRIST: "LeftHand", R_WRIST: "RightHand",
 }  # fmt: skip
 """Our joint: theirs. Their spine has six joints and ours three, so only its ends are used."""
 CLOSE = 0.01
