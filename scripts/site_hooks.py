@@ -58,8 +58,11 @@ class FencedExamples(griffe.Extension):
 
 
 def on_config(config: Any) -> Any:
-    """List the pages of the API, which are as many as there are rooms."""
+    """List the pages of the API, which are as many as there are rooms, and at the end pages that have no place yet."""
+    said = (ROOT / "mkdocs.yml").read_text()
     for entry in config.nav:
+        if isinstance(entry, dict) and "Project" in entry:
+            entry["Project"] += [p.name for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in said]
         if isinstance(entry, dict) and "API" in entry:
             entry["API"] = ["api/index.md", *(f"api/{room}.md" for room in ROOMS)]
     return config

@@ -38,6 +38,7 @@ EXTRAS = {
     "wandb": Extra(("wandb",), "magnet fit --wandb: curves of training at Weights & Biases"),
     "smplx": Extra(("smplx",), "comparing with the package smplx, non-commercial; SMPL-X files are read without it"),
     "hub": Extra(("huggingface_hub",), 'models of a hub: magnet.load("hub:owner/name")'),
+    "plot": Extra(("matplotlib",), "metric.plot(), as torchmetrics has it"),
     "onnx": Extra(("onnx", "onnxruntime", "onnxscript"), "magnet export-model: networks for programs without torch"),
     "usd": Extra(("usd-core",), "magnet export scene.usdc: Omniverse, Houdini, Maya"),
     "docs": Extra(("mkdocs-material", "mkdocstrings"), "make docs: the documentation as a site"),

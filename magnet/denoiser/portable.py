@@ -21,7 +21,7 @@ import json
 import logging
 import operator
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,8 +108,14 @@ class PortableEncoder(nn.Module):
         super().__init__()
         if not isinstance(denoiser.tokenizer, Tokenizer):
             raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
-        self.layout, self.normalizer, self.tokenizer = denoiser.layout, denoiser.normalizer, denoiser.tokenizer
+        self.layout, self.normalizer = denoiser.layout, denoiser.normalizer
+        self.tokenizer = copy.deepcopy(denoiser.tokenizer)
         self.quantized = denoiser.quantized
+
+    def train(self, mode: bool = True) -> PortableEncoder:
+        super().train(mode)
+        self.tokenizer.quantizer.training = True  # so that looking codes up keeps nothing of a trace
+        return self
 
     def forward(self, pose: Tensor, betas: Tensor, deltas: Tensor, pairs: Tensor) -> Tensor:
         still = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0]).expand(deltas.shape[0], TOKEN_FRAMES, deltas.shape[2], 9)
@@ -158,8 +164,10 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
     }
     written = {}
     for suffix, (network, inputs, outputs) in parts.items():
-        content = _traced(network.eval(), inputs, outputs, metadata)
-        off = _difference(network, inputs, content)
+        with torch.no_grad():  # before tracing, so that what is computed once and kept is not kept of a trace
+            told = network.eval()(*inputs.values())
+        content = _traced(network, inputs, outputs, metadata)
+        off = _difference(content, inputs, told if isinstance(told, tuple) else (told,))
         file = path.with_name(f"{path.stem}{suffix}.onnx")
         if not off <= MOST_OFF:
             raise ValueError(f"{file.name}: onnxruntime's numbers differ from torch's by {off:.2g}; nothing is written")
@@ -173,15 +181,12 @@ def _always(name: str) -> Callable[[str], str]:
     return lambda _: name
 
 
-@torch.no_grad()
-def _difference(network: nn.Module, inputs: Mapping[str, Tensor], content: bytes) -> float:
-    """The largest difference between what onnxruntime and torch compute."""
+def _difference(content: bytes, inputs: Mapping[str, Tensor], wanted: Sequence[Tensor]) -> float:
+    """The largest difference between what onnxruntime computes and what is wanted."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     got = session.run(None, {name: value.numpy() for name, value in inputs.items()})
-    told = network(*inputs.values())
-    wanted = told if isinstance(told, tuple) else (told,)
     return max(float((torch.as_tensor(a) - b).abs().max()) for a, b in zip(got, wanted, strict=True))
 
 

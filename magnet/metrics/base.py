@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -29,6 +29,7 @@ class MotionMetric(Metric):
             truth's own row of a table.
         agents: (P,) or (T, P) bool, what is scored where `update` is not told: the agents, or the frames of each,
             that were generated; None: everything of everybody present.
+        kwargs: of `torchmetrics.Metric`, such as `compute_on_cpu`.
     """
 
     full_state_update = False
@@ -37,8 +38,8 @@ class MotionMetric(Metric):
     columns: ClassVar[Mapping[str, Column]] = {}
     """How its numbers are shown, by name; for `fd@second3` the entry of `fd` is read."""
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None) -> None:
-        super().__init__()
+    def __init__(self, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self._empty: dict[str, Tensor] = {}  # states that are lists, as they are without a batch
         self.of = of
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
@@ -47,16 +48,20 @@ class MotionMetric(Metric):
         self,
         generated: Tensor,
         truth: Tensor,
-        present: Tensor,
+        present: Tensor | None = None,
         agents: Tensor | None = None,
         units: Tensor | None = None,
     ) -> None:
         """(S, B, T, P, 22, 3), (B, T, P, 22, 3), (B, P) bool, and bool: what was generated; see `Futures.of`.
 
+        Without `present` everybody is.
+
         `units` (B,) int says which clips are not independent of each other, see `bootstrap_interval`.
         """
         if self.of == "truth":
             generated = truth[None]
+        if present is None:
+            present = torch.ones(truth.shape[0], truth.shape[2], dtype=torch.bool, device=truth.device)
         self.add(Futures.of(generated, truth, present, self.agents if agents is None else agents, units))
 
     @abstractmethod
@@ -66,6 +71,14 @@ class MotionMetric(Metric):
     @abstractmethod
     def compute(self) -> dict[str, Tensor]:
         """What was measured, float64 scalars by name."""
+
+    def plot(self, val: Any = None, ax: Any = None) -> Any:
+        """A figure and axis of what was measured, or of `val`: a result, or a list of them over time.
+
+        Raises:
+            ModuleNotFoundError: matplotlib is not installed, `pip install "magnet-motion[plot]"`.
+        """
+        return self._plot(val, ax)
 
     def add_sum(self, name: str, *shape: int) -> None:
         self.add_state(name, default=torch.zeros(*shape, dtype=torch.float64), dist_reduce_fx="sum")
@@ -123,8 +136,9 @@ class ClipMeans(MotionMetric):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(of, agents)
+        super().__init__(of, agents, **kwargs)
         self.names = tuple(names)
         self.confidence = confidence
         self.add_sum("total", len(self.names))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,13 @@ class PartnerBearing(ClipMeans):
     Two people face each other where each has the other within `within` degrees of straight ahead. Somebody is behind at
     more than 90 degrees; each of the two counts by itself, so one who follows another counts half. Means over samples,
     frames and pairs of people.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = PartnerBearing()
+    >>> metric.update(truth[None], truth)
+    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("facing", "behind")]
+    [0.0, 0.5]
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -52,8 +59,9 @@ class PartnerBearing(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["facing", "behind"], of, agents, confidence)
+        super().__init__(["facing", "behind"], of, agents, confidence, **kwargs)
         self.within = math.radians(within)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
@@ -69,6 +77,13 @@ class TurnRate(MotionMetric):
     """`turn_rate` in degrees/s: mean over samples, frames and people; `turn_rate@agent0` etc. are each slot's own.
 
     In recordings of leader and follower slot 0 leads.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = TurnRate()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["turn_rate"].item(), 3)
+    0.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -77,8 +92,8 @@ class TurnRate(MotionMetric):
 
     turned: list[Tensor]  # of (P, 2) by slot: total and count
 
-    def __init__(self, fps: float = FPS, of: Of = "generated", agents: Tensor | None = None) -> None:
-        super().__init__(of, agents)
+    def __init__(self, fps: float = FPS, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
+        super().__init__(of, agents, **kwargs)
         self.fps = fps
         self.add_keyed("turned", 2)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -46,6 +46,13 @@ class BodyDepth(ClipMeans):
     `depth_arms_...` are of arm on arm alone: upper arms and forearms of one against those of the other, forearm on
     forearm included, which the others leave out as IP does. Two arms are never over 10 cm deep. Percentiles are read
     off a histogram and within `BIN` metres.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = BodyDepth()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["depth_over_5cm"].item(), 3)
+    0.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -67,9 +74,11 @@ class BodyDepth(ClipMeans):
 
     histogram: Tensor  # (3, bins): all, without arm on arm, arm on arm
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
+    def __init__(
+        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
+    ) -> None:
         names = [f"{kind}_over_{share}cm" for kind in KINDS for share in (5, 10)]
-        super().__init__(names[:-1], of, agents, confidence)
+        super().__init__(names[:-1], of, agents, confidence, **kwargs)
         self.add_sum("histogram", 3, round(self.DEEPEST / self.BIN) + 1)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

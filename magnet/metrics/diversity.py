@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -28,6 +28,14 @@ class Diversity(ClipMeans):
     """`div` in m^2: mean over frames and agents of a clip, then over clips.
 
     One sample has no variance: such clips are left out. Equal samples (a deterministic method) have 0.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = Diversity()
+    >>> metric.update(torch.stack([truth, truth + 0.2]), truth)
+    >>> round(metric.compute()["div"].item(), 3)
+    1.26
     """
 
     higher_is_better = True
@@ -35,8 +43,10 @@ class Diversity(ClipMeans):
         "div": Column("DIV", "m²", "high", "variance over the samples of a scene", main=True)
     }
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
-        super().__init__(["div"], of, agents, confidence)
+    def __init__(
+        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(["div"], of, agents, confidence, **kwargs)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         places = futures.scored.sum(dim=(1, 2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -23,6 +23,14 @@ class Floating(ClipMeans):
 
     The height is that of the lowest joint of the feet, mean over the frames that float. Who jumps floats too, so both
     are read beside the recording's. The ball of a standing foot lies 2 to 3 cm high.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = Floating()
+    >>> metric.update((truth + torch.tensor([0.0, 0.1, 0.0]))[None], truth)
+    >>> round(metric.compute()["floating"].item(), 3)
+    1.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -36,8 +44,9 @@ class Floating(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["floating", "floating_height"], of, agents, confidence)
+        super().__init__(["floating", "floating_height"], of, agents, confidence, **kwargs)
         self.above = above
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
@@ -50,6 +59,14 @@ class GroundPenetration(ClipMeans):
     """`ground_penetration`: share of frames in which a joint of somebody's foot is over `below` metres under the floor.
 
     `ground_penetration_depth` is how deep the deepest one is, mean over these frames.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = GroundPenetration()
+    >>> metric.update((truth - torch.tensor([0.0, 0.1, 0.0]))[None], truth)
+    >>> round(metric.compute()["ground_penetration"].item(), 3)
+    1.0
     """
 
     higher_is_better = False
@@ -64,8 +81,9 @@ class GroundPenetration(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["ground_penetration", "ground_penetration_depth"], of, agents, confidence)
+        super().__init__(["ground_penetration", "ground_penetration_depth"], of, agents, confidence, **kwargs)
         self.below = below
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -80,6 +80,14 @@ class FrechetDistance(MotionMetric):
         features: `world_joints`; `canonical_joints`, each body in its own frame; `velocity`; `own_velocity`, turned
             into the frame that one has behind the step; `pair`, each partner's body in one's own frame. All but the
             first are named `fd_<features>` and do not change when the world is moved, `velocity` when it is shifted.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = FrechetDistance()
+    >>> metric.update((truth + torch.tensor([1.0, 0.0, 0.0]))[None], truth)
+    >>> round(metric.compute()["fd"].item(), 3)
+    21.0
     """
 
     higher_is_better = False
@@ -105,8 +113,9 @@ class FrechetDistance(MotionMetric):
         jitter: float = JITTER,
         of: Of = "generated",
         agents: Tensor | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(of, agents)
+        super().__init__(of, agents, **kwargs)
         self.features: Features = features
         self.fps = fps
         self.jitter = jitter
@@ -148,6 +157,13 @@ class FrechetBySecond(FrechetDistance):
 
     Both distributions are of that second alone, so a second is compared with the same second of the recording. A
     step belongs to the second in which it ends. A second of few frames is as unsure as any FD of few frames.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = FrechetBySecond("pair")
+    >>> metric.update(truth[None], truth)
+    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("fd_pair@second1", "fd_pair@second2")]
+    [0.0, 0.0]
     """
 
     seconds: list[Tensor]  # of (N, 2, 64, 64) by second: sums of products of (1, features), generated and truth
@@ -159,8 +175,9 @@ class FrechetBySecond(FrechetDistance):
         jitter: float = JITTER,
         of: Of = "generated",
         agents: Tensor | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(features, fps, jitter, of, agents)
+        super().__init__(features, fps, jitter, of, agents, **kwargs)
         self.add_keyed("seconds", 2, FEATURES + 1, FEATURES + 1)
 
     def pool(self, which: int, features: Tensor, counts: Tensor) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -56,6 +56,13 @@ class HandContact(ClipMeans):
     Args:
         within: metres under which hands are in contact.
         beyond: metres from the wrist to the middle of the hand.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = HandContact()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["hand_contact"].item(), 3)
+    0.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -74,9 +81,10 @@ class HandContact(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
         compared = ["hand_contact_precision", "hand_contact_recall"] if of == "generated" else []
-        super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of, agents, confidence)
+        super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of, agents, confidence, **kwargs)
         self.fps = fps
         self.within = within
         self.beyond = beyond

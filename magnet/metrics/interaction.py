@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -61,6 +61,15 @@ class MotionInteraction(MotionMetric):
         per_clip: (ours) correlation inside each sample of each clip, averaged over coordinates and clips:
             tells how people move with each other, wherever they are. Here `mi_left_out` counts the
             coordinates of every clip and sample.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> walking = truth + torch.linspace(0, 1, 60)[:, None, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    >>> metric = MotionInteraction()
+    >>> metric.update(walking[None], walking)
+    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("mi", "mi_truth")]
+    [0.0, 1.0]
     """
 
     higher_is_better = False
@@ -76,8 +85,10 @@ class MotionInteraction(MotionMetric):
     clip_totals: list[Tensor]  # of (Q, 2, 2) by pair of slots: sum of correlations inside clips, and how many
     still: Tensor
 
-    def __init__(self, per_clip: bool = False, of: Of = "generated", agents: Tensor | None = None) -> None:
-        super().__init__(of, agents)
+    def __init__(
+        self, per_clip: bool = False, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(of, agents, **kwargs)
         self.per_clip = per_clip
         if per_clip:
             self.add_keyed("clip_totals", 2, 2)

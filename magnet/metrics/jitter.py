@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -26,7 +26,15 @@ def jitter(joints: Tensor, fps: float = FPS) -> Tensor:
 
 
 class Jitter(ClipMeans):
-    """`jitter` in 10 m/s^3; to be read beside the ground truth's, which is not 0."""
+    """`jitter` in 10 m/s^3; to be read beside the ground truth's, which is not 0.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = Jitter()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["jitter"].item(), 3)
+    0.0
+    """
 
     columns: ClassVar[Mapping[str, Column]] = {"jitter": Column("jitter", "10 m/s³", "real", "mean third difference")}
 
@@ -36,8 +44,9 @@ class Jitter(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["jitter"], of, agents, confidence)
+        super().__init__(["jitter"], of, agents, confidence, **kwargs)
         self.fps = fps
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -34,6 +34,18 @@ class NearestTraining(ClipMeans):
 
     Args:
         windows: of the training set, as long as the scenes that are measured.
+
+    >>> import torch
+    >>> from magnet.body import load_body
+    >>> from magnet.baselines import Windows
+    >>> from magnet.motion.scene import empty_scene
+    >>> scene = empty_scene(1, 12, 1, like=torch.zeros(()))
+    >>> scene = scene.replace(present=~scene.present)  # somebody who stands still
+    >>> metric = NearestTraining(Windows.of([scene], load_body(), context=4))
+    >>> future = load_body().joints(scene)[:, 4:]
+    >>> metric.update(future[None], future)
+    >>> round(metric.compute()["nearest_training"].item(), 3)
+    0.0
     """
 
     higher_is_better = None
@@ -43,9 +55,14 @@ class NearestTraining(ClipMeans):
     }
 
     def __init__(
-        self, windows: Windows, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None
+        self,
+        windows: Windows,
+        of: Of = "generated",
+        agents: Tensor | None = None,
+        confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["nearest_training"], of, agents, confidence)
+        super().__init__(["nearest_training"], of, agents, confidence, **kwargs)
         self.windows = windows
         self._placed: dict[int, Tensor] = {}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -23,6 +23,13 @@ class PartnerDistance(MotionMetric):
     """`partner_distance` in metres: median over samples, frames and pairs of people.
 
     It is read off a histogram: within `BIN` metres, and `FARTHEST` for people farther apart than that.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = PartnerDistance()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["partner_distance"].item(), 3)
+    0.998
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -34,8 +41,8 @@ class PartnerDistance(MotionMetric):
 
     histogram: Tensor
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None) -> None:
-        super().__init__(of, agents)
+    def __init__(self, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
+        super().__init__(of, agents, **kwargs)
         self.add_sum("histogram", round(self.FARTHEST / self.BIN) + 1)
 
     def add(self, futures: Futures) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -89,6 +89,13 @@ class Interpenetration(ClipMeans):
     Beside it `ip_mean_total_depth`, the depths summed over capsules and pairs of people, mean over *all*
     frames, and `ip_mean_max_depth`, the deepest in a frame, mean over the frames with any; both in metres.
     Frames without two people (one of them scored) are not counted.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = Interpenetration()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["ip_ratio"].item(), 3)
+    0.0
     """
 
     higher_is_better = False
@@ -98,8 +105,10 @@ class Interpenetration(ClipMeans):
         "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
     }
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None) -> None:
-        super().__init__(["ip_ratio", "ip_mean_total_depth", "ip_mean_max_depth"], of, agents, confidence)
+    def __init__(
+        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(["ip_ratio", "ip_mean_total_depth", "ip_mean_max_depth"], of, agents, confidence, **kwargs)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         first, second, counts = futures.pairs()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -33,6 +33,14 @@ class PositionError(ClipMeans):
     Also `mpjpe_best`, each scene's best sample; `mpjpe_mean`, that of the samples' mean, which does not count their
     spread and so compares with a method that makes one prediction; and `<name>@<t>s`, the same over frames up to t
     seconds, measured only on clips at least that long.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = PositionError()
+    >>> metric.update((truth + torch.tensor([0.3, 0.0, 0.4]))[None], truth)
+    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("mpjpe", "mpjpe@1s")]
+    [0.5, 0.5]
     """
 
     higher_is_better = False
@@ -51,10 +59,11 @@ class PositionError(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
         horizons = ["", *(f"@{s:g}s" for s in seconds)]
         names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best", "mpjpe_mean")]
-        super().__init__(names, of, agents, confidence)
+        super().__init__(names, of, agents, confidence, **kwargs)
         self.until = tuple(round(s * fps) for s in seconds)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

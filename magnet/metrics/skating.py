@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -40,6 +40,15 @@ class FootSkating(ClipMeans):
         preset: thresholds: `"default"`, or `"reference"`, those of the paper's released code, which
             count only toes 1 cm inside the floor.
         height, speed: instead of the preset's.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> walking = truth + torch.linspace(0, 1, 60)[:, None, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    >>> metric = FootSkating()
+    >>> metric.update(walking[None], truth)
+    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("fs", "fs_contact")]
+    [0.508, 1.0]
     """
 
     higher_is_better = False
@@ -59,8 +68,9 @@ class FootSkating(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["fs", "fs_ratio", "fs_contact"], of, agents, confidence)
+        super().__init__(["fs", "fs_ratio", "fs_contact"], of, agents, confidence, **kwargs)
         self.fps = fps
         self.height = PRESETS[preset][0] if height is None else height
         self.speed = PRESETS[preset][1] if speed is None else speed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -20,6 +20,13 @@ class StandingToes(ClipMeans):
 
     A toe stands in a frame where it is under `height` metres in both frames, as for FS, which measures the speed of
     the others. The median is read off a histogram and within `BIN` m/s.
+
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = StandingToes()
+    >>> metric.update(truth[None], truth)
+    >>> round(metric.compute()["toe_still"].item(), 3)
+    1.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -40,8 +47,9 @@ class StandingToes(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["toe_still"], of, agents, confidence)
+        super().__init__(["toe_still"], of, agents, confidence, **kwargs)
         self.fps = fps
         self.height = height
         self.still = still

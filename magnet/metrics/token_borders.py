@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -35,6 +35,15 @@ class TokenBorders(MotionMetric):
 
     Args:
         stride: frames in a token.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)
+    >>> ahead = torch.linspace(0, 1, 60).square()[:, None, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    >>> metric = TokenBorders()
+    >>> metric.update((truth + ahead)[None], truth)  # the same acceleration throughout
+    >>> round(metric.compute()["border_acceleration"].item(), 2)
+    1.0
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -46,8 +55,10 @@ class TokenBorders(MotionMetric):
 
     sums: Tensor  # (2, 2, 2) acceleration and jerk, inside and at borders, total and count
 
-    def __init__(self, stride: int = TOKEN_FRAMES, of: Of = "generated", agents: Tensor | None = None) -> None:
-        super().__init__(of, agents)
+    def __init__(
+        self, stride: int = TOKEN_FRAMES, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(of, agents, **kwargs)
         if stride < 4:
             raise ValueError(f"stride={stride}: a jerk spans 4 frames, so tokens of at least 4 have an inside")
         self.stride = stride

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -31,6 +31,15 @@ class VelocityError(ClipMeans):
     Args:
         per_second: m/s. The default is metres a *frame* at the given fps, which is what the paper's
             tables hold.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> walking = truth + torch.linspace(0, 1, 60)[:, None, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    >>> metric = VelocityError()
+    >>> metric.update(walking[None], truth)
+    >>> round(metric.compute()["mpjve"].item(), 3)
+    0.017
     """
 
     higher_is_better = False
@@ -45,8 +54,9 @@ class VelocityError(ClipMeans):
         of: Of = "generated",
         agents: Tensor | None = None,
         confidence: float | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(["mpjve"], of, agents, confidence)
+        super().__init__(["mpjve"], of, agents, confidence, **kwargs)
         self.scale = fps if per_second else 1.0
         if per_second:
             self.columns = {name: shown._replace(unit="m/s") for name, shown in self.columns.items()}  # type: ignore[misc]

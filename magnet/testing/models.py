@@ -8,6 +8,7 @@ import roma
 import torch
 from torch import Tensor
 
+from magnet.body import load_body
 from magnet.motion.frames import rigid
 from magnet.motion.scene import FPS, Scene
 
@@ -45,6 +46,15 @@ def random_scene(
         present=torch.ones(scenes, agents, dtype=torch.bool),
     )
     return scene if present is None else without_absent(scene.replace(present=present))
+
+
+def standing_people(frames: int = 60, agents: int = 2, apart: float = 1.0) -> Tensor:
+    """Joints of people of average shape who stand still in the T pose, in a row. -> (1, T, P, 22, 3) metres"""
+    body = load_body("open")
+    rest = body.rest_joints(torch.zeros(10))
+    rest = rest - torch.tensor([0.0, float(body.v_template[:, 1].min()), 0.0])
+    aside = apart * torch.arange(agents)[:, None, None] * torch.tensor([0.0, 0.0, 1.0])
+    return (rest + aside).expand(1, frames, agents, -1, 3)
 
 
 def without_absent(scene: Scene) -> Scene:

@@ -1,0 +1,55 @@
+"""What users of torchmetrics expect of any metric holds for each of ours."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+from torchmetrics import Metric
+
+from magnet import metrics
+from magnet.testing import standing_people
+
+CLASSES = [
+    kind
+    for name in metrics.__all__
+    if inspect.isclass(kind := getattr(metrics, name)) and issubclass(kind, Metric) and not inspect.isabstract(kind)
+]
+MADE = [kind for kind in CLASSES if kind is not metrics.NearestTraining]  # which asks for windows of the training set
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_the_class_shows_how_it_is_used(kind: type[Metric]) -> None:
+    assert ">>> metric.update(" in (kind.__doc__ or "")
+    assert any(p.kind is p.VAR_KEYWORD for p in inspect.signature(kind).parameters.values())
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_options_of_torchmetrics_are_taken_and_others_refused(kind: type[Metric]) -> None:
+    assert kind(compute_on_cpu=True).compute_on_cpu
+    with pytest.raises(ValueError, match="no_such_option"):
+        kind(no_such_option=True)
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_everybody_is_present_where_nothing_is_said(kind: type[Metric]) -> None:
+    truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None]
+    results = []
+    for present in ((), (torch.ones(1, 2, dtype=torch.bool),)):
+        metric = kind()
+        metric.update(truth[None] + 0.01, truth, *present)
+        results.append(metric.compute())
+    assert results[0].keys() == results[1].keys()
+    assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
+
+
+def test_what_was_measured_can_be_plotted() -> None:
+    pytest.importorskip("matplotlib").use("Agg")
+    truth = standing_people(40, 2)
+    metric = metrics.PositionError()
+    metric.update(truth[None] + 0.1, truth)
+    figure, axis = metric.plot()
+    assert figure is not None and {"mpjpe", "mpjpe_best"} <= set(axis.get_legend_handles_labels()[1])
+    later = {name: value / 2 for name, value in metric.compute().items()}
+    assert metric.plot([metric.compute(), later])[0] is not None
