@@ -2,9 +2,9 @@
 
     MAGNET_CMU=... python benchmarks/relation.py --ckpt_path duet --out runs/relation
 
-Runs `magnet test` on takes 5, 10 and 15, once for each task, and on scenes of three and four people from nothing. Scenes
-do not overlap. A run that is in OUT already is read and not run again, so that a stopped table goes on. What a bar
-compares with (recordings, training windows in place of samples, baselines) is measured on the same scenes.
+Runs `magnet test` on takes 5, 10 and 15, once for each task, and on scenes of three and four people from nothing.
+Scenes do not overlap. A run that is in OUT already is read and not run again, so that a stopped table goes on. What a
+bar compares with (recordings, training windows in place of samples, baselines) is measured on the same scenes.
 """
 
 from __future__ import annotations
