@@ -6,7 +6,7 @@ On a CPU a packed product takes about half the time of a plain one, and its rows
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 import torch
@@ -76,6 +76,6 @@ class Kept(Generic[Made]):
         return kept[2]
 
 
-def state_of(weights: list[nn.Parameter]) -> list[int]:
+def state_of(weights: Sequence[Tensor]) -> list[int]:
     """Numbers that change when weights do."""
     return [number for each in weights for number in (each.data_ptr(), each._version)]

@@ -47,7 +47,7 @@ class Synthetic(MotionDataModule):
         people: Sequence[int] = (2, 3, 4),
         train_clips: int = 150,
         val_clips: int = 15,
-        test_clips: int = 30,
+        test_clips: int = 12,
         clip_frames: int = 300,
         scene_seed: int = 0,
         max_agents: int = 4,

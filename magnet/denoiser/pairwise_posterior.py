@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from magnet.motion.frames import partners
-from magnet.motion.planar import nine_of, rotate_ground, unit_of
-from magnet.motion.pose_graph import Planar, solve_pose_graph
+from magnet.motion.pose_graph import PoseGraph
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
+from magnet.packing import Kept, state_of
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.normalizer import Normalizer
 
@@ -20,6 +20,9 @@ KNOTS = 11
 
 SHARPEST = 2e-3
 """Standard deviation in metres, and in radians, of what is shown clean: tokens hold numbers of finite precision."""
+
+MOST_KEPT = 128
+"""Settings that a posterior keeps; a rolling sampler passes some 80."""
 
 
 class PairwisePosterior(nn.Module):
@@ -61,23 +64,69 @@ class PairwisePosterior(nn.Module):
         Returns:
             (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s; deltas shown clean are `noisy`'s.
         """
+        known = self._setting(levels, present, normalizer)
+        where = known.people.where(*clean.shape[:2])
+        predicted, given = self._transforms(clean)[where], self._transforms(noisy)[where]
+        told = torch.addcmul(known.mean, predicted, known.std)
+        # Clean tokens estimated from the noisy ones alone; at level K they tell nothing.
+        shown = torch.addcmul(known.mean, given, known.rescaling)
+        told = torch.where(known.deltas, shown, told)
+        fused = (frames_fused(told, shown, known) - known.mean) / known.std
+        better = clean.clone()
+        self._transforms(better)[where] = torch.where(known.met, fused, predicted)
+        return better
+
+    def _transforms(self, tokens: Tensor) -> Tensor:
+        """Deltas and pairwise transforms of tokens, a view. (B, N, P, D) -> (B, N, P, P, 4, 9)"""
+        return tokens[..., self.layout.latent :].unflatten(-1, (-1, TOKEN_FRAMES, 9))
+
+    def _setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Setting:
+        """What does not depend on tokens; kept while nothing is learnt, for samplers pass the same levels again.
+
+        Samples of one batch have the same levels, and need it once. On a GPU, looking would have to wait for it.
+        """
+        if levels.device.type != "cpu" or torch.is_grad_enabled() or self.log_pair_yaw.is_inference():
+            return self._new_setting(levels, present, normalizer)
+        if len(levels) > 1 and not bool((levels == levels[:1]).all() and (present == present[:1]).all()):
+            return self._new_setting(levels, present, normalizer)
+        levels, present, kept = levels[:1], present[:1], SETTINGS.of(self)
+        key = (levels.numpy().tobytes(), present.numpy().tobytes(), *state_of([normalizer.mean, normalizer.std]))
+        if key not in kept:
+            if len(kept) == MOST_KEPT:
+                kept.pop(next(iter(kept)))
+            kept[key] = self._new_setting(levels, present, normalizer)
+        return kept[key]
+
+    def _new_setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Setting:
         people = SlotsInUse.of(present, self.layout)
         group_levels = people.layout.group_levels(people.levels(levels))  # (B, N, P, P) of those in use
-        mean, std = (people.transforms(each.expand_as(clean[:, :1])) for each in (normalizer.mean, normalizer.std))
-        predicted, given = people.transforms(clean), people.transforms(noisy)
-        # Clean tokens estimated from the noisy ones alone; at level K they tell nothing.
+        mean, std = (
+            self._transforms(each.expand(1, 1, self.layout.agents, -1))[0, 0][people.slots[..., None], people.groups]
+            for each in (normalizer.mean, normalizer.std)
+        )
+        mean, std = mean[:, None], std[:, None]
         scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)[..., None, None]
-        shown, told = given / scale * std + mean, predicted * std + mean
-        deltas = torch.where((group_levels[..., :1] == 0)[..., None], shown[..., 0, :, :], told[..., 0, :, :])
-        told = torch.cat([deltas[..., None, :, :], told[..., 1:, :, :]], dim=-3)
-        weights = self._weights(group_levels, people.together, normalizer)
-        fused = frames_fused(_frames(told), _frames(shown), weights).to(clean.dtype)
-        fused = fused.unflatten(1, (-1, TOKEN_FRAMES)).permute(0, 1, 3, 4, 2, 5)
-        met = torch.cat([people.together.any(dim=-1, keepdim=True), people.together], dim=-1)[:, None, ..., None, None]
-        return people.with_transforms(clean, torch.where(met, (fused - mean) / std, predicted))
+        deltas = (group_levels[..., :1] == 0) & (torch.arange(people.layout.agents, device=levels.device) == 0)
+        met = torch.cat([people.together.any(dim=-1, keepdim=True), people.together], dim=-1)
+        delta, smooth, pair, share = self._weights(group_levels, people.together, normalizer)
+        return Setting(
+            people=people,
+            mean=mean,
+            std=std,
+            rescaling=std / scale,
+            deltas=deltas[..., None, None],
+            met=met[:, None, ..., None, None],
+            share=share,
+            graph=PoseGraph.of(delta, smooth, pair),
+        )
 
-    def _weights(self, group_levels: Tensor, together: Tensor, normalizer: Normalizer) -> Weights:
-        """How much each thing counts in each frame. group_levels (B, N, P, P), together (B, P, P - 1)"""
+    def _weights(self, group_levels: Tensor, together: Tensor, normalizer: Normalizer) -> tuple[Tensor, ...]:
+        """How much each thing counts in each frame; of each two, the first is of yaws, the other of ground positions.
+
+        group_levels (B, N, P, P), together (B, P, P - 1) -> precisions of deltas (2, B, T, P), of how their error
+        changes (2, B, T, P), and of pairwise transforms, shown and predicted together (2, B, T, P, P - 1); the shown
+        ones' share of these (2, B, T, P, P - 1); all float64
+        """
         table = self._precisions(normalizer)
         pairs = table[:4, group_levels[..., 1:]] * together[:, None]  # (4, B, N, P, P - 1)
         total = pairs[:2] + pairs[2:]
@@ -89,7 +138,7 @@ class PairwisePosterior(nn.Module):
         own = own.repeat_interleave(TOKEN_FRAMES, dim=1)
         smooth = table[6:, torch.maximum(own, F.pad(own[:, :-1], (0, 0, 1, 0)))]
         total, share = torch.stack([total, share]).repeat_interleave(TOKEN_FRAMES, dim=3)
-        return Weights(delta, smooth, total, share)
+        return delta, smooth, total, share
 
     def _precisions(self, normalizer: Normalizer) -> Tensor:
         """Precisions by level: of predicted and of shown pairwise transforms, of deltas and of how their error changes,
@@ -137,80 +186,75 @@ class SlotsInUse:
         """(B, N, P of the batch) -> (B, N, P)"""
         return levels.gather(2, self.slots[:, None].expand(-1, levels.shape[1], -1))
 
-    def transforms(self, tokens: Tensor) -> Tensor:
-        """(B, N, P of the batch, D) -> deltas and pairwise transforms of those in use, (B, N, P, P, 4, 9)"""
-        return self._by_group(tokens)[self._where(tokens.shape[1])]
-
-    def with_transforms(self, tokens: Tensor, transforms: Tensor) -> Tensor:
-        """Tokens (B, N, P of the batch, D) with other transforms."""
-        tokens = tokens.clone()
-        self._by_group(tokens)[self._where(tokens.shape[1])] = transforms
-        return tokens
-
-    def _by_group(self, tokens: Tensor) -> Tensor:
-        return tokens[..., self.layout.latent :].unflatten(-1, (-1, TOKEN_FRAMES, 9))
-
-    def _where(self, steps: int) -> tuple[Tensor, ...]:
-        scene, step = (torch.arange(count, device=self.slots.device) for count in (len(self.slots), steps))
+    def where(self, scenes: int, steps: int) -> tuple[Tensor | slice, ...]:
+        """Index of the transforms of those in use, into (scenes, steps, P of the batch, groups, ...)."""
+        if len(self.slots) == 1:
+            return slice(None), slice(None), self.slots[0, :, None], self.groups[0]
+        scene, step = (torch.arange(count, device=self.slots.device) for count in (scenes, steps))
         return scene[:, None, None, None], step[:, None, None], self.slots[:, None, :, None], self.groups[:, None]
 
 
 @dataclass(frozen=True)
-class Weights:
-    """How much each thing counts; the first of each two for yaws, the other for ground positions. All float64.
+class Setting:
+    """What a posterior takes from levels, from who is present and from how tokens are normalized.
 
     Attributes:
-        delta: (2, B, T, P) precision of deltas.
-        smooth: (2, B, T, P) precision of how their error changes from frame to frame.
-        pair: (2, B, T, P, P - 1) precision of pairwise transforms, shown and predicted together.
-        share: (2, B, T, P, P - 1) what of that is the shown ones'.
+        people: P of them below. B is 1 where all scenes are alike.
+        mean, std: (B, 1, P, P, 4, 9) of deltas and pairwise transforms.
+        rescaling: (B, N, P, P, 4, 9) what noisy ones are multiplied by to estimate clean ones, in real units.
+        deltas: (B, N, P, P, 1, 1) bool, where deltas are shown clean.
+        met: (B, 1, P, P, 1, 1) bool, what changes.
+        share: (2, B, T, P, P - 1) weight of shown pairwise transforms against predicted ones: yaws, ground positions.
+        graph: precisions.
     """
 
-    delta: Tensor
-    smooth: Tensor
-    pair: Tensor
+    people: SlotsInUse
+    mean: Tensor
+    std: Tensor
+    rescaling: Tensor
+    deltas: Tensor
+    met: Tensor
     share: Tensor
+    graph: PoseGraph
 
 
-def frames_fused(told: Tensor, shown: Tensor, weights: Weights) -> Tensor:
+SETTINGS: Kept[dict[tuple[object, ...], Setting]] = Kept(lambda posterior: {})
+
+
+def frames_fused(told: Tensor, shown: Tensor, known: Setting) -> Tensor:
     """Posterior means: one motion, by what a network told and what it was shown.
 
+    Yaws are complex numbers exp(-i yaw) here, which turn ground positions x + i z, and numbers 0 and 2 of a transform.
+
     Args:
-        told: (B, T, P, P, 9); the first of an agent's P transforms are its deltas, the others lead to its partners.
-        shown: (B, T, P, P, 9); its deltas are not read.
-        weights: of both.
+        told: (B, N, P, P, 4, 9); the first of an agent's P transforms are its deltas, the others lead to its partners.
+        shown: (B, N, P, P, 4, 9); its deltas are not read.
+        known: how much they count.
 
     Returns:
-        (B, T, P, P, 9) float64. The first frame's deltas are those told.
+        (B, N, P, P, 4, 9). The first frame's deltas are those told.
     """
-    turns, moves = (torch.stack([told[..., i : i + 3 : 2], shown[..., i : i + 3 : 2]]).double() for i in (0, 6))
-    yaw = torch.atan2(-turns[0, ..., 1], turns[0, ..., 0])
-    guess, seen = turns[..., 1:, :]
-    cross = guess[..., 1] * seen[..., 0] - guess[..., 0] * seen[..., 1]
-    turned = torch.atan2(cross, (guess * seen).sum(dim=-1))
-    pair_yaw = yaw[..., 1:] + weights.share[0] * turned
-    pair_ground = torch.lerp(moves[0, ..., 1:, :], moves[1, ..., 1:, :], weights.share[1, ..., None])
-    start = heading_at_start(pair_yaw, yaw[..., 0], weights.pair[0])
-    heading, place = solve_pose_graph(
-        Planar(yaw[..., 0], moves[0, ..., 0, :], *weights.delta, *weights.smooth),
-        Planar(pair_yaw, pair_ground, *weights.pair),
-        start,
-        torch.zeros_like(start)[..., None].expand(-1, -1, 2),
-    )
-    pose = torch.cat([heading[..., None], place], dim=-1)
+    frames = torch.stack([told, shown]).permute(0, 1, 2, 5, 3, 4, 6).flatten(2, 3).double()  # (2, B, T, P, P, 9)
+    turn, move = torch.complex(frames[..., 0], frames[..., 2]), frames[..., 6::2]
+    yaw = -turn[0].angle()
+    further = (turn[0, ..., 1:] * turn[1, ..., 1:].conj()).angle()
+    pair_yaw = torch.addcmul(yaw[..., 1:], known.share[0], further)
+    pair_ground = torch.lerp(move[0, ..., 1:, :], move[1, ..., 1:, :], known.share[1, ..., None])
+    start = heading_at_start(pair_yaw, yaw[..., 0], known.graph.tied[0])
+    zero = torch.zeros_like(start)[..., None].expand(-1, -1, 2)
+    heading, place = known.graph.solve(yaw[..., 0], move[0, ..., 0, :], pair_yaw, pair_ground, start, zero)
+    pose = torch.stack([torch.exp(-1j * heading), torch.view_as_complex(place)])  # (2, B, T, P)
     # From the frame before to this one, and from an agent to its partners.
-    before, here = torch.cat([pose[:, :1], pose[:, :-1]], dim=1)[..., None, :], pose[..., None, :]
-    others = pose[:, :, partners(pose.shape[2], pose.device)]
-    origin = torch.cat([before, here.expand_as(others)], dim=-2)
-    gap = torch.cat([here, others], dim=-2) - origin
-    nine = nine_of(gap[..., 0], rotate_ground(-origin[..., 0], gap[..., 1:]))
-    nine[:, 0, :, 0] = told[:, 0, :, 0].double()
-    return nine
-
-
-def _frames(tokens: Tensor) -> Tensor:
-    """(B, N, P, P, 4, 9) -> (B, T, P, P, 9)"""
-    return tokens.permute(0, 1, 4, 2, 3, 5).flatten(1, 2)
+    before, here = torch.cat([pose[:, :, :1], pose[:, :, :-1]], dim=2)[..., None], pose[..., None]
+    others = pose[..., partners(pose.shape[-1], pose.device)]
+    origin, target = torch.cat([before, here.expand_as(others)], dim=-1), torch.cat([here, others], dim=-1)
+    back = origin[0].conj()
+    nine = torch.zeros_like(frames[0], dtype=told.dtype)
+    nine[..., 4] = 1
+    nine[..., :3:2] = torch.view_as_real(target[0] * back)
+    nine[..., 6::2] = torch.view_as_real((target[1] - origin[1]) * back)
+    nine[:, 0, :, 0] = told[:, 0, :, 0, 0]
+    return nine.unflatten(1, (-1, TOKEN_FRAMES)).permute(0, 1, 3, 4, 2, 5)
 
 
 def deviation(value: float) -> nn.Parameter:
@@ -239,5 +283,4 @@ def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor) -> Tensor:
     """
     along = delta_yaw.cumsum(dim=1)
     offset = yaw[:, :, 0] - along[..., 1:] + along[..., :1]  # (B, T, P - 1)
-    total = (weight[:, :, 0, :, None] * unit_of(offset)).sum(dim=1)
-    return F.pad(torch.atan2(total[..., 1], total[..., 0]), (1, 0))
+    return F.pad((weight[:, :, 0] * torch.exp(1j * offset)).sum(dim=1).angle(), (1, 0))

@@ -5,6 +5,7 @@ To add a placement, write its function, name it in `Placement`, and list it in `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +17,8 @@ from magnet.motion.frames import from_planar, partners, project_se2, to_planar
 from magnet.motion.planar import rotate_ground
 
 Placement = Literal["integrate", "anchor", "fuse"]
+
+TURN = 2 * math.pi
 
 FIXED = 1e9
 """Weight of a delta that is known: `fuse` moves such an agent by less than rounding does."""
@@ -114,37 +117,53 @@ def fuse(predicted: Predicted) -> Tensor:
     """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
 
     Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight.
+    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight. So each
+    frame's poses are a constant matrix times those before, plus what the frame says: all frames at once, by doubling.
     """
     assert predicted.T_self_partner is not None
-    delta_yaw, delta_ground = predicted.delta_yaw, predicted.delta_ground
     pair_yaw, pair_ground = to_planar(predicted.T_self_partner)
-    present, yaw, ground = predicted.present, predicted.start_yaw, predicted.start_ground
-    own = torch.where(predicted.fixed, FIXED, torch.ones_like(yaw[0]))
+    present, start_yaw = predicted.present, predicted.start_yaw
+    own = torch.where(predicted.fixed, FIXED, torch.ones_like(start_yaw[0]))
     partner = partners(present.shape[1], present.device)
-    together = predicted.pairwise_weight * (present[:, :, None] & present[:, None]).to(delta_yaw)
+    together = predicted.pairwise_weight * (present[:, :, None] & present[:, None]).to(start_yaw)
     together.diagonal(dim1=1, dim2=2).zero_()
-    system = torch.diag(own.to(delta_yaw)) + 2 * (torch.diag_embed(together.sum(-1)) - together)
-    solve = torch.linalg.inv(system)
-    weight = together.gather(2, partner.expand(len(present), -1, -1))  # (B, P, P - 1)
+    laplacian = 2 * (torch.diag_embed(together.sum(-1)) - together)
+    solve = torch.linalg.inv(torch.diag(own.to(start_yaw)) + laplacian)[:, None]
+    keep = torch.eye(len(own), dtype=solve.dtype, device=solve.device) - solve @ laplacian[:, None]
+    weight = together.gather(2, partner.expand(len(present), -1, -1))[:, None, ..., None]  # (B, 1, P, P - 1, 1)
 
-    def pull(residual: Tensor) -> Tensor:
-        """Pair residuals (B, P, P - 1, C) as a pull on each agent: those that point at it, less its own."""
-        weighted = weight[..., None] * residual
-        return (-weighted.sum(dim=2)).index_add(1, partner.flatten(), weighted.flatten(1, 2))
+    def pulled(pairs: Tensor) -> Tensor:
+        """What pairs (B, T, P, P - 1, C) add to each agent: those that point at it, less its own. -> (B, T, P, C)"""
+        weighted = weight * pairs
+        return solve @ (-weighted.sum(dim=3)).index_add(2, partner.flatten(), weighted.flatten(2, 3))
 
-    yaws, grounds = [], []
-    for t in range(delta_yaw.shape[1]):
-        ground = ground + rotate_ground(yaw, delta_ground[:, t])
-        yaw = yaw + delta_yaw[:, t]
-        off = pair_yaw[:, t] - (yaw[:, partner] - yaw[:, :, None])
-        off = torch.atan2(off.sin(), off.cos())
-        yaw = yaw + (solve @ pull(off[..., None]))[..., 0]
-        away = rotate_ground(yaw[:, :, None], pair_ground[:, t]) - (ground[:, partner] - ground[:, :, None])
-        ground = ground + solve @ pull(away)
-        yaws.append(yaw)
-        grounds.append(ground)
-    return from_planar(torch.stack(yaws, dim=1), torch.stack(grounds, dim=1))
+    steps, begins = predicted.delta_yaw[..., None], start_yaw[:, None, :, None]
+    turned = start_yaw[:, None] + predicted.delta_yaw.cumsum(dim=1)
+    turns = None
+    while True:
+        # A pair's heading counts the short way round: by whole turns that follow from the frames before.
+        new = ((pair_yaw - (turned[:, :, partner] - turned[..., None])) / TURN).round()
+        if turns is not None and torch.equal(new, turns):
+            break
+        turns = new
+        yaw = accumulated(keep, keep @ steps + pulled((pair_yaw - TURN * turns)[..., None]), begins)[..., 0]
+        turned = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1) + predicted.delta_yaw
+    before = torch.cat([start_yaw[:, None], yaw[:, :-1]], dim=1)
+    moves = keep @ rotate_ground(before, predicted.delta_ground) + pulled(rotate_ground(yaw[..., None], pair_ground))
+    return from_planar(yaw, accumulated(keep, moves, predicted.start_ground[:, None]))
+
+
+def accumulated(keep: Tensor, added: Tensor, start: Tensor) -> Tensor:
+    """x_t = keep x_{t-1} + added_t from a start, by doubling: log2 T products in place of T.
+
+    keep (B, 1, P, P), added (B, T, P, C), start (B, 1, P, C) -> (B, T, P, C)
+    """
+    x = torch.cat([added[:, :1] + keep @ start, added[:, 1:]], dim=1)
+    reach, power = 1, keep
+    while reach < x.shape[1]:
+        x = torch.cat([x[:, :reach], x[:, reach:] + power @ x[:, :-reach]], dim=1)
+        reach, power = 2 * reach, power @ power
+    return x
 
 
 PLACEMENTS: dict[Placement, Callable[[Predicted], Tensor]] = {"integrate": integrate, "anchor": anchored, "fuse": fuse}

@@ -17,13 +17,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from magnet.motion.frames import partners
-from magnet.motion.planar import rotate_by, unit_of
 
 GAUGE = 1e-6
 """Small precision of the integrated deltas, which decides where nothing else determines a position."""
 
-DENSE = 64
-"""Up to so many unknowns a system is factored whole; larger ones are reduced first."""
+WHOLE = 2 * 128**3
+"""Matrices are factored whole where their number times the cube of their size is no more; others are reduced first."""
 
 RUN = 4
 """Blocks of two frames in a run, all but the last of which are eliminated at once."""
@@ -66,45 +65,85 @@ def solve_pose_graph(deltas: Planar, pairs: Planar, start_yaw: Tensor, start_gro
     Returns:
         yaw (B, T, P) and ground (B, T, P, 2), in float64.
     """
-    start_yaw, start_ground = start_yaw.double(), start_ground.double()
-    partner = partners(deltas.yaw.shape[2], deltas.yaw.device)
-    # The matrices depend on precisions only, so that of headings and that of positions are factored together.
-    held = torch.stack([deltas.yaw_precision, deltas.ground_precision]).double()
     smooth = [0 * deltas.yaw_precision if s is None else s for s in (deltas.yaw_smoothness, deltas.ground_smoothness)]
-    tied = torch.stack([pairs.yaw_precision, pairs.ground_precision]).double()
-    systems = factor(*_in_twos(*_bands(held, torch.stack(smooth).double(), tied, partner)))
-    yaw = start_yaw[:, None] + deltas.yaw.double().cumsum(dim=1)
-    off = pairs.yaw.double() - (yaw[:, :, partner] - yaw[..., None])
-    off = torch.atan2(off.sin(), off.cos())
-    yaw = yaw + _corrections(systems[0], tied[0], off[..., None], partner)[..., 0]
-    unit = unit_of(yaw)
-    before = torch.cat([unit_of(start_yaw)[:, None], unit[:, :-1]], dim=1)
-    ground = start_ground[:, None] + rotate_by(before, deltas.ground.double()).cumsum(dim=1)
-    seen = rotate_by(unit[:, :, :, None], pairs.ground.double())
-    away = seen - (ground[:, :, partner] - ground[:, :, :, None])
-    return yaw, ground + _corrections(systems[1], tied[1], away, partner)
+    graph = PoseGraph.of(
+        torch.stack([deltas.yaw_precision, deltas.ground_precision]).double(),
+        torch.stack(smooth).double(),
+        torch.stack([pairs.yaw_precision, pairs.ground_precision]).double(),
+    )
+    return graph.solve(deltas.yaw, deltas.ground, pairs.yaw, pairs.ground, start_yaw, start_ground)
 
 
-def _corrections(system: BlockTridiagonal, tied: Tensor, off: Tensor, partner: Tensor) -> Tensor:
-    """Correction of each agent's integrated path in each frame.
+@dataclass(frozen=True)
+class PoseGraph:
+    """All of `solve_pose_graph` that depends on precisions only, to be solved with any deltas and pairwise transforms.
 
-    tied (B, T, P, P - 1) precisions, off (B, T, P, P - 1, C), how far each pairwise transform is from the integrated
-    paths -> (B, T, P, C)
+    Attributes:
+        tied: (2, B, T, P, P - 1) precisions of pairwise transforms, of yaws and of ground positions. B may be 1, for
+            any number of scenes.
+        systems: the two factored matrices.
     """
-    B, T, P, _, C = off.shape
-    pull = tied[..., None] * off
-    right = (-pull.sum(dim=3)).index_add(2, partner.flatten(), pull.flatten(2, 3))
-    right = pad(right, (0, 0, 0, 0, 0, T % 2))
-    return system.solve(right.view(B, -1, 2 * P, C)).view(B, -1, P, C)[:, :T]
+
+    tied: Tensor
+    systems: BlockTridiagonal
+
+    @classmethod
+    def of(cls, held: Tensor, smooth: Tensor, tied: Tensor) -> PoseGraph:
+        """held, smooth (2, B, T, P) precisions of deltas and of their changes, tied as above; all float64."""
+        return cls(tied, factor(*_in_twos(*_bands(held, smooth, tied))))
+
+    def solve(
+        self,
+        delta_yaw: Tensor,
+        delta_ground: Tensor,
+        pair_yaw: Tensor,
+        pair_ground: Tensor,
+        start_yaw: Tensor,
+        start_ground: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """As `solve_pose_graph`. (x, z) is one complex number here, which a turn by a yaw multiplies by exp(-i yaw)."""
+        partner = partners(delta_yaw.shape[2], delta_yaw.device)
+        start_yaw, start_ground = start_yaw.double(), torch.view_as_complex(start_ground.double().contiguous())
+        yaw = start_yaw[:, None] + delta_yaw.double().cumsum(dim=1)
+        off = pair_yaw.double() - (yaw[:, :, partner] - yaw[..., None])
+        off = torch.atan2(off.sin(), off.cos())
+        yaw = yaw + self._corrections(0, off[..., None])[..., 0]
+        turn = torch.exp(-1j * torch.cat([start_yaw[:, None], yaw], dim=1))
+        steps = turn[:, :-1] * torch.view_as_complex(delta_ground.double().contiguous())
+        ground = start_ground[:, None] + steps.cumsum(dim=1)
+        seen = turn[:, 1:, :, None] * torch.view_as_complex(pair_ground.double().contiguous())
+        away = torch.view_as_real(seen - (ground[:, :, partner] - ground[..., None]))
+        return yaw, torch.view_as_real(ground) + self._corrections(1, away)
+
+    def _corrections(self, which: int, off: Tensor) -> Tensor:
+        """Correction of each agent's integrated path in each frame, of yaws (0) or of ground positions (1).
+
+        off (B, T, P, P - 1, C), how far each pairwise transform is from the integrated paths -> (B, T, P, C)
+        """
+        B, T, P, _, C = off.shape
+        tied, system = self.tied[which], self.systems[which]
+        pull = tied[..., None] * off
+        partner = partners(P, off.device).flatten()
+        right = (-pull.sum(dim=3)).index_add(2, partner, pull.flatten(2, 3))
+        if T % 2:
+            right = pad(right, (0, 0, 0, 0, 0, 1))
+        right = right.view(B, -1, 2 * P, C)
+        if len(tied) < B:  # scenes of one matrix are columns of one right side
+            columns = right.movedim(0, -1).flatten(-2)[None]
+            solved = system.solve(columns)[0].unflatten(-1, (C, B)).movedim(-1, 0)
+        else:
+            solved = system.solve(right)
+        return solved.reshape(B, -1, P, C)[:, :T]
 
 
-def _bands(held: Tensor, smooth: Tensor, tied: Tensor, partner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _bands(held: Tensor, smooth: Tensor, tied: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The matrix whose solutions are corrections: each frame is tied to the two before it.
 
     held, smooth (..., T, P) precisions of deltas and of their changes, tied (..., T, P, P - 1) of pairs -> each frame's
     own block (..., T, P, P), and what ties agents to themselves one and two frames before, (..., T, P) each
     """
     P = held.shape[-1]
+    partner = partners(P, held.device)
     # Ordered pairs both ways as one symmetric matrix a frame: (..., T, P, P).
     both = torch.zeros(*held.shape, P, dtype=held.dtype, device=held.device)
     both = both.scatter(-1, partner.expand(tied.shape), tied)
@@ -194,7 +233,7 @@ def factor(diagonal: Tensor, before: Tensor) -> BlockTridiagonal:
         before: (..., T, P, P) what ties a block to the one before it; that of the first is not read.
     """
     T, P = diagonal.shape[-3:-1]
-    if T * P <= DENSE or T == 1:
+    if T == 1 or diagonal.shape[:-3].numel() * (T * P) ** 3 <= WHOLE:
         return BlockTridiagonal(_cholesky(_whole(diagonal, before)))
     if T % RUN:
         diagonal = _with_unit_blocks(diagonal, -T % RUN)

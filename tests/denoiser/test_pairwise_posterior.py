@@ -1,5 +1,7 @@
 """Pairwise transforms as their posterior: never worse than what is shown, for any number of people."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -258,6 +260,30 @@ def test_it_is_the_answer_of_a_dense_least_squares(model: Denoiser, people: list
         for q, (angle, place) in origin.items():
             assert np.abs(np.exp(1j * (yaw[1:, q] - angle)) - np.exp(1j * found[1:, p, q, 0])).max() < 1e-5
             assert np.abs(turned(-angle, ground[1:, q] - place) - found[1:, p, q, 1:]).max() < 1e-5
+
+
+def test_what_is_kept_from_call_to_call_is_that_of_the_same_question(model: Denoiser):
+    """Without gradients, other levels, people, deviations and statistics each give what they give with gradients."""
+    posterior, normalizer = PairwisePosterior(model.layout), copy.deepcopy(model.normalizer)
+    _, guess, noisy, levels, present = shown(model, 100)
+    others = levels.clone()
+    others[1:, 3] = 500
+    two = torch.tensor([True, False, True]).expand_as(present)
+
+    def asked() -> list[Tensor]:
+        cases = [(levels, present), (levels + 100, present), (levels, two), (others, present), (levels, present)]
+        return [posterior(guess, noisy, *case, normalizer) for case in cases]
+
+    changes = (lambda: None, lambda: posterior.log_pair_ground.add_(-1), lambda: normalizer.std.mul_(1.1))
+    for change in changes:
+        with torch.no_grad():
+            change()
+            kept = asked()
+        expected = asked()
+        for one, other in zip(kept, expected, strict=True):
+            assert torch.allclose(one, other, atol=1e-5)
+        differ = [not torch.allclose(one, expected[0], atol=1e-4) for one in expected]
+        assert differ == [False, True, True, True, False]
 
 
 def test_deviations_can_be_learnt(model: Denoiser):

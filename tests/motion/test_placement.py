@@ -1,11 +1,95 @@
-"""Every placement is listed under its name."""
+"""Every placement is listed under its name; `fuse` is its plain loop, without the loop."""
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
-from magnet.motion.placement import PLACEMENTS, Placement
+import pytest
+import torch
+import torch.utils._python_dispatch
+from torch import Tensor
+
+from magnet.motion.frames import from_planar, to_planar
+from magnet.motion.placement import PLACEMENTS, Placement, place
+from magnet.motion.planar import rotate_ground
 
 
 def test_every_placement_has_a_function():
     assert tuple(PLACEMENTS) == get_args(Placement)
+
+
+def frame_by_frame(
+    deltas: Tensor, pairs: Tensor, start: Tensor, weight: float, present: Tensor, fixed: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`fuse` as its docstring has it, one frame and one scene at a time: yaws (B, T, P) and grounds (B, T, P, 2)."""
+    (dyaw, dground), (pyaw, pground), (yaw0, ground0) = (to_planar(x.double()) for x in (deltas, pairs, start))
+    B, T, P = dyaw.shape
+    yaws, grounds = torch.zeros(B, T, P).double(), torch.zeros(B, T, P, 2).double()
+    others = [[q for q in range(P) if q != p] for p in range(P)]
+    for b in range(B):
+        own = torch.diag(torch.where(fixed, 1e9, 1.0).double())
+        system, yaw, ground = own.clone(), yaw0[b], ground0[b]
+        ties = [(p, s, q) for p in range(P) for s, q in enumerate(others[p]) if present[b, p] and present[b, q]]
+        for p, _, q in ties:
+            system[p, p] += weight
+            system[q, q] += weight
+            system[p, q] -= weight
+            system[q, p] -= weight
+        for t in range(T):
+            ground = ground + rotate_ground(yaw, dground[b, t])
+            yaw = yaw + dyaw[b, t]
+            right = torch.zeros(P, 1).double()
+            for p, s, q in ties:
+                off = pyaw[b, t, p, s] - (yaw[q] - yaw[p])
+                off = torch.atan2(off.sin(), off.cos())
+                right[q] += weight * off
+                right[p] -= weight * off
+            yaw = yaw + torch.linalg.solve(system, right)[:, 0]
+            right = torch.zeros(P, 2).double()
+            for p, s, q in ties:
+                away = rotate_ground(yaw[p], pground[b, t, p, s]) - (ground[q] - ground[p])
+                right[q] += weight * away
+                right[p] -= weight * away
+            ground = ground + torch.linalg.solve(system, right)
+            yaws[b, t], grounds[b, t] = yaw, ground
+    return yaws, grounds
+
+
+@pytest.mark.parametrize(("frames", "people", "spread"), [(1, 2, 0.1), (9, 3, 0.3), (17, 3, 4.0), (32, 2, 0.1)])
+def test_fuse_is_the_compromise_of_each_frame_after_the_one_before(frames: int, people: int, spread: float) -> None:
+    """However far pairs are from the deltas: with a spread of 4 they are whole turns off."""
+    generator = torch.Generator().manual_seed(frames)
+
+    def planar(*shape: int, turn: float) -> Tensor:
+        ground = torch.randn(*shape, 2, generator=generator)
+        return from_planar(turn * torch.randn(shape, generator=generator), ground)
+
+    deltas, start = planar(2, frames, people, turn=0.1), planar(2, people, turn=3.0)
+    pairs = planar(2, frames, people, people - 1, turn=spread)
+    present = torch.ones(2, people, dtype=torch.bool)
+    present[1, 0] = people < 3
+    fixed = torch.arange(people) == 1
+    placed = place(deltas, pairs, start, "fuse", 0.3, present, fixed)
+    yaws, grounds = frame_by_frame(deltas, pairs, start, 0.3, present, fixed)
+    torch.testing.assert_close(placed, from_planar(yaws, grounds).float(), rtol=1e-5, atol=1e-5)
+
+
+def test_fuse_takes_few_products_however_many_frames_there_are() -> None:
+    """A loop over frames would be launched on a GPU frame by frame, in each step of training."""
+
+    def operators(frames: int) -> int:
+        deltas = from_planar(torch.zeros(1, frames, 2), torch.zeros(1, frames, 2, 2))
+        pairs = from_planar(torch.zeros(1, frames, 2, 1), torch.ones(1, frames, 2, 1, 2))
+        with Counter() as counter:
+            place(deltas, pairs, from_planar(torch.zeros(1, 2), torch.zeros(1, 2, 2)), "fuse")
+        return counter.operators
+
+    assert operators(256) < operators(16) + 240, "a loop would take twenty for each frame more"
+
+
+class Counter(torch.utils._python_dispatch.TorchDispatchMode):
+    operators = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.operators += 1
+        return func(*args, **(kwargs or {}))
