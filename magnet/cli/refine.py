@@ -22,6 +22,7 @@ the air without falling comes down, and soles are not under the floor. The table
 for example:
   magnet refine demo/quartet.npz apart.npz
   magnet refine leader.bvh follower.bvh couple.glb --keep 0
+  magnet refine duet.npz better.npz --plot over_time.svg
   magnet refine smplx.npz apart.npz --poses keep   # people are moved over the ground as a whole, and that is all
 """
 
@@ -52,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="SPEED",
         help="low toes slower than so many m/s are to stand still; 0: feet may slide (default: %(default)s)",
     )
+    options.add_argument("--plot", metavar="SVG", help="draw depths, feet and hands over time, before and after")
     return options
 
 
@@ -63,8 +65,11 @@ def main(arguments: Sequence[str] = ()) -> int:
         ValueError: files that cannot be read or written; says what to do.
     """
     options = parser().parse_args(list(arguments))
+    from pathlib import Path
+
     from magnet.body.apart import APART
     from magnet.body.repair import fixed_agents, moved_apart, repaired
+    from magnet.cli import refine_plot
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 
@@ -86,6 +91,11 @@ def main(arguments: Sequence[str] = ()) -> int:
     for title, scene in (("before", got.scene), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
+    if options.plot:
+        plot = Path(options.plot)
+        before, after = (refine_plot.by_frame(scene, got.body) for scene in (got.scene, refined))
+        plot.write_text(refine_plot.drawn(before, after, got.scene.fps), encoding="utf-8")
+        scene_files.say_written([plot])
     return 0
 
 

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from magnet.body.capsules import capsule_segments
 from magnet.body.joints import WRISTS
-from magnet.metrics.penetration import penetration_depth
+from magnet.export.page.palette import COLLIDES, SLIDES
+from magnet.metrics.body_depth import DEEP
+from magnet.metrics.penetration import TOUCH, penetration_depth
 from magnet.metrics.skating import PRESETS, TOES
 
 Array = NDArray[np.floating]
@@ -54,6 +56,12 @@ def penetrations(joints: Array) -> tuple[Array, Array, Array]:
     c, d, _ = capsule_segments(other)
     place = nearest(a[n, i], b[n, i], c[n, j], d[n, j])
     return place.numpy(), torch.maximum(radius[i], radius[j]).numpy(), depth[n, i, j].numpy()
+
+
+def depth_colours(depths: Array) -> Array:
+    """Amber where bodies just count as in each other, at 5 cm, and red from 10 cm on. (M,) metres -> (M, 3)"""
+    share = np.clip((depths - TOUCH) / (DEEP - TOUCH), 0.0, 1.0)[:, None]
+    return (1 - share) * np.array(SLIDES, dtype=float) + share * np.array(COLLIDES, dtype=float)
 
 
 def nearest(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, d: torch.Tensor, parts: int = 12) -> torch.Tensor:

@@ -8,7 +8,7 @@ import numpy as np
 
 from magnet.body.joints import PELVIS, TOES
 from magnet.export.drawing import SHADOW
-from magnet.export.page.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
+from magnet.export.page.palette import FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.export.page.rig import Array, Index, capsule
 from magnet.viewer import marks
 
@@ -151,7 +151,7 @@ class Marks:
         """Joints (P, 22, 3). -> metres that the deepest collision is deep"""
         places, radii, depths = marks.penetrations(now)
         deepest = np.argsort(-depths)
-        self.hits.show(places[deepest], np.array(COLLIDES), radii[deepest] + 0.03)
+        self.hits.show(places[deepest], marks.depth_colours(depths[deepest]), radii[deepest] + 0.03)
         return float(depths.max(initial=0.0))
 
     def clear(self, contacts: bool, collisions: bool) -> None:

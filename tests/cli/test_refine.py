@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -91,3 +92,13 @@ def test_one_person_and_unknown_formats_are_refused(crowded: Scene, tmp_path: Pa
     assert "one person" in capsys.readouterr().err
     assert cli.main(["refine", str(alone), str(tmp_path / "out.xyz")]) == 2
     assert "nothing writes .xyz" in capsys.readouterr().err
+
+
+def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene, tmp_path: Path) -> None:
+    scene, plot = crowded.slice(0, 40).save(tmp_path / "crowded.npz"), tmp_path / "over_time.svg"
+    assert cli.main(["refine", str(scene), str(tmp_path / "out.npz"), "--poses", "keep", "--plot", str(plot)]) == 0
+    lines = re.findall(r'<polyline points="([^"]*)" class="(before|after)"', plot.read_text())
+    assert [which for _, which in lines] == ["before", "after"] * 5
+    assert all(len(points.split()) == 40 for points, _ in lines)
+    heights = [float(point.partition(",")[2]) for point in lines[0][0].split()]
+    assert min(heights) < 0.5 * (42 + 162), "the deepest reaches the top of its strip"

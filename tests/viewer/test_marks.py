@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from magnet.body import Body
+from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.metrics.penetration import penetration_depth
 from magnet.metrics.skating import toe_steps
 from magnet.motion.scene import Scene
@@ -58,3 +59,9 @@ def test_marks_that_are_not_needed_are_too_small_to_be_seen(server) -> None:
     for shown in (3, 1, 0):
         spots.show(np.ones((shown, 3)), np.zeros(3), 0.5)
         assert (spots.batch.batched_scales[:shown] == 0.5).all() and spots.batch.batched_scales[shown:].max() < 1e-5
+
+
+def test_the_deeper_a_collision_the_redder_its_mark():
+    colours = marks.depth_colours(np.array([0.05, 0.075, 0.10, 0.30]))
+    assert colours[0].tolist() == list(SLIDES) and colours[2].tolist() == colours[3].tolist() == list(COLLIDES)
+    assert np.allclose(colours[1], (colours[0] + colours[2]) / 2)
