@@ -47,7 +47,7 @@ class Parser(LightningArgumentParser):
     """The parser of the command; the parsers of classes inside it know only their own fields."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
         self.command = ""
         self.arguments: list[str] = []
         self.classes: dict[str, dict[str, type]] = {}
