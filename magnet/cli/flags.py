@@ -1,4 +1,4 @@
-"""Flags as they are written, and what may be meant by one that there is not; nothing heavy is imported to say so."""
+"""Reads flags and suggests what an unknown one may mean, without importing Torch or Lightning."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def path_of(classes: dict[str, str]) -> str:
 
 
 def quiet() -> None:
-    """Silence what a user can do nothing about."""
+    """Silence warnings that a user can do nothing about."""
     for text in SILENCED:
         warnings.filterwarnings("ignore", text)
     log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
@@ -150,7 +150,7 @@ class MagnetCLI(LightningCLI):
     # -- parsing -------------------------------------------------------------------------------
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """Only the one that runs: building the others' parsers takes most of a second."""
+        """Only the command that runs: building the parsers of the others takes most of a second."""
         hidden = {"model", "dataloaders", "train_dataloaders", "val_dataloaders", "datamodule", "weights_only"}
         return {self.command: hidden | {"return_predictions", "verbose"}}
 
@@ -217,7 +217,7 @@ class MagnetCLI(LightningCLI):
         self.config = parser.parse_args(args)
 
     def _parse_ckpt_path(self) -> None:
-        """Off: it would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""
+        """Do nothing: Lightning's would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""
 
     # -- building ------------------------------------------------------------------------------
 
