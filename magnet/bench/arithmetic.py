@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 Clock = Callable[[], float]
 """Seconds: `time.perf_counter`, or `time.process_time`, which others on the machine disturb less."""
 
-PRODUCTS = ("mm", "addmm", "bmm", "baddbmm", "convolution", "_scaled_dot_product")
+PRODUCTS = ("mm", "addmm", "bmm", "baddbmm", "convolution", "_scaled_dot_product", "_linear_pointwise")
 """Beginnings of the names of the operators that count: everything that grows with a product of two sizes."""
 
 
@@ -32,7 +32,7 @@ class Recorder(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         self.operators += 1
-        if func._schema.name.removeprefix("aten::").startswith(PRODUCTS):
+        if func._schema.name.rpartition("::")[2].startswith(PRODUCTS):
             self.products.append(lambda: func(*args, **kwargs))
         return func(*args, **kwargs)
 

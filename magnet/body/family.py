@@ -1,4 +1,4 @@
-"""Which model of SMPL's family a body file holds: told by its tree of joints, since their shape numbers differ."""
+"""The model of SMPL's family in a body file, found by its tree of joints; shape numbers differ between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A shape of one body as a shape of another."""
+"""Converts shape numbers of one body model to another."""
 
 from __future__ import annotations
 

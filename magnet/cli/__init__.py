@@ -1,3 +1,3 @@
-"""The command `magnet`: the roof over everything."""
+"""The command `magnet`."""
 
 from magnet.cli.main import main as main

@@ -86,7 +86,7 @@ def show(name: str, draw: Callable[[Console], bool]) -> None:
 
 @contextlib.contextmanager
 def columns(number: int) -> Iterator[None]:
-    """Let the terminal be so wide for whoever asks."""
+    """Set the width of the terminal for whatever is drawn."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(number)
     try:

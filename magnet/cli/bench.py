@@ -54,6 +54,7 @@ def parser() -> argparse.ArgumentParser:
     add("--rounds", type=int, default=3, help="medians are over so many (default: %(default)s)")
     add("--sampler", default="default", metavar="PRESET", help="how is sampled (default: %(default)s)")
     add("--steps", type=int, default=None, help="denoising steps (default: the sampler's)")
+    add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
     add("--live", type=float, default=None, metavar="SECONDS", help="of live answers (default: 60); 0: none")
     add("--threads", type=int, default=None, help="threads of torch (default: its own choice)")
     add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: seconds of this process, for a busy machine")
@@ -120,10 +121,12 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     clock = time.process_time if given.clock == "cpu" else time.perf_counter
     usual = QUICK if given.quick else WHOLE
     model = load(given.model).to(given.device)
-    options = SamplerOptions.preset(given.sampler, **({} if given.steps is None else {"steps": given.steps}))
+    asked = {"steps": given.steps, "precision": given.precision}
+    options = SamplerOptions.preset(given.sampler, **{name: v for name, v in asked.items() if v is not None})
     tasks = given.task or registry.names()
     people = [P for P in given.people or usual["people"] if model.layout.agents >= P]
-    print(f"{given.model or 'the default model'}, {options.steps} steps, {torch.get_num_threads()} threads", flush=True)
+    threads = torch.get_num_threads()
+    print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads} threads")
     print(row("", list(COLUMNS.values())), flush=True)
     found: dict[str, Any] = {"cases": {}, "live": None}
     for case in cases(tasks, people, given.batch or usual["batch"]):
@@ -137,7 +140,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
             f"live: {live['answers']} answers in {live['median_ms']:.0f} ms (median), {live['p99_ms']:.0f} ms (99th "
             f"percentile), jitter {live['jitter_ms']:.1f} ms, {live['late']} late of {live['period_ms']:.0f} ms"
         )
-    about = {"model": given.model, "threads": torch.get_num_threads(), "frames": given.frames, "rounds": given.rounds}
+    about = {"model": given.model, "threads": threads, "frames": given.frames, "rounds": given.rounds}
     about |= {"clock": given.clock}
     return {**found, **about, "sampler": dataclasses.asdict(options), "machine": machine(), **provenance()}
 

@@ -1,4 +1,4 @@
-"""What a checkpoint remembers of its making, as defaults below everything that the user says.
+"""Options stored in a checkpoint, as defaults below everything that the user says.
 
 Two traps of LightningCLI are met here: it lets a checkpoint's options beat explicit ones, and it does not
 restore linked options. So its own reading of checkpoints is switched off, and the options that a checkpoint
@@ -291,7 +291,7 @@ def tokens(window_frames: int) -> int:
 
 
 def refuse_linked(given: Arguments) -> None:
-    """A linked option can only be set where it comes from.
+    """Refuse a linked option that is not set where it comes from.
 
     Raises:
         CommandError: it is set at the model.

@@ -31,7 +31,7 @@ class Settled:
 
 
 def settle(layers: Sequence[Layer], flags: Sequence[str]) -> Settled:
-    """Find the classes that win, and leave out of each layer what it says of others.
+    """Find the classes that win, and remove the options of other classes from each layer.
 
     Args:
         layers: lowest first; those without a path are not the user's own.
@@ -78,7 +78,7 @@ def same_class(one: str, other: str) -> bool:
 
 
 def _only(layers: list[Layer], specs: list[Options], key: str, winner: str) -> list[str]:
-    """Leave what is said of other classes out of all layers; a note for each file.
+    """Remove options of other classes from all layers; a note for each file.
 
     Options without a class belong to the class that lower layers name, or else to any.
     """
@@ -96,7 +96,7 @@ def _only(layers: list[Layer], specs: list[Options], key: str, winner: str) -> l
 
 
 def _replace(lower: Options, later: Options) -> None:
-    """Take lists, and options of classes, out of a layer where a later one has something else in their place."""
+    """Remove lists, and options of classes, from a layer where a later layer replaces them."""
     for key in [key for key in lower if key in later]:
         old, new = lower[key], later[key]
         if isinstance(old, dict) and isinstance(new, dict):

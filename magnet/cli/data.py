@@ -295,6 +295,8 @@ def run_prepare(given: argparse.Namespace) -> int:
     if given.place and given.out and given.place != given.out:
         raise ValueError(f"{given.parser.prog}: OUT is {given.place} and --out {given.out}: give one")
     given.out = given.out or given.place
+    if given.name:
+        registry.reader(given.name)  # a wrong name is said before what else is missing
     name, root, out = needed(given, "name", "root", "out")
     job = job_of(given, name, root)
     splits = read_splits(given.splits) if given.splits else None

@@ -47,7 +47,7 @@ def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
 
 
 def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
-    """What the splits lack, where nobody overlooks it."""
+    """Warn of what the splits lack, on the error stream."""
     from magnet.datamodules.preparing.split_gaps import split_gaps
 
     for line in split_gaps(clips):

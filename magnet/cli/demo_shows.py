@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,8 +33,12 @@ from magnet.tasks.partner import PartnerInpainting
 CONTEXT, HORIZON = 32, 150
 LONG = 1800
 """Frames of the minute that one scene is continued for."""
-LONG_SHOWN = 10.0
-"""Seconds of it that the moving picture shows, the last ones."""
+FASTER = 4.0
+"""How many times as fast its moving picture shows it, all of it."""
+RATE = 30.0
+"""Frames a second of moving pictures."""
+PANEL = (480, 400)
+"""Pixels of a moving picture's panel."""
 STEADY = 100
 """Noise level at which what is finished is shown in a long scene (docs/results.md)."""
 COLUMNS = 9
@@ -148,20 +151,20 @@ def perform(
 
 
 def picture(show: Show, rows: dict[str, Scene], body: Body, out: Path) -> list[Path]:
-    """A strip of the whole scene, and a moving picture of it, or of its end if it is long."""
+    """A strip of the whole scene, and a moving picture of all of it; of a long one four times as fast."""
     frames = next(iter(rows.values())).frames
     moments = [round(i * (frames - 1) / (COLUMNS - 1)) for i in range(COLUMNS)]
     sheet = contact_sheet(rows, out / f"{show.name}.png", frames=moments, context_frames=show.context, body=body)
-    first = max(0, frames - round(FPS * LONG_SHOWN)) if frames > CONTEXT + HORIZON else 0
-    end = {words: scene.slice(first) for words, scene in rows.items()}
-    paint: Callable[..., Path] = render_video
-    moving = paint(
-        end,
-        out / f"{show.name}.gif",
-        size=(320, 240),
-        fps=10,
-        context_frames=max(0, show.context - first),
+    long = frames > CONTEXT + HORIZON
+    moving = render_video(
+        {f"{words}, {FASTER:g} times as fast": scene for words, scene in rows.items()} if long else rows,
+        out / f"{show.name}.webp",
+        size=PANEL,
+        fps=RATE,
+        style="light",
+        context_frames=show.context,
         body=body,
+        speed=FASTER if long else 1.0,
         progress=True,
     )
     return [sheet, moving]

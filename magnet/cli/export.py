@@ -77,9 +77,12 @@ def parser() -> argparse.ArgumentParser:
         "--style",
         choices=("body", "light", "capsules", "skeleton"),
         default="body",
-        help="how people look; light, a body of few vertices, is for .html",
+        help="how people look; light is a body of few triangles",
     )
     pictures.add_argument("--title", help="written above")
+    pictures.add_argument(
+        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels of a film's panel"
+    )
     bvh = options.add_argument_group("reading .bvh and .npz of other programs")
     scene_files.add_origin(bvh)
     bvh.add_argument(
@@ -135,6 +138,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         context_frames=options.context,
         style=options.style,
         title=options.title,
+        size=tuple(options.size),
         progress=True,
         bones=BoneOptions(options.names, options.root, options.clips),
     )

@@ -1,4 +1,4 @@
-"""Flags as they are written, and what may be meant by one that there is not; nothing heavy is imported to say so."""
+"""Reads flags and suggests what an unknown one may mean, without importing Torch or Lightning."""
 
 from __future__ import annotations
 
@@ -128,4 +128,4 @@ def _accepted(name: str, known: Mapping[str, Any]) -> bool:
         field = rest.removeprefix("init_args.").partition(".")[0]
         fields = {option.split(".")[1] for options in known["classes"][key].values() for option in options}
         return field in fields or field in CLASS_WORDS or field in known["old"].get(key, ())
-    return any(flag == name or name.startswith(f"{flag}.") or flag.startswith(name) for flag in known["actions"])
+    return any(flag == name or name.startswith(f"{flag}.") for flag in known["actions"])

@@ -47,7 +47,7 @@ class Parser(LightningArgumentParser):
     """The parser of the command; the parsers of classes inside it know only their own fields."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
         self.command = ""
         self.arguments: list[str] = []
         self.classes: dict[str, dict[str, type]] = {}
@@ -146,7 +146,7 @@ class Parser(LightningArgumentParser):
                     action.metavar, action.help = "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"])
 
     def explain(self, key: str, value: str, text: str) -> None:
-        """Say of an option that is a group of others what else may stand behind it."""
+        """Set the help of an option that is a group of others."""
         for action in self._actions:
             if action.option_strings == [f"--{key}"]:
                 action.metavar, action.help = value, text

@@ -76,6 +76,11 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
     how.add_argument("--sampler", metavar="PRESET", default="default", help="default, steady or paper")
     how.add_argument("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
+    films = options.add_argument_group("films")
+    films.add_argument("--style", choices=("body", "light", "capsules", "skeleton"), default="body", help="of people")
+    films.add_argument(
+        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels of a panel (640 480)"
+    )
     files = options.add_argument_group("files")
     scene_files.add_body(files)
     scene_files.add_origin(files)
@@ -115,8 +120,12 @@ def main(arguments: Sequence[str]) -> int:
     print(f"{task.name}: {made.scenes * made.frames} frames in {took:.1f} s, seed {options.seed}")
     from magnet.export import formats
 
+    given, plain = made.context, made.plain()
+    if plain.scenes > 1:
+        plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
+    look: dict[str, Any] = {"style": options.style, "size": tuple(options.size), "context_frames": given}
     for out in outs:
-        scene_files.say_written(formats.write(made.plain(), out, body, context_frames=made.context, progress=True))
+        scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
 
 

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, class_options, outputs, run_folder
+from magnet.cli import answers, checkpoint_config, class_options, optimizers, outputs, run_folder
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
@@ -117,7 +117,7 @@ def path_of(classes: dict[str, str]) -> str:
 
 
 def quiet() -> None:
-    """Silence what a user can do nothing about."""
+    """Silence warnings that a user can do nothing about."""
     for text in SILENCED:
         warnings.filterwarnings("ignore", text)
     log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
@@ -150,7 +150,7 @@ class MagnetCLI(LightningCLI):
     # -- parsing -------------------------------------------------------------------------------
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """Only the one that runs: building the others' parsers takes most of a second."""
+        """Only the command that runs: building the parsers of the others takes most of a second."""
         hidden = {"model", "dataloaders", "train_dataloaders", "val_dataloaders", "datamodule", "weights_only"}
         return {self.command: hidden | {"return_predictions", "verbose"}}
 
@@ -169,6 +169,7 @@ class MagnetCLI(LightningCLI):
             help='also log to Weights & Biases; needs pip install "magnet-motion[wandb]"',
         )
         if self.command == "fit":
+            optimizers.add_optimizer_arguments(parser)
             parser.link_arguments("data.init_args.max_agents", "model.init_args.max_agents")
             parser.link_arguments("data.init_args.window_frames", "model.init_args.window", checkpoint_config.tokens)
         self._default_class(parser, "model", None if self.command == "fit" else path_of(MODELS))
@@ -217,7 +218,7 @@ class MagnetCLI(LightningCLI):
         self.config = parser.parse_args(args)
 
     def _parse_ckpt_path(self) -> None:
-        """Off: it would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""
+        """Do nothing: Lightning's would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""
 
     # -- building ------------------------------------------------------------------------------
 
@@ -299,6 +300,7 @@ class MagnetCLI(LightningCLI):
 
     def before_fit(self) -> None:
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
+        optimizers.choose_optimizer(self.model, self.config_init[self.command])
         if self.checkpoint is not None and not getattr(self.model, "built", True):
             self.model.on_load_checkpoint(checkpoints.read(self.checkpoint))
         if isinstance(self.model, Denoiser):  # now, and not once data are made and files are written

@@ -110,7 +110,8 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def show_at_the_end(words: Sequence[str]) -> None:
-    """`magnet view` after a run that has written its results: what keeps it from showing them is said, no failure."""
+    """`magnet view` after a run that has written its results; if it cannot show them, it says why and does not
+    fail."""
     try:
         main(words)
     except (ImportError, OSError, ValueError) as error:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.weak import WeakIdKeyDictionary
 
 from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
 from magnet.packing import Kept, linear_of, norm_of
@@ -254,8 +255,16 @@ def seats(present: Tensor) -> list[tuple[Tensor | None, slice | Tensor]]:
 
     Rows None: all of them, which then use the same slots.
     """
-    key = present.detach().cpu().contiguous()
-    return _seats(key.numpy().tobytes(), *key.shape, present.device)
+    if present.device.type == "cpu":
+        return _seats(present.detach().contiguous().numpy().tobytes(), *present.shape, present.device)
+    if present not in _SEATED:  # one wait for the device a stage, in place of one an evaluation
+        key = present.detach().cpu().contiguous()
+        _SEATED[present] = _seats(key.numpy().tobytes(), *key.shape, present.device)
+    return _SEATED[present]
+
+
+_SEATED: WeakIdKeyDictionary = WeakIdKeyDictionary()
+"""Seats by the tensor that was asked about; who is present is never changed in place."""
 
 
 @functools.lru_cache(maxsize=256)

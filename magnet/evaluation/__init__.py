@@ -1,1 +1,1 @@
-"""Samples of a task scored beside baselines, and the tables that come of it."""
+"""Samples of a task scored beside baselines, and tables of the results."""

@@ -211,7 +211,7 @@ class Evaluator(L.LightningModule):
     def sample(self, scene: Scene, samples: int, generators: Generators) -> Scene:
         """Context and samples, in the model's slots.
 
-        Where nothing is given samples stand anywhere: they are put where recorded ones are.
+        Where nothing is given, samples may stand anywhere; they are moved to where the recorded scenes are.
         """
         whole = self._sampled(scene, samples, generators)
         if not self.nothing_is_given:
@@ -313,7 +313,7 @@ class Evaluator(L.LightningModule):
         return joints, torch.tensor([len(among) > 0 for among in chosen], device=batch.device)
 
     def finish(self) -> dict[str, Tensor]:
-        """Close the run; the table is in `results`. Returns what to log, the model's metrics first."""
+        """Finish the run and put the table into `results`. Returns what to log, the model's metrics first."""
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
         strangers: dict[str, tuple[str, ...]] = {
             TRAINING: (*AGAINST_RECORDING, "div")

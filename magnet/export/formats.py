@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import level
@@ -14,6 +14,7 @@ from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, save_bvh
 from magnet.export.cast import Style
+from magnet.export.drawing import Size
 from magnet.export.fbx import save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 READ = (".npz", ".bvh")
 PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
+FILM = (640, 480)
+"""Pixels of a film's panel."""
 
 
 @dataclass(frozen=True)
@@ -168,10 +171,11 @@ class WriteOptions:
     unit: Unit
     smplx: bool
     context_frames: int
-    style: Style | Literal["light"]
+    style: Style
     title: str | None
     progress: bool | Report
     bones: BoneOptions
+    size: Size = FILM
 
     @property
     def look(self) -> dict[str, Any]:
@@ -217,7 +221,7 @@ def _write_usd(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
 def _write_film(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
     from magnet.export.video import render_video
 
-    return [render_video(scene, path, fps=o.fps, progress=o.progress, **o.look)]
+    return [render_video(scene, path, fps=o.fps, size=o.size, progress=o.progress, **o.look)]
 
 
 def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
@@ -249,10 +253,11 @@ def write(
     unit: Unit = "m",
     smplx: bool = False,
     context_frames: int = 0,
-    style: Style | Literal["light"] = "body",
+    style: Style = "body",
     title: str | None = None,
     progress: bool | Report = False,
     bones: BoneOptions = BoneOptions(),
+    size: Size = FILM,
 ) -> list[Path]:
     """Write a scene in the format of the path's suffix.
 
@@ -265,10 +270,11 @@ def write(
         unit: of lengths in BVH.
         smplx: npz with SMPL-X's conventional keys.
         context_frames: how many first frames were given to a model, where the scene does not say; pictures mark them.
-        style: how pictures show people: `body`, `capsules` or `skeleton`; of pages also `light`.
+        style: how pictures show people: `body`, `light`, `capsules` or `skeleton`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function told (done, all).
         bones: how people hang in GLB, FBX and USD.
+        size: pixels of a film's panel, width and height, even numbers.
 
     Returns:
         The paths written.
@@ -293,7 +299,7 @@ def write(
     if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
-    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones)
+    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size)
     if scene.scenes == 1 or (kind.batch and not apart):
         return list(kind.write(scene, path, options))
     places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]

@@ -39,6 +39,7 @@ def render_video(
     ghosts: Scene | None = None,
     camera: Camera | None = None,
     trail: float = 1.5,
+    speed: float = 1.0,
     progress: bool | Report = False,
 ) -> Path:
     """Write a moving picture of one scene, or of several side by side at one scale and from one side.
@@ -49,11 +50,12 @@ def render_video(
         context_frames: how many first frames were given to the model, where the scene does not say; they are pink and
             marked in the time bar.
         body: the scenes' body model; the packaged one if None.
-        style: `skeleton` strokes, `capsules` mannequins, or the `body`'s own skin.
+        style: `skeleton` strokes, `capsules` mannequins, the `body`'s own skin, or a `light` one of fewer triangles.
         fps: frames a second of the picture; the scene's are repeated or left out.
         size: pixels of one panel, even numbers.
         ghosts: a scene (B = 1) drawn pale behind every panel, such as the ground truth.
         trail: seconds of the way of each pelvis that are drawn on the floor.
+        speed: seconds of the scene that pass in a second of the picture.
         progress: True for a progress bar, or a function told (done, all) after each frame.
 
     Returns:
@@ -68,9 +70,10 @@ def render_video(
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
     if size[0] % 2 or size[1] % 2:
         raise ValueError(f"size {size}: video needs even numbers of pixels")
-    if not fps > 0:
-        raise ValueError(f"fps: got {fps:g}, expected more than 0")
-    film = Film(scenes, context_frames, body, style, fps, size, title, ghosts, camera or Camera(), trail)
+    for name, value in (("fps", fps), ("speed", speed)):
+        if not value > 0:
+            raise ValueError(f"{name}: got {value:g}, expected more than 0")
+    film = Film(scenes, context_frames, body, style, fps, size, title, ghosts, camera or Camera(), trail, speed)
     path.parent.mkdir(parents=True, exist_ok=True)
     # A name of its own until it is whole, so that an interrupted run leaves no half picture behind.
     part = path.with_name(f".{path.stem}.part{path.suffix}")
@@ -98,11 +101,12 @@ class Film:
         ghosts: Scene | None,
         camera: Camera,
         trail: float,
+        speed: float = 1.0,
     ) -> None:
         labelled = panels(scenes)
         first = labelled[0][1]
         body = body or default_body(first)
-        self.fps, self.size, self.title, self.trail = fps, size, title, trail
+        self.fps, self.size, self.title, self.trail, self.speed = fps, size, title, trail, speed
         self.scene_fps = first.fps
         self.labels = [label for label, _ in labelled]
         self.casts = [cast(s, body, style, known_frames(s, context_frames)) for _, s in labelled]
@@ -114,7 +118,7 @@ class Film:
             groups = [np.concatenate([joints, self.ghost], axis=1) for joints in groups]
         self.views = plan_views(groups, camera, size, self.scene_fps)
         duration = self.casts[0].frames / self.scene_fps
-        self.frames = max(1, round(duration * fps))
+        self.frames = max(1, round(duration * fps / speed))
         self.columns = len(labelled) if len(labelled) <= 3 else math.ceil(math.sqrt(len(labelled)))
         self.rows = math.ceil(len(labelled) / self.columns)
         self.header = 0 if title is None else round(0.08 * size[1] / 2) * 2
@@ -123,7 +127,7 @@ class Film:
 
     def draw(self, index: int) -> Image.Image:
         """Frame `index` of the picture."""
-        frame = min(int(index * self.scene_fps / self.fps + 1e-6), self.casts[0].frames - 1)
+        frame = min(int(index * self.speed * self.scene_fps / self.fps + 1e-6), self.casts[0].frames - 1)
         page = Image.new("RGB", self.size_all, PAGE)
         gap = 1 if len(self.casts) > 1 else 0
         for i, people in enumerate(self.casts):

@@ -67,7 +67,7 @@ def next_known(keep: Tensor) -> Tensor:
 
 
 def seam_weights(keep: Tensor, blend: int) -> Tensor:
-    """Weight of a seam's difference in the frames after it: 1 at the last known frame, 0 after `blend` frames.
+    """Weight of the difference at a seam, in the frames after it: 1 at the last known frame, 0 after `blend` frames.
 
     In a shorter gap it is 0 at the next known frame. (T, P) bool -> (T, P)
     """
@@ -156,7 +156,7 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
     before, (stays, grows) = (last - 1).clamp_min(0), spring_weights(keep, blend)
 
     def left(difference: Tensor) -> Tensor:
-        """What is left of a difference (B, T, P, ...) that was at the last known frame."""
+        """The remainder of a difference (B, T, P, ...) at the last known frame."""
         at = difference[:, last, agents]
         shape = (*keep.shape, *[1] * (difference.dim() - 3))
         return stays.view(shape) * at + grows.view(shape) * (at - difference[:, before, agents])

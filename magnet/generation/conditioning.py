@@ -33,7 +33,7 @@ def occupied(scene: Scene) -> int:
 
 
 def require_people(schedule: MaskSchedule, scene: Scene) -> None:
-    """Raises ValueError if some scene has nobody in the slots that a task generates, or in those that it gives."""
+    """Raise ValueError if in some scene nobody is in the slots that a task generates, or in those that it gives."""
     generated = (schedule.finished & ~schedule.known).any(dim=0)
     given = schedule.known.any(dim=0) & ~generated
     for agents, what in ((generated, "generated"), (given, "given")):
@@ -57,7 +57,7 @@ def receptive_field(model: Denoiser) -> tuple[int, int]:
 
 
 def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
-    """The scene without everything that is unknown, so that nothing can leak. known (N, P) bool
+    """The scene with everything unknown removed, so that nothing can leak. known (N, P) bool
 
     Unknown frames hold a body at rest at the origin. Frames are added or removed so that their number is right.
 

@@ -1,4 +1,4 @@
-"""What a model can go on from: refused here, with what to do, before anything is made of it."""
+"""Checks of what a model is to continue: refused before anything is sampled, with what to do."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
 
 
 def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
-    """Refuse motion that is given and means nothing; what is not given may hold anything. known (N, P) bool
+    """Refuse given motion that is not valid; what is not given may hold anything. known (N, P) bool
 
     Args:
         scene: B recordings; of frames beyond them nothing is known.

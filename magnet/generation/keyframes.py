@@ -38,7 +38,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A token of motion that somebody is to make at a time and a place.
+    """A token of motion that an agent must make at a given time and place.
 
     Attributes:
         agent: slot.
@@ -56,7 +56,7 @@ class Keyframe:
 
 
 def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held: bool = False) -> Keyframe:
-    """What somebody does in a scene (B = 1) as a keyframe: of the token that `frame` is in, at its place there.
+    """A keyframe from an agent's motion in a scene (B = 1): the token that holds `frame`, at its place there.
 
     Args:
         pose: the frame that the motion is taken from, brought to the place of `frame`; None: `frame` itself.
@@ -96,7 +96,7 @@ def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
 
 
 def reached(T_world_can: Tensor, goal: Goal, seconds: float) -> Goal:
-    """The goal, or the point on the way to it that can be reached in that time. T_world_can (4, 4)"""
+    """The goal, or the point on the way to it that can be reached in the given time. T_world_can (4, 4)"""
     here = Goal.of(T_world_can)
     length = math.hypot(goal.x - here.x, goal.z - here.z)
     share = min(1.0, FASTEST * seconds / length) if length > 0 else 1.0

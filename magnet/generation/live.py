@@ -1,6 +1,6 @@
 """A live scene: motion generated chunk by chunk from the last second, while the settings change.
 
-Nothing here knows of a browser or of threads; see `Worker` for one that keeps it a little ahead of who watches.
+It uses neither browser nor threads; `Worker` runs it a little ahead of the frame that is shown.
 """
 
 from __future__ import annotations

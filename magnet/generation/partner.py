@@ -1,4 +1,4 @@
-"""A partner in real time: people's newest frames in, the answer to them out."""
+"""A partner in real time: takes people's newest frames and returns the answer to them."""
 
 from __future__ import annotations
 

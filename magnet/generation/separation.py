@@ -39,7 +39,7 @@ def separated(
 ) -> Tensor:
     """Canonical frames of some rows of tokens with the new people moved so far that bodies do not collide.
 
-    Bodies are those of the open body: where capsules lie is told well enough by anybody's shape numbers and joints.
+    Bodies are those of the open body: its capsules are close enough for any shape numbers and joints.
 
     Args:
         decode: the tokenizer's.

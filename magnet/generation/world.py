@@ -207,7 +207,7 @@ class WorldState:
         return tokens
 
     def _ready(self, first: int, stop: int) -> Tensor:
-        """Which groups of tokens concern placed agents only. -> (n, P, 1 + slots) bool"""
+        """Groups of tokens that concern placed agents only. -> (n, P, 1 + slots) bool"""
         own = self.placed[first:stop, :, None]
         if not self.model.layout.slots:
             return own.clone()
@@ -215,7 +215,7 @@ class WorldState:
         return torch.cat([own, own & self.placed[first:stop][:, partner]], dim=-1)
 
     def _touched(self, moved: Tensor) -> Tensor:
-        """Which groups of tokens concern somebody who moved. moved (n, P) -> (n, P, 1 + slots) bool"""
+        """Groups of tokens that concern an agent that moved. moved (n, P) -> (n, P, 1 + slots) bool"""
         own = moved[..., None]
         if not self.model.layout.slots:
             return own

@@ -1,4 +1,4 @@
-"""Whether feet are where the floor is: neither above it for long nor in it."""
+"""Contact of feet with the floor: floating above it, and penetration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Confidence intervals over clips: frames of a clip hang together, and so do clips that overlap."""
+"""Confidence intervals over clips: frames of a clip are not independent, nor are clips that overlap."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def bootstrap_interval(
     generator: torch.Generator | None = None,
     units: Tensor | None = None,
 ) -> tuple[Tensor, Tensor] | None:
-    """Where the mean would lie for other clips of the same kind: percentile bootstrap over independent units.
+    """Confidence interval of the mean by percentile bootstrap over independent units.
 
     With fewer than some ten units it is too narrow.
 

@@ -1,4 +1,4 @@
-"""Jitter: how much acceleration changes from frame to frame (docs/metrics.md)."""
+"""Jitter: the change of acceleration from frame to frame (docs/metrics.md)."""
 
 from __future__ import annotations
 

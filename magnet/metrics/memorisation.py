@@ -1,4 +1,4 @@
-"""Memorisation: how near a future comes to what training has shown."""
+"""Memorisation: distance of a future to the nearest training window."""
 
 from __future__ import annotations
 

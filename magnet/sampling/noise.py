@@ -1,4 +1,4 @@
-"""How noise is added and taken away, with a level of its own on every token (paper 3.2, A.3)."""
+"""Adding and removing noise, with a level for each token (paper 3.2, A.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What plans of noise levels are made of: levels of each token, places of the window, blocks of time steps."""
+"""Parts of plans: levels of each token, positions of the window, blocks of time steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ways of sampling that have a name; plain values, so that help can list them without loading a model."""
+"""Named sets of sampler options, as plain values, so that help can list them without loading a model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A moving average of the weights: what is saved and validated is smoother than what the last step left."""
+"""A moving average of the weights, which is what is validated and saved."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def adamw_cosine(
 ) -> dict[str, Any]:
     """AdamW whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
 
-    In a run without an end the rate stays where the warm-up has brought it.
+    In a run without an end the rate is constant after the warm-up.
     """
     optimizer = torch.optim.AdamW(
         parameters,

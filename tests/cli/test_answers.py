@@ -82,7 +82,10 @@ KNOWN = {
         ("--otu runs", "no option --otu; did you mean --out?"),
         ("--width 3", "no option --width; did you mean --model.width?"),
         ("--model.wdith 3", "no option --model.wdith; did you mean --model.width?"),
-        ("--trainer.max_step 3", None),  # the parser may take it as short for another
+        (
+            "--trainer.max_step 3",
+            "no option --trainer.max_step; did you mean --trainer.max_steps?",
+        ),  # the parser may take it as short for another
         ("--trainer.maxsteps 3", "no option --trainer.maxsteps; did you mean --trainer.max_steps?"),
         ("--model.width=3 --model.init_args.width 4 --model.loss.latent 1 --trainer.logger.save_dir x", None),
         ("--model.size 3", None),

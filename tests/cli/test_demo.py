@@ -18,6 +18,8 @@ def performed(tmp_path_factory) -> tuple[Path, dict[str, list[str]]]:
     options = SamplerOptions(steps=4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "COLUMNS", 2)  # of a strip: skin takes its time
+        patch.setattr(demo, "PANEL", (64, 48))
+        patch.setattr(demo, "RATE", 3.0)
         said = {show.name: demo.perform(show, model, Synthetic(), options, folder, minute=24) for show in demo.SHOWS}
     return folder, said
 
@@ -29,7 +31,7 @@ def test_a_show_writes_its_scene_a_strip_and_a_moving_picture(show, performed):
     assert scene.frames == show.context + 24
     assert int(scene.present.sum()) == show.scene[1]
     assert (folder / f"{show.name}.png").exists()
-    assert (folder / f"{show.name}.gif").exists()
+    assert (folder / f"{show.name}.webp").exists()
     assert show.words in said[show.name][0]
 
 
@@ -39,6 +41,23 @@ def test_the_shows_are_what_a_newcomer_is_promised():
     assert tasks.count("Generation") == 2
     assert {"JointFuture", "PartnerInpainting", "AgenticAsync"} <= set(tasks)
     assert max(show.frames for show in demo.SHOWS) == 1800
+
+
+def test_a_minute_is_shown_whole_and_four_times_as_fast(monkeypatch, tmp_path):
+    drawn = {}
+
+    def film(rows, path, **look):
+        drawn.update(look, frames=[scene.frames for scene in rows.values()], words=list(rows))
+        return path
+
+    monkeypatch.setattr(demo, "render_video", film)
+    monkeypatch.setattr(demo, "contact_sheet", lambda rows, path, **look: path)
+    minute = next(show for show in demo.SHOWS if show.name == "minute")
+    scene = demo.test_scene(Synthetic(), *minute.scene)
+    demo.picture(minute, {"long": scene.pad_frames(900)}, None, tmp_path)
+    assert (
+        drawn["frames"] == [scene.frames + 1800] and drawn["speed"] == 4 and drawn["words"] == ["long, 4 times as fast"]
+    )
 
 
 def test_the_pictures_tell_what_was_given(performed):

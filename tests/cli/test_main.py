@@ -155,6 +155,8 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
         (["test", "2"], "options are written --NAME VALUE"),
         (["test", "--out", __file__], "got a file, expected a folder"),
         (["test", "--frames", "9"], "did you mean --data.window_frames?"),
+        (["test", "--sampler.step", "4"], "no option --sampler.step; did you mean --sampler.steps?"),
+        (["test", "--trainer.max_epoch", "4"], "no option --trainer.max_epoch; did you mean --trainer.max_epochs?"),
         (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
         (
             ["test", "--sampler.pyramid_offset", "four"],

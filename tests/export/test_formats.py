@@ -38,11 +38,12 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
-def test_a_page_can_be_light_and_a_film_says_that_it_cannot(duet: Scene, body: Body, tmp_path: Path):
+def test_a_page_and_a_film_can_be_light_and_a_film_is_of_the_size_asked_for(duet: Scene, body: Body, tmp_path: Path):
     (page,) = formats.write(duet, tmp_path / "a.html", body, style="light")
     assert '"styles":["light"]' in page.read_text()
-    with pytest.raises(ValueError, match="style 'light': expected one of"):
-        formats.write(duet, tmp_path / "a.gif", body, style="light")
+    (film,) = formats.write(duet.slice(0, 2), tmp_path / "a.gif", body, style="light", size=(96, 64))
+    with Image.open(film) as picture:
+        assert picture.size == (96, 64)
 
 
 def test_mp4_is_written_where_its_package_is(duet: Scene, body: Body, tmp_path: Path):

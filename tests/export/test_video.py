@@ -202,3 +202,13 @@ def test_mp4_without_pyav_names_the_fix(
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ImportError, match=r"magnet-motion\[video\]"):
         render_video(duet, tmp_path / "a.mp4", context_frames=4, body=body, size=SMALL)
+
+
+def test_a_faster_picture_shows_all_of_the_scene_in_less_time(duet: Scene, body: Body, tmp_path: Path) -> None:
+    with Image.open(render_video(duet, tmp_path / "a.gif", context_frames=0, body=body, size=(64, 48))) as film:
+        slow = film.n_frames  # type: ignore[attr-defined]
+    path = render_video(duet, tmp_path / "b.gif", context_frames=0, body=body, size=(64, 48), speed=4.0)
+    with Image.open(path) as film:
+        assert film.n_frames == round(slow / 4)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="speed: got 0, expected more than 0"):
+        render_video(duet, tmp_path / "c.gif", context_frames=0, body=body, speed=0.0)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.utils._python_dispatch
 
 import magnet
 from magnet.api import Model
@@ -172,3 +173,32 @@ def test_the_partner_in_the_docs_answers():
     exec(next(block for block in blocks if "partner.answer" in block), told)
     assert told["answer"].frames == 4
     assert torch.equal(told["answer"].T_world_root[:, :, 1], told["coming"].T_world_root[:, :, 1])
+
+
+class Counting(torch.utils._python_dispatch.TorchDispatchMode):
+    """Counts operators, and the numbers that they make."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operators = self.numbers = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        self.operators += 1
+        self.numbers += made.numel() if isinstance(made, torch.Tensor) else 0
+        return made
+
+
+def test_an_answer_takes_the_same_work_however_long_the_past():
+    model = tiny_denoiser(max_agents=2, window=8)
+    scene = random_scene(1, 240, 2, torch.Generator().manual_seed(0))
+    partner = Partner(model, scene.slice(0, 32), (0,), SamplerOptions(steps=2, any_floor=True))
+    work = []
+    for first in range(32, 240, 4):
+        with Counting() as mode:
+            partner.answer(scene.slice(first, first + 4))
+        work.append((mode.operators, mode.numbers))
+    early, late = work[20:30], work[-10:]
+    assert max(late) <= max(early), (early, late)
+    held = partner.stream
+    assert held.tokens.shape[1] <= 2 * (8 + sum(model.tokenizer.receptive_field)) + 4

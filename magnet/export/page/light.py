@@ -5,13 +5,13 @@ Because vertices are chosen and not made, shapes and skinning weights of the who
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from magnet.body.base import Body
+from torch import Tensor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,6 +27,14 @@ TURN = 0.3
 """Smallest cosine between a triangle's normals before and after a collapse."""
 
 
+class Meshed(Protocol):
+    """What is asked of a body model (`magnet.body.Body` is one)."""
+
+    v_template: Tensor  # (V, 3)
+    faces: Tensor  # (F, 3)
+    weights: Tensor  # (V, 22)
+
+
 @dataclass(frozen=True)
 class Light:
     """Which vertices of a body stay, and the triangles between these."""
@@ -35,12 +43,19 @@ class Light:
     faces: Ints  # (F', 3) into `keep`
 
 
-@lru_cache(maxsize=2)
-def light(body: Body, vertices: int = VERTICES) -> Light:
-    """A body's mesh collapsed to about so many vertices; the same for the same body."""
+_made: dict[tuple[bytes, int], Light] = {}
+
+
+def light(body: Meshed, vertices: int = VERTICES) -> Light:
+    """A body's mesh collapsed to about so many vertices; made once for all copies of a body."""
     points = body.v_template.detach().cpu().double().numpy()
     weights = body.weights.detach().cpu().double().numpy()
-    return simplified(points, body.faces.cpu().numpy().astype(np.int64), weights, vertices)
+    digest = hashlib.blake2b(points.tobytes())
+    digest.update(weights.tobytes())
+    key = digest.digest(), vertices
+    if key not in _made:
+        _made[key] = simplified(points, body.faces.cpu().numpy().astype(np.int64), weights, vertices)
+    return _made[key]
 
 
 def simplified(points: Floats, faces: Ints, weights: Floats, vertices: int) -> Light:

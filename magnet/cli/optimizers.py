@@ -1,0 +1,76 @@
+"""`--optimizer` and `--lr_scheduler` of `magnet fit`, as LightningCLI has them, in place of a model's own."""
+
+from __future__ import annotations
+
+from types import MethodType
+from typing import Any
+
+from jsonargparse import Namespace
+from lightning.pytorch import LightningModule
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, instantiate_class
+from torch.optim import Optimizer
+
+KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
+"""Options, and what a model does without them (`magnet.training.optim`)."""
+
+
+def add_optimizer_arguments(parser: LightningArgumentParser) -> None:
+    """Any optimizer and scheduler of torch by its name, or a class of somebody's by its path."""
+    parser.add_optimizer_args()
+    parser.add_lr_scheduler_args()
+    for group in parser._action_groups:
+        for action in group._group_actions:
+            for key, own in KEYS.items():
+                if action.option_strings == [f"--{key}"]:
+                    group.title, group.description = f"--{key} NAME", None
+                    action.metavar = "NAME"
+                    action.help = (
+                        f"a class of torch, its fields as --{key}.FIELD VALUE; default: the model's own, {own}"
+                    )
+
+
+def choose_optimizer(model: LightningModule, config: Namespace) -> None:
+    """Make a model train with what the command line chose; nothing where it chose nothing.
+
+    The parameters are those that the model's own optimizer would train. A scheduler alone drives that optimizer,
+    from its full rate. Schedulers step each epoch, as LightningCLI's.
+    """
+    optimizer, scheduler = config.get("optimizer"), config.get("lr_scheduler")
+    if not optimizer and not scheduler:
+        return
+    own = model.configure_optimizers
+
+    def configure_optimizers(self: LightningModule) -> Any:
+        made = optimizer_of(own())
+        for group in made.param_groups:
+            group["lr"] = group.pop("initial_lr", group["lr"])
+        if optimizer:
+            groups = [{"params": group["params"]} for group in made.param_groups]
+            made = instantiate_class(groups, plain(optimizer))
+        steps = instantiate_class(made, plain(scheduler)) if scheduler else None
+        return LightningCLI.configure_optimizers(self, made, steps)
+
+    model.configure_optimizers = MethodType(configure_optimizers, model)  # type: ignore[method-assign]
+
+
+def plain(chosen: Namespace | dict[str, Any]) -> dict[str, Any]:
+    """A class and its fields as Lightning builds them."""
+    said = chosen.as_dict() if isinstance(chosen, Namespace) else dict(chosen)
+    return {"class_path": said["class_path"], "init_args": said.get("init_args") or {}}
+
+
+def optimizer_of(configured: Any) -> Optimizer:
+    """The optimizer among what `configure_optimizers` may return.
+
+    Raises:
+        ValueError: there is none, or there are several.
+    """
+    if isinstance(configured, dict):
+        configured = configured["optimizer"]
+    while isinstance(configured, (list, tuple)) and len(configured) and not isinstance(configured, Optimizer):
+        if isinstance(configured[0], Optimizer) and len(configured) > 1 and isinstance(configured[1], Optimizer):
+            raise ValueError("--optimizer: the model has several optimizers of its own; expected one")
+        configured = configured[0]
+    if not isinstance(configured, Optimizer):
+        raise ValueError(f"--optimizer: the model's own is {type(configured).__name__}, expected an Optimizer")
+    return configured

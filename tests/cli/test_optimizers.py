@@ -1,0 +1,62 @@
+"""`--optimizer` and `--lr_scheduler` take the place of a model's own, for the parameters that it trains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from magnet import cli
+from magnet.cli import train
+from magnet.cli.optimizers import optimizer_of
+from magnet.datamodules import registry
+from tests.toys import ToyData, ToyModel
+
+QUIET = ["--trainer.enable_progress_bar", "false", "--trainer.logger", "false", "--trainer.accelerator", "cpu"]
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData})
+
+
+def trained(*words: str) -> Any:
+    """The trainer after two epochs."""
+    model = ["--model", "ToyModel", "--model.lr", "0.5", "--trainer.max_epochs", "2"]
+    assert cli.main(["fit", *model, *QUIET, *words]) == 0
+    return ToyModel.seen["model"].trainer
+
+
+def test_an_optimizer_and_a_scheduler_of_torch_train_the_model(toy: None) -> None:
+    words = ["--optimizer", "Adam", "--optimizer.lr", "0.25", "--lr_scheduler", "StepLR"]
+    trainer = trained(*words, "--lr_scheduler.step_size", "1", "--lr_scheduler.gamma", "0.1")
+    (optimizer,) = trainer.optimizers
+    assert type(optimizer) is torch.optim.Adam and optimizer.param_groups[0]["lr"] == pytest.approx(0.0025)
+    assert [id(p) for g in optimizer.param_groups for p in g["params"]] == [id(trainer.model.weight)]
+    assert type(trainer.lr_scheduler_configs[0].scheduler) is torch.optim.lr_scheduler.StepLR
+
+
+def test_a_scheduler_alone_drives_the_models_own_optimizer(toy: None) -> None:
+    trainer = trained("--lr_scheduler", "ExponentialLR", "--lr_scheduler.gamma", "0.1")
+    (optimizer,) = trainer.optimizers
+    assert type(optimizer) is torch.optim.SGD and optimizer.param_groups[0]["lr"] == pytest.approx(0.005)
+
+
+def test_without_either_the_models_own_trains(toy: None) -> None:
+    (optimizer,) = trained().optimizers
+    assert type(optimizer) is torch.optim.SGD and optimizer.param_groups[0]["lr"] == 0.5
+
+
+def test_an_optimizer_is_found_in_whatever_is_configured() -> None:
+    optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=0.1)
+    for configured in (optimizer, [optimizer], ([optimizer], []), {"optimizer": optimizer}):
+        assert optimizer_of(configured) is optimizer
+    with pytest.raises(ValueError, match="several optimizers"):
+        optimizer_of([optimizer, optimizer])
+    with pytest.raises(ValueError, match="NoneType"):
+        optimizer_of(None)
