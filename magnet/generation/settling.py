@@ -22,6 +22,9 @@ LEAD = 2
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 """How a block is corrected while sampling: it is short, so its corrections are stiff; the end sees to the rest."""
 
+WORTH = 0.02
+"""Metres that some joint must be moved for a person's block to be corrected: encoding it again costs about as much."""
+
 
 @lru_cache(maxsize=4)
 def open_body_on(device: torch.device) -> Body:
@@ -57,7 +60,9 @@ def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead
         hidden = unseen | (moving & ~who)
         seen = frozen(shaped, hidden, lead - 1) if lead else shaped.replace(present=shaped.present & ~hidden)
         own = new & who
-        one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), drifting=False)
+        one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), slides=0.0, drifting=False)
+        far = (body.joints(one) - body.joints(seen)).norm(dim=-1).amax(dim=(1, 3))  # (B, P)
+        own = own & (far > WORTH)[:, None]
         made = made.replace(
             body_rot=torch.where(own[..., None, None, None], one.body_rot, made.body_rot),
             T_world_root=torch.where(own[..., None, None], one.T_world_root, made.T_world_root),
@@ -78,8 +83,8 @@ def settled_block(
     how: str,
     lead: int,
     decentralized: bool = False,
-) -> Scene:
-    """Bodies of some rows of tokens, those of new people corrected.
+) -> tuple[Scene, Scene]:
+    """Bodies of some rows of tokens, as they are and with those of new people corrected.
 
     Arguments as for `magnet.generation.separation.separated`, and:
 
@@ -87,7 +92,7 @@ def settled_block(
         lead: first rows that are of before, whence the new ones go on.
 
     Returns:
-        (B, 4 n, P).
+        (B, 4 n, P) twice.
     """
     there = known.repeat_interleave(TOKEN_FRAMES, dim=0)
     made = posed(decode(latent, given.betas, deltas), T_world_can, given)
@@ -96,7 +101,7 @@ def settled_block(
         T_world_root=torch.where(there[..., None, None], given.T_world_root, made.T_world_root),
     )
     rows = new.repeat_interleave(TOKEN_FRAMES, dim=0)
-    return corrected_in_views(made, rows, unseen, how, lead * TOKEN_FRAMES, decentralized)
+    return made, corrected_in_views(made, rows, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
 @torch.no_grad()

@@ -115,7 +115,7 @@ class WorldState:
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
-        if self.options.settle != "off":
+        if self.options.settle == "firm":
             latent = self._settle(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
@@ -172,13 +172,16 @@ class WorldState:
         new, known = new.to(latent.device), self.known[low:stop].to(latent.device)
         given, T_world_can = self.given.slice(frames.start, frames.stop), self.T_world_can[:, frames]
         unseen = (self.known[first] & self.causal).to(latent.device)
-        made = settled_block(
+        plain, made = settled_block(
             self.model.tokenizer.decode, latent, self.placed_deltas(low, stop), T_world_can, given, new, known, unseen,
             self.options.settle, lead, decentralized,
         )  # fmt: skip
-        moves = new.repeat_interleave(TOKEN_FRAMES, dim=0)[..., None, None]
-        self.T_world_can[:, frames] = torch.where(moves, canonical_frame(made.T_world_root), T_world_can)
-        return torch.where(new[..., None], self.model.encode(made), latent)[:, lead:]
+        moves = new & (made.T_world_root != plain.T_world_root).flatten(3).any(-1).unflatten(1, (-1, TOKEN_FRAMES)).any(
+            2
+        )
+        frame = moves.repeat_interleave(TOKEN_FRAMES, dim=1)[..., None, None]
+        self.T_world_can[:, frames] = torch.where(frame, canonical_frame(made.T_world_root), T_world_can)
+        return torch.where(moves[..., None], self.model.encode(made), latent)[:, lead:]
 
     def placed_deltas(self, first: int, stop: int) -> Tensor:
         """Deltas of some tokens as placed in the world; the identity after unplaced rows. -> (B, n, P, 4, 9)"""

@@ -51,9 +51,9 @@ class SamplerOptions:
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
             (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
-        settle: correct the poses of each finished block: people out of each other and of themselves, hands held, feet
-            still and on the floor, and the model goes on from there (ours, `magnet.body.settle`): `off`, `light` or
-            `firm`.
+        settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
+            themselves, hands held, feet still and on the floor. `light`: of the finished scene, people may lean on each
+            other; `firm`: of each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
