@@ -43,7 +43,7 @@ def test_the_frame_rate_of_models_is_written_once() -> None:
 
 
 def test_joints_are_written_by_name() -> None:
-    """`magnet.body.joints` has a name for each: a table from joints to something else must not say 16 for a shoulder."""
+    """`magnet.body.joints` has a name for each: no table of joints says 16 for a shoulder."""
     bare = [
         f"{path}:{node.lineno}"
         for path, _, tree in parsed("magnet")
