@@ -42,6 +42,18 @@ def test_the_frame_rate_of_models_is_written_once() -> None:
     assert [place.partition(":")[0] for place in written] == ["magnet/motion/scene.py"]
 
 
+def test_joints_are_written_by_name() -> None:
+    """`magnet.body.joints` has a name for each: no table of joints says 16 for a shoulder."""
+    bare = [
+        f"{path}:{node.lineno}"
+        for path, _, tree in parsed("magnet")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Dict) and len(node.keys) > 4
+        if all(isinstance(key, ast.Constant) and isinstance(key.value, int) and key.value < 22 for key in node.keys)
+    ]
+    assert not bare
+
+
 def defaults(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
     """Names with the values that a function, a class or a module gives them."""
     if isinstance(node, ast.arguments):

@@ -36,6 +36,9 @@ CKPT_PATH = {
 CANDIDATES = r",\s+known\s+subclasses:\s[^)]*\)"
 """Class paths that jsonargparse lists behind an option: a screen of them for the Trainer's."""
 
+GROUP = "Path to a configuration file."
+"""What jsonargparse says of an option that stands for a group of others; the group's heading says more."""
+
 REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
 
@@ -241,7 +244,7 @@ def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:
     told: set[str] = set()
     for action in parser._actions:
         flags = action.option_strings
-        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags):
+        if any(flag == f"--{key}" or flag.endswith(".help") for flag in flags) or action.help == GROUP:
             action.help = argparse.SUPPRESS
             continue
         told.add(f"{flags} {action.default!r} {action.help}")

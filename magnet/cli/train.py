@@ -33,6 +33,7 @@ from magnet.old_names import OPTIONS
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
+from magnet.training.duration import Duration
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
 """Models with short names, and where they are; the first one is the default."""
@@ -239,6 +240,8 @@ class MagnetCLI(LightningCLI):
             logger = run_folder.loggers(self.folder, self._option("wandb"), fit)
             if fit and logger:
                 callbacks.append(run_folder.learning_rate())
+        if fit and not config.get("fast_dev_run"):
+            callbacks.append(Duration())
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False
         self.record = self._record()

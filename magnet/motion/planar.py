@@ -51,9 +51,3 @@ def unit_ground(nine: Tensor) -> tuple[Tensor, Tensor]:
 def yaw_ground(nine: Tensor) -> tuple[Tensor, Tensor]:
     """Yaw and ground position of a transform in 9-D that is about planar. (..., 9) -> (...), (..., 2)"""
     return torch.atan2(-nine[..., 2], nine[..., 0]), nine[..., [6, 8]]
-
-
-def nine_of(yaw: Tensor, ground: Tensor) -> Tensor:
-    """Inverse of `yaw_ground`: a transform over the ground in 9-D. (...), (..., 2) -> (..., 9)"""
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    return torch.stack([yaw.cos(), zero, -yaw.sin(), zero, one, zero, ground[..., 0], zero, ground[..., 1]], dim=-1)

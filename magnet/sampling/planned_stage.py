@@ -141,7 +141,7 @@ def run_planned_stage(
 def plan_of(stage: Stage, layout: TokenLayout, eta: float, history: History | None, device: torch.device) -> StagePlan:
     """The plan of a stage; that of a stage like an earlier one is not made again."""
     begins, ends = (row - stage.start for row in stage.active)
-    levels = stage.levels.cpu().contiguous()
+    levels = stage.levels.to("cpu", torch.int16).contiguous()
     hidden = None if stage.visibility is None else (~stage.visibility).cpu().contiguous()
     before = None
     if history is not None:

@@ -1,0 +1,66 @@
+"""How long a training will take, told when its first steps have shown it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from magnet.training.step_rate import WARM_UP, now
+
+MEASURED = 5
+"""Steps that are measured, after those that warm up."""
+
+
+class Duration(Callback):
+    """Prints, after the first eight steps, how long the rest will take here, and how to make it shorter."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+        self.begun = 0.0
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        if self.seen in (WARM_UP, WARM_UP + MEASURED):
+            if self.seen > WARM_UP:  # from start to start: waiting for data counts, too
+                seconds = (now(pl_module.device) - self.begun) / MEASURED
+                if trainer.is_global_zero:
+                    print(announced(seconds, steps_left(trainer), where(pl_module.device)), flush=True)
+            self.begun = now(pl_module.device)
+        self.seen += 1
+
+
+def steps_left(trainer: Trainer) -> float:
+    """Steps until training ends by itself; infinite where nothing ends it."""
+    limits = [float(trainer.estimated_stepping_batches)]
+    if trainer.max_steps >= 0:
+        limits.append(float(trainer.max_steps))
+    return max(min(limits) - trainer.global_step, 0.0)
+
+
+def announced(seconds: float, steps: float, place: str) -> str:
+    """The line: a step takes so long, all of them so long."""
+    each = f"{seconds:.2f} s" if seconds >= 0.1 else f"{1000 * seconds:.0f} ms"
+    if math.isinf(steps):
+        return f"a step takes {each} on {place}; nothing ends this training: say --trainer.max_steps N"
+    all_of_it = told(seconds * steps)
+    return (
+        f"about {all_of_it} for {steps:,.0f} steps of {each} on {place}; --trainer.max_steps N makes it shorter, "
+        "Ctrl+C stops it, --ckpt_path last goes on"
+    )
+
+
+def told(seconds: float) -> str:
+    """A length of time as one says it."""
+    for limit, unit, name in ((90, 1, "seconds"), (90 * 60, 60, "minutes"), (48 * 3600, 3600, "hours")):
+        if seconds < limit:
+            exact = unit > 1 and seconds / unit < 10
+            return f"{seconds / unit:.{int(exact)}f} {name}"
+    return f"{seconds / 86400:.1f} days"
+
+
+def where(device: torch.device) -> str:
+    """What a training runs on."""
+    threads = torch.get_num_threads()
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} CPU thread{'s' * (threads > 1)}"
