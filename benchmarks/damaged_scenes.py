@@ -1,4 +1,4 @@
-"""Nine recorded scenes, three pushed into each other, three floated, three slid, and what `magnet refine` makes of them.
+"""Nine recorded scenes, three pushed into each other, three floated, three slid, and what `magnet refine` does.
 
 MAGNET_CMU=... python benchmarks/damaged_scenes.py --out runs/results/damaged
 """
