@@ -1,4 +1,4 @@
-"""How well a denoiser gives pairwise transforms back at each noise level, on recorded test takes.
+"""How well a denoiser gives pairwise transforms and deltas back at each noise level, on recorded test takes.
 
     MAGNET_CMU=... python benchmarks/pairwise_error.py --ckpt_path duet
 
@@ -36,14 +36,16 @@ def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
     return {**even, "block at 800": (block, slice(window // 2, 3 * window // 4))}
 
 
-def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float]:
-    """Mean errors of pairwise transforms: centimetres, degrees. (B, N, P, D) x 2"""
+def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float, float]:
+    """Mean errors: of pairwise transforms in centimetres and degrees, of deltas in millimetres. (B, N, P, D) x 2"""
     pairs = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2]) for x in (tokens, truth)]
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(pairs[0][0].shape)
     turned = pairs[0][0] - pairs[1][0]
     turned = torch.atan2(turned.sin(), turned.cos()).abs()[there]
     moved = (pairs[0][1] - pairs[1][1]).norm(dim=-1)[there]
-    return 100 * float(moved.mean()), float(turned.mean().rad2deg())
+    deltas = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[1])[1] for x in (tokens, truth)]
+    stepped = (deltas[0] - deltas[1]).norm(dim=-1)[present[:, None, :, None].expand(deltas[0].shape[:-1])]
+    return 100 * float(moved.mean()), float(turned.mean().rad2deg()), 1000 * float(stepped.mean())
 
 
 @torch.no_grad()
@@ -73,7 +75,7 @@ def main() -> None:
         fused = posterior(alone, noisy, levels, scenes.present, model.normalizer)
         each = {"shown": noisy, "network": alone, "posterior": fused}
         rows[name] = {how: errors(model, tokens, truth, scenes.present, part) for how, tokens in each.items()}
-        told = " | ".join(f"{how} {cm:.1f} cm {degrees:.1f} deg" for how, (cm, degrees) in rows[name].items())
+        told = " | ".join(f"{how} {cm:.1f} cm {deg:.1f} deg, {mm:.1f} mm" for how, (cm, deg, mm) in rows[name].items())
         print(f"level {name}: {told}")
     if options.out:
         facts = {"scenes": scenes.scenes, "checkpoint": options.ckpt_path, "takes": options.takes, **machine()}

@@ -21,6 +21,9 @@ KNOTS = 11
 SHARPEST = 2e-3
 """Standard deviation in metres, and in radians, of what is shown clean: tokens hold numbers of finite precision."""
 
+SHARPEST_DELTA = 1e-4
+"""The same of deltas that are shown, metres and radians a frame."""
+
 MOST_KEPT = 128
 """Settings that a posterior keeps; a rolling sampler passes some 80."""
 
@@ -28,11 +31,11 @@ MOST_KEPT = 128
 class PairwisePosterior(nn.Module):
     """Replaces the deltas and pairwise transforms that a network predicts by their posterior mean in closed form.
 
-    At low levels a network predicts pairwise transforms less accurately than they are shown to it. Its deltas are
-    accurate to millimetres a frame, but their errors add up over a second. Three estimates are therefore fused by
-    precision: the noisy pairwise transforms, with the variance of their level; the predicted pairwise transforms; and
-    the predicted deltas, whose errors change slowly over time. The result is consistent: its deltas lead to its
-    pairwise transforms.
+    At low levels a network predicts deltas and pairwise transforms less accurately than they are shown to it. Its
+    deltas are accurate to millimetres a frame, but their errors add up over a second. Four estimates are therefore
+    fused by precision: noisy deltas and pairwise transforms, with the variance of their level; the predicted pairwise
+    transforms; and the predicted deltas, whose errors change slowly over time. The result is consistent: its deltas
+    lead to its pairwise transforms.
 
     Args:
         layout: what a token holds; with pairwise transforms.
@@ -108,7 +111,7 @@ class PairwisePosterior(nn.Module):
         scale = alpha_bar(group_levels).sqrt().clamp_min(1e-3)[..., None, None]
         deltas = (group_levels[..., :1] == 0) & (torch.arange(people.layout.agents, device=levels.device) == 0)
         met = torch.cat([people.together.any(dim=-1, keepdim=True), people.together], dim=-1)
-        delta, smooth, pair, share = self._weights(group_levels, people.together, normalizer)
+        delta, smooth, pair, share, second = self._weights(group_levels, people.together, normalizer)
         return Setting(
             people=people,
             mean=mean,
@@ -117,6 +120,7 @@ class PairwisePosterior(nn.Module):
             deltas=deltas[..., None, None],
             met=met[:, None, ..., None, None],
             share=share,
+            second=second,
             graph=PoseGraph.of(delta, smooth, pair),
         )
 
@@ -125,24 +129,26 @@ class PairwisePosterior(nn.Module):
 
         group_levels (B, N, P, P), together (B, P, P - 1) -> precisions of deltas (2, B, T, P), of how their error
         changes (2, B, T, P), and of pairwise transforms, shown and predicted together (2, B, T, P, P - 1); the shown
-        ones' share of these (2, B, T, P, P - 1); all float64
+        ones' share of these (2, B, T, P, P - 1); the part of the first that is of shown deltas; all float64
         """
         table = self._precisions(normalizer)
         pairs = table[:4, group_levels[..., 1:]] * together[:, None]  # (4, B, N, P, P - 1)
         total = pairs[:2] + pairs[2:]
         share = pairs[2:] / total.clamp_min(1e-9)
         own = group_levels[..., 0]
-        delta = table[4:6, own].repeat_interleave(TOKEN_FRAMES, dim=2)  # (2, B, T, P)
+        delta, second = torch.stack([table[4:6], table[8:]])[..., own].repeat_interleave(
+            TOKEN_FRAMES, dim=3
+        )  # (2, B, T, P) each
         # Where the window stands in the world is arbitrary: the first frame's deltas tie nobody to anything.
-        delta = F.pad(delta[:, :, 1:], (0, 0, 1, 0))
+        delta, second = (F.pad(each[:, :, 1:], (0, 0, 1, 0)) for each in (delta + second, second))
         own = own.repeat_interleave(TOKEN_FRAMES, dim=1)
-        smooth = table[6:, torch.maximum(own, F.pad(own[:, :-1], (0, 0, 1, 0)))]
+        smooth = table[6:8, torch.maximum(own, F.pad(own[:, :-1], (0, 0, 1, 0)))]
         total, share = torch.stack([total, share]).repeat_interleave(TOKEN_FRAMES, dim=3)
-        return delta, smooth, total, share
+        return delta, smooth, total, share, second
 
     def _precisions(self, normalizer: Normalizer) -> Tensor:
-        """Precisions by level: of predicted and of shown pairwise transforms, of deltas and of how their error changes,
-        each of yaws and of ground positions. -> (8, K + 1) float64"""
+        """Precisions by level: of predicted and of shown pairwise transforms, of predicted deltas and of how their
+        error changes, and of shown deltas, each of yaws and of ground positions. -> (10, K + 1) float64"""
         knots = torch.stack(
             [
                 *(self.log_pair_yaw, self.log_pair_ground),
@@ -153,7 +159,8 @@ class PairwisePosterior(nn.Module):
         log = F.interpolate(knots.double()[None], size=LEVELS + 1, mode="linear", align_corners=True)[0]
         pair, delta, bend = (-2 * log).exp().split(2)
         delta = torch.cat([torch.full_like(delta[:, :1], SHARPEST**-2), delta[:, 1:]], dim=1)  # level 0: shown clean
-        return torch.cat([pair, shown_precisions(self.layout, normalizer), delta, bend])
+        shown_pairs, shown_deltas = shown_precisions(self.layout, normalizer)
+        return torch.cat([pair, shown_pairs, delta, bend, shown_deltas])
 
 
 @dataclass(frozen=True)
@@ -204,6 +211,7 @@ class Setting:
         rescaling: (B, N, P, P, 4, 9) what noisy ones are multiplied by to estimate clean ones, in real units.
         deltas: (B, N, P, P, 1, 1) bool, where deltas are shown clean.
         met: (B, 1, P, P, 1, 1) bool, what changes.
+        second: (2, B, T, P) precisions of shown deltas: yaws, ground positions.
         share: (2, B, T, P, P - 1) weight of shown pairwise transforms against predicted ones: yaws, ground positions.
         graph: precisions.
     """
@@ -214,6 +222,7 @@ class Setting:
     rescaling: Tensor
     deltas: Tensor
     met: Tensor
+    second: Tensor
     share: Tensor
     graph: PoseGraph
 
@@ -228,7 +237,7 @@ def frames_fused(told: Tensor, shown: Tensor, known: Setting) -> Tensor:
 
     Args:
         told: (B, N, P, P, 4, 9); the first of an agent's P transforms are its deltas, the others lead to its partners.
-        shown: (B, N, P, P, 4, 9); its deltas are not read.
+        shown: (B, N, P, P, 4, 9).
         known: how much they count.
 
     Returns:
@@ -237,12 +246,13 @@ def frames_fused(told: Tensor, shown: Tensor, known: Setting) -> Tensor:
     frames = torch.stack([told, shown]).permute(0, 1, 2, 5, 3, 4, 6).flatten(2, 3).double()  # (2, B, T, P, P, 9)
     turn, move = torch.complex(frames[..., 0], frames[..., 2]), frames[..., 6::2]
     yaw = -turn[0].angle()
-    further = (turn[0, ..., 1:] * turn[1, ..., 1:].conj()).angle()
-    pair_yaw = torch.addcmul(yaw[..., 1:], known.share[0], further)
+    further = (turn[0] * turn[1].conj()).angle()
+    pair_yaw = torch.addcmul(yaw[..., 1:], known.share[0], further[..., 1:])
+    pulls = known.second[0] * further[..., 0], known.second[1] * torch.view_as_complex((move[1] - move[0])[..., 0, :])
     pair_ground = torch.lerp(move[0, ..., 1:, :], move[1, ..., 1:, :], known.share[1, ..., None])
     start = heading_at_start(pair_yaw, yaw[..., 0], known.graph.tied[0])
     zero = torch.zeros_like(start)[..., None].expand(-1, -1, 2)
-    heading, place = known.graph.solve(yaw[..., 0], move[0, ..., 0, :], pair_yaw, pair_ground, start, zero)
+    heading, place = known.graph.solve(yaw[..., 0], move[0, ..., 0, :], pair_yaw, pair_ground, start, zero, *pulls)
     pose = torch.stack([torch.exp(-1j * heading), torch.view_as_complex(place)])  # (2, B, T, P)
     # From the frame before to this one, and from an agent to its partners.
     before, here = torch.cat([pose[:, :, :1], pose[:, :, :-1]], dim=2)[..., None], pose[..., None]
@@ -262,18 +272,23 @@ def deviation(value: float) -> nn.Parameter:
     return nn.Parameter(torch.full((KNOTS,), value).log())
 
 
-def shown_precisions(layout: TokenLayout, normalizer: Normalizer) -> Tensor:
-    """Precisions of pairwise transforms that are shown, by level: 1 / rad^2, 1 / m^2. -> (2, K + 1) float64
+def shown_precisions(layout: TokenLayout, normalizer: Normalizer) -> tuple[Tensor, Tensor]:
+    """Precisions by level of what is shown of pairwise transforms, and of deltas: 1 / rad^2, 1 / m^2.
 
-    A heading is read off two of the nine numbers: about a turn, their noise of standard deviation s in each leaves
-    s / sqrt(2) radians, for there are two more that say the same.
+    A heading is read off two of the nine numbers, cosine and sine. Of an arbitrary one, both tell, with the mean of
+    their variances; of a delta, whose heading is near 0, the sine alone.
+
+    Returns:
+        (2, K + 1), (2, K + 1) float64.
     """
     alpha = alpha_bar(torch.arange(LEVELS + 1, device=normalizer.std.device)).double()
     noise = (1 - alpha) / alpha.clamp_min(1e-6)
-    std = normalizer.std[layout.latent + 9 * TOKEN_FRAMES :][:9].double()
-    turning = noise * std[:3:2].square().sum() / 2
-    moving = noise * std[6::2].square().mean()
-    return torch.stack([turning * (1 + turning), moving]).clamp_min(SHARPEST**2).reciprocal()
+    numbers = normalizer.std[layout.latent :][: 9 * (TOKEN_FRAMES + 1)].double().unflatten(0, (-1, 9))
+    delta, pair = numbers[:-1].square().mean(dim=0), numbers[-1].square()
+    turning = noise * pair[:3:2].sum() / 2
+    pairs = torch.stack([turning * (1 + turning), noise * pair[6::2].mean()])
+    deltas = torch.stack([noise * delta[2], noise * delta[6::2].mean()])
+    return pairs.clamp_min(SHARPEST**2).reciprocal(), deltas.clamp_min(SHARPEST_DELTA**2).reciprocal()
 
 
 def heading_at_start(yaw: Tensor, delta_yaw: Tensor, weight: Tensor) -> Tensor:

@@ -100,31 +100,41 @@ class PoseGraph:
         pair_ground: Tensor,
         start_yaw: Tensor,
         start_ground: Tensor,
+        yaw_pull: Tensor | float = 0.0,
+        ground_pull: Tensor | float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """As `solve_pose_graph`. (x, z) is one complex number here, which a turn by a yaw multiplies by exp(-i yaw)."""
+        """As `solve_pose_graph`. (x, z) is one complex number here, which a turn by a yaw multiplies by exp(-i yaw).
+
+        Deltas that were observed a second time, `held` being the sum of both precisions: the pull is the second
+        precision times how far that observation is from the first, yaw (B, T, P), ground (B, T, P) complex. Then the
+        first one's error is smooth, and the second one's independent from frame to frame.
+        """
         partner = partners(delta_yaw.shape[2], delta_yaw.device)
         start_yaw, start_ground = start_yaw.double(), torch.view_as_complex(start_ground.double().contiguous())
         yaw = start_yaw[:, None] + delta_yaw.double().cumsum(dim=1)
         off = pair_yaw.double() - (yaw[:, :, partner] - yaw[..., None])
         off = torch.atan2(off.sin(), off.cos())
-        yaw = yaw + self._corrections(0, off[..., None])[..., 0]
+        yaw = yaw + self._corrections(0, off[..., None], _each(yaw_pull, yaw)[..., None])[..., 0]
         turn = torch.exp(-1j * torch.cat([start_yaw[:, None], yaw], dim=1))
         steps = turn[:, :-1] * torch.view_as_complex(delta_ground.double().contiguous())
         ground = start_ground[:, None] + steps.cumsum(dim=1)
         seen = turn[:, 1:, :, None] * torch.view_as_complex(pair_ground.double().contiguous())
         away = torch.view_as_real(seen - (ground[:, :, partner] - ground[..., None]))
-        return yaw, torch.view_as_real(ground) + self._corrections(1, away)
+        force = torch.view_as_real(turn[:, :-1] * _each(ground_pull, steps))
+        return yaw, torch.view_as_real(ground) + self._corrections(1, away, force)
 
-    def _corrections(self, which: int, off: Tensor) -> Tensor:
+    def _corrections(self, which: int, off: Tensor, force: Tensor) -> Tensor:
         """Correction of each agent's integrated path in each frame, of yaws (0) or of ground positions (1).
 
-        off (B, T, P, P - 1, C), how far each pairwise transform is from the integrated paths -> (B, T, P, C)
+        off (B, T, P, P - 1, C), how far each pairwise transform is from the integrated paths, force (B, T, P, C), what
+        pulls deltas -> (B, T, P, C)
         """
         B, T, P, _, C = off.shape
         tied, system = self.tied[which], self.systems[which]
         pull = tied[..., None] * off
         partner = partners(P, off.device).flatten()
-        right = (-pull.sum(dim=3)).index_add(2, partner, pull.flatten(2, 3))
+        right = (-pull.sum(dim=3)).index_add(2, partner, pull.flatten(2, 3)) + force
+        right[:, :-1] -= force[:, 1:]
         if T % 2:
             right = pad(right, (0, 0, 0, 0, 0, 1))
         right = right.view(B, -1, 2 * P, C)
@@ -134,6 +144,10 @@ class PoseGraph:
         else:
             solved = system.solve(right)
         return solved.reshape(B, -1, P, C)[:, :T]
+
+
+def _each(pull: Tensor | float, like: Tensor) -> Tensor:
+    return pull.to(like.dtype) if isinstance(pull, Tensor) else torch.full_like(like, pull)
 
 
 def _bands(held: Tensor, smooth: Tensor, tied: Tensor) -> tuple[Tensor, Tensor, Tensor]:

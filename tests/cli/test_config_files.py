@@ -114,8 +114,8 @@ def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ((), SamplerOptions(steps=10)),
-        (("--steps", "4"), SamplerOptions(steps=4)),
+        ((), SamplerOptions.preset("steady", apart="light", steps=10)),  # a couple stays together with these
+        (("--steps", "4"), SamplerOptions.preset("steady", apart="light", steps=4)),
         (("--sampler", "paper"), PAPER),
         (("--sampler", "paper", "--steps", "4"), dataclasses.replace(PAPER, steps=4)),
     ],

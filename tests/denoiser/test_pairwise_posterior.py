@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.pairwise_posterior import KNOTS, SHARPEST, PairwisePosterior
+from magnet.denoiser.pairwise_posterior import KNOTS, SHARPEST, SHARPEST_DELTA, PairwisePosterior
 from magnet.motion.frames import from_9d, propagate_pairwise
 from magnet.motion.planar import yaw_ground
 from magnet.motion.pose_graph import GAUGE
@@ -90,6 +90,19 @@ def test_deltas_lead_where_pairwise_transforms_say(model: Denoiser):
     assert torch.allclose(T_next, T_self_partner[:, 1:], atol=1e-4)
 
 
+@pytest.mark.parametrize(("level", "left"), [(5, 0.2), (50, 0.6)])
+def test_deltas_come_nearer_than_the_guess_where_little_noise_hides_them(model: Denoiser, level: int, left: float):
+    """Somebody walks too fast in the guess; what is shown says otherwise."""
+    truth, guess, noisy, levels, present = shown(model, level)
+    latent, deltas, pairs = model.layout.unpack(model.normalizer.denormalize(guess))
+    deltas = deltas.clone()
+    deltas[..., 6] += 0.01
+    fast = model.normalizer.normalize(model.layout.pack(latent, deltas, pairs))
+    better = PairwisePosterior(model.layout)(fast, noisy, levels, present, model.normalizer)
+    off = [by_frame(model.layout.unpack(model.normalizer.denormalize(x))[1])[:, 1:, :, 6] for x in (better, truth)]
+    assert float((off[0] - off[1]).abs().mean()) < left * 0.01
+
+
 def test_corrections_of_deltas_are_smooth(model: Denoiser):
     """The deltas of the guess are right and its pairs are noise from frame to frame, which must not shake people."""
     truth, guess, noisy, levels, present = shown(model, 300)
@@ -159,8 +172,14 @@ def turned(yaw: np.ndarray, ground: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(yaw) * x + np.sin(yaw) * z, np.cos(yaw) * z - np.sin(yaw) * x], axis=-1)
 
 
-def dense_corrections(delta: np.ndarray, bend: np.ndarray, pair: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """Weighted least squares, a row for each term. delta, bend (T, n), pair (T, n, n), off (T, n, n, C) -> (T, n, C)"""
+def dense_corrections(
+    delta: np.ndarray, bend: np.ndarray, pair: np.ndarray, second: np.ndarray, off: np.ndarray, other: np.ndarray
+) -> np.ndarray:
+    """Weighted least squares, a row for each term.
+
+    delta, bend, second (T, n), pair (T, n, n), off (T, n, n, C), other (T, n, C), how far the second observation of
+    deltas is from the first -> (T, n, C)
+    """
     T, n = delta.shape
     rows, weights, wanted = [np.eye(T * n)], [np.full(T * n, GAUGE)], [np.zeros((T * n, off.shape[-1]))]
 
@@ -176,6 +195,7 @@ def dense_corrections(delta: np.ndarray, bend: np.ndarray, pair: np.ndarray, off
         for p in range(n):
             if t > 0:
                 add(delta[t, p], zero, (t, p, 1), (t - 1, p, -1))
+                add(second[t, p], other[t, p], (t, p, 1), (t - 1, p, -1))
             if t > 1:
                 add(bend[t, p], zero, (t, p, 1), (t - 1, p, -2), (t - 2, p, 1))
             for q in set(range(n)) - {p}:
@@ -190,7 +210,7 @@ def dense_posterior(
     """Headings (T, n) and positions (T, n, 2) of n people, all present.
 
     told, shown (T, n, n, 3) yaw and ground of T_p_q, on the diagonal of T_prev_now; levels (T, n); noise (T, n, n, 2)
-    deviations of what is shown of yaws and of ground positions
+    deviations of what is shown of yaws and of ground positions, on the diagonal of deltas
     """
     n = levels.shape[1]
     pair_levels = np.maximum(levels[:, :, None], levels[:, None])
@@ -200,25 +220,27 @@ def dense_posterior(
         return np.exp(-2 * np.interp(at, np.linspace(0, LEVELS, KNOTS), knots))
 
     bent = np.maximum(levels, np.concatenate([0 * levels[:1], levels[:-1]]))
-    terms = []
+    terms, self = [], np.arange(n)
     for i, kind in enumerate(("yaw", "ground")):
         delta = np.where(levels == 0, SHARPEST**-2, weight(f"delta_{kind}", levels))
         own, given = weight(f"pair_{kind}", pair_levels), noise[..., i] ** -2
-        terms.append((delta, weight(f"bend_{kind}", bent), own + given, given / (own + given)))
-    self = np.arange(n)
+        second = noise[:, self, self, i] ** -2
+        terms.append((delta, weight(f"bend_{kind}", bent), own + given, second, given / (own + given)))
     deltas = np.where((levels == 0)[..., None], shown[:, self, self], told[:, self, self])
     around = shown[..., 0] - told[..., 0]
-    pair_yaw = told[..., 0] + terms[0][3] * np.angle(np.exp(1j * around))
-    pair_ground = told[..., 1:] + terms[1][3][..., None] * (shown - told)[..., 1:]
+    pair_yaw = told[..., 0] + terms[0][4] * np.angle(np.exp(1j * around))
+    pair_ground = told[..., 1:] + terms[1][4][..., None] * (shown - told)[..., 1:]
+    further = shown[:, self, self] - deltas
     along = deltas[..., 0].cumsum(axis=0)
     seen = terms[0][2][:, 0] * np.exp(1j * (pair_yaw[:, 0] - along + along[:, :1]))
     start = np.where(self == 0, 0.0, np.angle(seen.sum(axis=0)))
     yaw = start + along
     off = np.angle(np.exp(1j * (pair_yaw - (yaw[:, None] - yaw[:, :, None]))))
-    yaw = yaw + dense_corrections(*terms[0][:3], off[..., None])[..., 0]
-    ground = turned(np.concatenate([start[None], yaw[:-1]]), deltas[..., 1:]).cumsum(axis=0)
+    yaw = yaw + dense_corrections(*terms[0][:4], off[..., None], further[..., :1])[..., 0]
+    before = np.concatenate([start[None], yaw[:-1]])
+    ground = turned(before, deltas[..., 1:]).cumsum(axis=0)
     off = turned(yaw[:, :, None], pair_ground) - (ground[:, None] - ground[:, :, None])
-    return yaw, ground + dense_corrections(*terms[1][:3], off)
+    return yaw, ground + dense_corrections(*terms[1][:4], off, turned(before, further[..., 1:]))
 
 
 @pytest.mark.parametrize("people", [[0, 2], [0, 1, 2]])
@@ -253,6 +275,9 @@ def test_it_is_the_answer_of_a_dense_least_squares(model: Denoiser, people: list
     turning = spread * np.sqrt((std[0] ** 2 + std[2] ** 2) / 2)
     moving = spread * np.sqrt((std[6] ** 2 + std[8] ** 2) / 2)
     noise = np.stack([turning * np.sqrt(1 + turning**2), moving], axis=-1).clip(SHARPEST)
+    std = np.sqrt((normalizer.std[layout.latent :][:36].double().numpy().reshape(4, 9) ** 2).mean(axis=0))
+    alone, self = np.array([std[2], np.sqrt((std[6] ** 2 + std[8] ** 2) / 2)]), np.arange(len(people))
+    noise[:, self, self] = (spread[:, self, self, None] * alone).clip(SHARPEST_DELTA)
     yaw, ground = dense_posterior(posterior, planar(normalizer.denormalize(guess)), given, own, noise)
     found, n = planar(normalizer.denormalize(better)), range(len(people))
     for p in n:

@@ -98,12 +98,12 @@ def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, gu
 
 @pytest.mark.parametrize("name", HIDING)
 def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypatch: pytest.MonkeyPatch):
-    honest = sampler.run_stage
+    honest = sampler.run_planned_stage
 
     def open_to_all(denoise: Any, stage: Stage, *rest: Any) -> Tensor:
         return honest(denoise, dataclasses.replace(stage, visibility=None), *rest)
 
-    monkeypatch.setattr(sampler, "run_stage", open_to_all)
+    monkeypatch.setattr(sampler, "run_planned_stage", open_to_all)
     task = registry.get(name)(**({"offset": 0.25} if name == "agentic_async" else {}))  # at 1 there is nothing to see
     with pytest.raises(AssertionError, match="what it hides from agent 0 influences"):
         task_laws(task, [Grid(8, 2, 3, steps=4, window=6, stride=2)])

@@ -160,6 +160,17 @@ class Given:
             step_noise[self.plain + (number * N + first + row) * P + agent, row, agent] = 1.0
         return step_noise
 
+    def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
+        """The same, of a planned step's (row, level, which numbers of its agents)."""
+        N, P = self.noise.shape[1:3]
+        step_noise = torch.zeros_like(self.noise[:, first : first + rows])
+        for row, level, where in draws:
+            for agent in range(P):
+                if where is None or bool(where[agent, 0]):
+                    number = self.levels.index(level)
+                    step_noise[self.plain + (number * N + first + row) * P + agent, row, agent] = 1.0
+        return step_noise
+
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         assert count == self.noise.shape[1]
         return self.noise, self.mask_noise
