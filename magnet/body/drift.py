@@ -10,6 +10,7 @@ from magnet.body.base import Body
 from magnet.body.joints import TOES
 from magnet.body.settle_wishes import SLIDES, Wishes
 from magnet.motion.frames import from_planar
+from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene
 
 AVERAGED = 0.5
@@ -40,7 +41,7 @@ def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
     mean = averaged(slowest * counts[..., None]) / averaged(counts[..., None]).clamp_min(1e-3)
     speed = mean.norm(dim=-1, keepdim=True)
     share = ((speed - STILL) / (DRIFTS - STILL)).clamp(0, 1)
-    return F.pad(mean * share * share * (3 - 2 * share), (0, 0, 0, 0, 1, 0))
+    return F.pad(mean * smoothstep(share), (0, 0, 0, 0, 1, 0))
 
 
 def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: float = SLIDES) -> Scene:

@@ -13,10 +13,9 @@ from magnet.baselines.nearest_neighbour import NearestNeighbour
 from magnet.checks import require_number, require_whole
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.self_forcing import MadePasts
-from magnet.generation.blending import smoothstep
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
-from magnet.motion.resample import slerp
+from magnet.motion.resample import slerp, smoothstep
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions

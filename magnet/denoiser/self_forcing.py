@@ -11,6 +11,7 @@ from torch import Tensor
 from magnet.denoiser.options import SelfForcing
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, pairwise, partners, project_se2
 from magnet.motion.placement import place
+from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
@@ -81,7 +82,7 @@ def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -
     begin = begin * T
     length = RETURN_FRAMES[0] + (RETURN_FRAMES[1] - RETURN_FRAMES[0]) * length
     way = ((torch.arange(T, device=device) - begin) / length).clamp(0, 1)
-    off = (1 - way * way * (3 - 2 * way)) * (changed < share)  # (B, T)
+    off = (1 - smoothstep(way)) * (changed < share)  # (B, T)
     drawn = torch.randn(B, 1, P, 3, generator=generator, device=device) * off[..., None, None]
     yaw, ground = DISPLACED_YAW * drawn[..., 0], DISPLACED_GROUND * drawn[..., 1:]
     T_turn = from_planar(yaw, torch.zeros_like(ground)).to(dtype)

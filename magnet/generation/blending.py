@@ -8,16 +8,12 @@ from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar
 from magnet.motion.planar import rotate_ground
+from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene, cat_time
 
 SPRING = 2.5
 """Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
 put elsewhere slide for longer. With `blend` 10 a difference is halved in 7 frames."""
-
-
-def smoothstep(ramp: Tensor) -> Tensor:
-    """0 to 1 with no speed at either end. ramp in 0..1"""
-    return ramp * ramp * (3 - 2 * ramp)
 
 
 def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:

@@ -14,6 +14,11 @@ from magnet.motion.frames import rigid
 from magnet.motion.scene import FPS, Scene
 
 
+def smoothstep(ramp: Tensor) -> Tensor:
+    """0 to 1 with no speed at either end. ramp in 0..1"""
+    return ramp * ramp * (3 - 2 * ramp)
+
+
 def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     """Rotations between two, along the shorter arc.
 
