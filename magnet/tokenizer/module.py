@@ -97,7 +97,14 @@ class Tokenizer(L.LightningModule):
         self.quantizer = made = make_quantizer(options)
         self.codebook_dim = made.dim
         self.vqvae = VQVAE(
-            POSE_FEATURES, made.dim, network.width, network.depth, network.causal, TOKEN_FRAMES, made.unit_input
+            POSE_FEATURES,
+            made.dim,
+            network.width,
+            network.depth,
+            network.causal,
+            TOKEN_FRAMES,
+            made.unit_input,
+            network.lookahead,
         )
         self.body: Body | None = None
         self.mpjpe = MeanMetric()

@@ -18,15 +18,21 @@ class AutoencoderOptions:
         width: channels of the convolutions, paper Table A.2.
         depth: residual blocks in each of the two stages; the paper does not say.
         causal: no token sees later frames, so tokens of a growing clip never change (ours, for streaming).
+        lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1 (ours): with 1, frames are final one
+            token late, and smoother at the borders of tokens.
     """
 
     width: int = 512
     depth: int = 3
     causal: bool = False
+    lookahead: int = 0
 
     def __post_init__(self) -> None:
         require_whole("width", self.width, 1)
         require_whole("depth", self.depth, 1)
+        require_whole("lookahead", self.lookahead, 0, 1)
+        if self.lookahead and not self.causal:
+            raise ValueError("lookahead: only of a causal tokenizer, one that is not sees both ways; give causal too")
 
 
 @dataclass(frozen=True)

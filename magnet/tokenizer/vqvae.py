@@ -84,16 +84,19 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Token latents and conditions to frames. (B, N, inputs) -> (B, 4 N, outputs)"""
+    """Token latents and conditions to frames. (B, N, inputs) -> (B, 4 N, outputs)
 
-    def __init__(self, inputs: int, width: int, outputs: int, depth: int, causal: bool) -> None:
+    A causal one sees `lookahead` tokens after its own, 0 or 1: with 1, the first convolution alone sees both ways.
+    """
+
+    def __init__(self, inputs: int, width: int, outputs: int, depth: int, causal: bool, lookahead: int = 0) -> None:
         super().__init__()
-        layers: list[nn.Module] = [Conv(inputs, width, 3, causal=causal), nn.GELU()]
+        layers: list[nn.Module] = [Conv(inputs, width, 3, causal=causal and not lookahead), nn.GELU()]
         for _ in range(STAGES):
             layers += [stack(width, depth, causal), Upsample(), Conv(width, width, 3, causal=causal)]
         layers += [nn.LayerNorm(width), nn.GELU(), Conv(width, outputs, 3, causal=causal)]
         self.layers = nn.Sequential(*layers)
-        self.depth, self.causal = depth, causal
+        self.depth, self.causal, self.lookahead = depth, causal, lookahead
 
     @property
     def receptive_field(self) -> tuple[int, int]:
@@ -104,7 +107,7 @@ class Decoder(nn.Module):
             rate *= 2
             steps += 1 / rate
         tokens = int(steps + 1 / rate) + 1
-        return (2 * tokens, 0) if self.causal else (tokens, tokens)
+        return (2 * tokens, self.lookahead) if self.causal else (tokens, tokens)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.layers(x)
@@ -124,10 +127,19 @@ class VQVAE(nn.Module):
         causal: no frame sees later ones.
         stride: frames in a token.
         unit: bring the encoder's output to unit spread.
+        lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1.
     """
 
     def __init__(
-        self, pose: int, latent: int, width: int, depth: int, causal: bool, stride: int, unit: bool = True
+        self,
+        pose: int,
+        latent: int,
+        width: int,
+        depth: int,
+        causal: bool,
+        stride: int,
+        unit: bool = True,
+        lookahead: int = 0,
     ) -> None:
         super().__init__()
         self.stride, self.latent = stride, latent
@@ -137,7 +149,7 @@ class VQVAE(nn.Module):
         # or a new person would lie hundreds of deviations away.
         self.betas = Normalizer(10, floor=1.0)
         self.encoder = Encoder(pose + 10 + 9, width, latent, depth, causal, unit)
-        self.decoder = Decoder(latent + 10 + 9 * stride, width, pose, depth, causal)
+        self.decoder = Decoder(latent + 10 + 9 * stride, width, pose, depth, causal, lookahead)
 
     def encode(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
         """(B, T, pose), (B, 10), (B, T, 9), known (B, T, 2) bool for pose and step -> (B, N, latent)

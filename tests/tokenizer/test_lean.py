@@ -11,9 +11,11 @@ from magnet.tokenizer.lean import decoded, encoded
 from magnet.tokenizer.raw import RawPose
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["sees both ways", "causal"])
+@pytest.fixture(scope="module", params=[(False, 0), (True, 0), (True, 1)], ids=["sees both ways", "causal", "ahead"])
 def tokenizer(request: pytest.FixtureRequest):
-    made = tiny_tokenizer(network={"width": 16, "depth": 2, "causal": request.param}).eval()
+    made = tiny_tokenizer(
+        network={"width": 16, "depth": 2, "causal": request.param[0], "lookahead": request.param[1]}
+    ).eval()
     for weight in made.vqvae.parameters():
         torch.nn.init.normal_(weight, std=0.2)
     return made

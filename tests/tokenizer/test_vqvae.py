@@ -36,18 +36,19 @@ def test_a_causal_token_depends_on_no_later_frame() -> None:
         assert matters[4 * token : 4 * token + 4].all()
 
 
-def test_a_causal_frame_depends_on_no_later_token() -> None:
-    decoder = Decoder(8, 8, 3, depth=3, causal=True)
+@pytest.mark.parametrize("lookahead", [0, 1])
+def test_a_causal_frame_depends_on_no_later_token_than_its_lookahead(lookahead: int) -> None:
+    decoder = Decoder(8, 8, 3, depth=3, causal=True, lookahead=lookahead)
     for frame in (0, 3, 4, 41):
         matters = frames_that_matter(decoder, torch.randn(1, 20, 8), frame)
-        assert not matters[frame // 4 + 1 :].any()
-        assert matters[frame // 4]
+        assert not matters[frame // 4 + 1 + lookahead :].any()
+        assert matters[frame // 4 : frame // 4 + 1 + lookahead].all()
 
 
-@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize(("causal", "lookahead"), [(False, 0), (True, 0), (True, 1)])
 @pytest.mark.parametrize("depth", [1, 2, 3])
-def test_nothing_beyond_the_stated_reach_matters(depth: int, causal: bool) -> None:
-    decoder = Decoder(4, 8, 3, depth=depth, causal=causal)
+def test_nothing_beyond_the_stated_reach_matters(depth: int, causal: bool, lookahead: int) -> None:
+    decoder = Decoder(4, 8, 3, depth=depth, causal=causal, lookahead=lookahead)
     before, after = decoder.receptive_field
     tokens = torch.randn(1, 120, 4)
     for frame in range(240, 248):
