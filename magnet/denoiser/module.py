@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +32,7 @@ from magnet.precision import dtype_of, require_float32_scenes
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.tokenizer.lean import encoded, encoded_plainly
+from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
 from magnet.tokenizer.module import RawPose, Tokenizer
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
@@ -175,17 +176,19 @@ class Denoiser(L.LightningModule):
 
     # -- what the model does -------------------------------------------------------------------
 
-    def encode(self, scene: Scene, tokens: slice = slice(None), packed: bool = False) -> Tensor:
+    def encode(
+        self, scene: Scene, tokens: slice = slice(None), packed: bool = False, growing: Growing | None = None
+    ) -> Tensor:
         """Latents of those present, codes if `quantized`; invalid frames are not looked at. -> (B, N, P, C) float32
 
         The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
-        `tokens` says which are wanted; `packed`: see `magnet.tokenizer.lean`.
+        `tokens` says which are wanted; `packed`, `growing`: see `magnet.tokenizer.lean`.
         """
         held = scene.people().pad_frames(TOKEN_FRAMES)
         first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
         wanted = slice(first + 1, stop + 1)
-        encode = encoded if packed else encoded_plainly
+        encode = functools.partial(encoded, growing=growing) if packed else encoded_plainly
         people = encode(self.tokenizer, held, self.quantized, wanted)[:, :, 0]
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people

@@ -17,7 +17,8 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
-from magnet.tokenizer.lean import decoded
+from magnet.tokenizer.carried import Carried
+from magnet.tokenizer.lean import Growing, decoded
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
@@ -34,6 +35,8 @@ class World(Protocol):
     T_world_can: Tensor
     finalized: int
     there: Tensor
+    released: int
+    decoder: Carried
 
     def by_frame(self, rows: Tensor) -> Tensor: ...
 
@@ -150,7 +153,7 @@ def decode_bodies(
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
     shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
-    features = decoded_frames(world, latent, deltas, shown)
+    features = decoded_frames(world, latent, deltas, shown, low, near - low)
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
@@ -160,13 +163,17 @@ def decode_bodies(
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
 
 
-def decoded_frames(world: World, latent: Tensor, deltas: Tensor, frames: slice) -> Tensor:
-    """Some frames of decoded tokens, of those who are there. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)"""
+def decoded_frames(world: World, latent: Tensor, deltas: Tensor, frames: slice, low: int, final: int) -> Tensor:
+    """Some frames of decoded tokens, of those who are there. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)
+
+    The first of them is row `low`; `final` of them are finished.
+    """
     tokenizer, betas = world.model.tokenizer, world.given.betas
     if world.options.precision == "reference":
         return tokenizer.decode(latent, betas, deltas)[:, frames]
     there = world.there
-    made = decoded(tokenizer, latent[:, :, there], betas[:, there], deltas[:, :, there], frames)
+    growing = Growing(world.decoder, world.released + low, final)
+    made = decoded(tokenizer, latent[:, :, there], betas[:, there], deltas[:, :, there], frames, growing)
     whole = made.new_zeros(*made.shape[:2], latent.shape[2], made.shape[3])
     whole[..., ::6] = whole[..., 4::6] = 1.0  # absent: any proper rotations
     whole[:, :, there] = made

@@ -14,6 +14,8 @@ from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tokenizer.carried import Carried
+from magnet.tokenizer.lean import Growing
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -122,6 +124,10 @@ def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
     return torch.minimum(lookahead_limit(task.schedule(grid)), lookahead_limit(task.schedule(wider)))
 
 
+Encoders = dict[tuple[int, ...], Carried]
+"""What is carried from token to token, by the agents who are encoded together."""
+
+
 def known_tokens(
     model: Denoiser,
     given: Scene,
@@ -129,34 +135,48 @@ def known_tokens(
     related: Scene | None = None,
     limits: Tensor | None = None,
     packed: bool = False,
+    rows: slice = slice(None),
+    carried: Encoders | None = None,
+    first_row: int = 0,
 ) -> Tensor:
-    """Normalized tokens of what is known; the others hold no information. known (N, P) -> (B, N, P, D)
+    """Normalized tokens of what is known; the others hold no information. known (N, P) -> (B, rows, P, D)
 
     Each agent's known segments are encoded one by one: an encoder that looks ahead must not see beyond a segment, nor
     beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are
     those of `related`, by default the same scene. The delta into a segment from an unknown frame is unknown too: the
     segment's next delta stands in for it, which leaves a smaller error at keyframes than a delta of zero. The first
-    step of a scene is zero. `packed`: with the lean form of the encoder.
+    step of a scene is zero. `packed`: with the lean form of the encoder. `rows`: which are wanted. With `carried`, this
+    is a scene from `first_row` on that goes on with that of the call before.
     """
     N, P = known.shape
+    wanted, end, _ = rows.indices(N)
     like = given.T_world_root
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
     deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, TOKEN_FRAMES, 9).clone()
+    T_world_can = canonical_frame(like)
     for start, stop, agents in segments(known):
-        part = given.slice(start * TOKEN_FRAMES, stop * TOKEN_FRAMES).permute_agents(
-            torch.tensor(agents, device=like.device)
-        )
         for low, first, last, limit, those in encodings(start, stop, agents, limits, receptive_field(model)[0]):
+            first, last = max(first, wanted), min(last, end)
+            if first >= last:
+                continue
             seen = given.slice(low * TOKEN_FRAMES, limit * TOKEN_FRAMES).permute_agents(
                 torch.tensor(those, device=like.device)
             )
-            latent[:, first:last, those] = model.encode(seen, slice(first - low, last - low), packed)
-        own = by_token(to_9d(canonical_deltas(canonical_frame(part.T_world_root))))
-        if start > 0:
+            growing = None
+            if carried is not None:
+                growing = Growing(carried.setdefault(tuple(those), Carried()), first_row + low, limit - low)
+            latent[:, first:last, those] = model.encode(seen, slice(first - low, last - low), packed, growing)
+        low, stop = max(start, wanted - 1), min(stop, end)  # a row more in front, for the first delta
+        if low >= stop:
+            continue
+        own = by_token(to_9d(canonical_deltas(T_world_can[:, low * TOKEN_FRAMES : stop * TOKEN_FRAMES, agents])))
+        if low == start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
-        deltas[:, start:stop, agents] = own
-    pairs = pairwise_by_token(to_9d(pairwise(canonical_frame((related or given).T_world_root))))
-    return model.normalizer.normalize(model.layout.pack(latent, deltas, pairs))
+        deltas[:, low:stop, agents] = own
+    frames = slice(wanted * TOKEN_FRAMES, end * TOKEN_FRAMES)
+    T_world_can = T_world_can if related is None else canonical_frame(related.T_world_root)
+    pairs = pairwise_by_token(to_9d(pairwise(T_world_can[:, frames])))
+    return model.normalizer.normalize(model.layout.pack(latent[:, rows], deltas[:, rows], pairs))
 
 
 def encodings(

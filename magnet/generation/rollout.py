@@ -15,6 +15,7 @@ from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
 from magnet.generation.conditioning import (
+    Encoders,
     known_tokens,
     mask_unknown,
     occupied,
@@ -187,10 +188,10 @@ class Rollout:
                 f"guidance.cond_weight: got {o.guidance.cond_weight:g} and no condition to guide by; give `cond`, "
                 "or leave it at 0"
             )
+        self.encoders: Encoders = {}
         self.stats.begin(B)
-        self.first = self.stop = 0
+        self.first = self.stop = self.reached = 0  # one past the last row that has been generated
         self.there: float = self.length
-        self.reached = 0  # one past the last row that has been generated
         self.expected = Expected(receptive_field(model)[1])
         self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
@@ -359,7 +360,7 @@ class Rollout:
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
             limits, packed = self._limits(low, high, part), self.options.precision != "reference"
-            tokens = known_tokens(self.model, given, known, related, limits, packed)[:, part]
+            tokens = known_tokens(self.model, given, known, related, limits, packed, part, self.encoders, low)
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             init_noise, mask_noise = self.noise.draw(last - self.stop)
             new = begin(tokens, init_noise, known[part], self.model.layout)

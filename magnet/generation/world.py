@@ -30,6 +30,7 @@ from magnet.motion.placement import Placement, place
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.schedule import MaskSchedule
+from magnet.tokenizer.carried import Carried
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -75,6 +76,7 @@ class WorldState:
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
         self.correction: Tensor | None = None  # of the last two frames of the last chunk, see `settled_chunk`
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
+        self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
 
     def extend(self, given: Scene, known: Tensor) -> None:
         """Add rows at the end. given (B, 4 n), known (n, P)"""
@@ -176,9 +178,8 @@ class WorldState:
             self.model.tokenizer.decode, latent, self.placed_deltas(low, stop), T_world_can, given, new, known, unseen,
             self.options.settle, lead, decentralized,
         )  # fmt: skip
-        moves = new & (made.T_world_root != plain.T_world_root).flatten(3).any(-1).unflatten(1, (-1, TOKEN_FRAMES)).any(
-            2
-        )
+        moved = (made.T_world_root != plain.T_world_root).flatten(3).any(-1)
+        moves = new & moved.unflatten(1, (-1, TOKEN_FRAMES)).any(2)
         frame = moves.repeat_interleave(TOKEN_FRAMES, dim=1)[..., None, None]
         self.T_world_can[:, frames] = torch.where(frame, canonical_frame(made.T_world_root), T_world_can)
         return torch.where(moves[..., None], self.model.encode(made), latent)[:, lead:]
@@ -367,7 +368,7 @@ class WorldState:
         near = slice(max(low - behind, 0), high + ahead)
         latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
         frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
-        features = decoded_frames(self, latent, deltas, frames)
+        features = decoded_frames(self, latent, deltas, frames, near.start, latent.shape[1])
         given = self.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
         T_world_can = self.T_world_can[:, low * TOKEN_FRAMES : high * TOKEN_FRAMES]
         decoded = posed(features, T_world_can, given)

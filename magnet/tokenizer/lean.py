@@ -15,16 +15,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.packing import Kept, Linear, linear_of, norm_of, packs
 from magnet.precision import dtype_of
 from magnet.tokenizer.base import PoseTokenizer
+from magnet.tokenizer.carried import Carried, Span, SpanLayer
 from magnet.tokenizer.features import features, fold, unfold
 from magnet.tokenizer.losses import orthonormalize
 from magnet.tokenizer.module import Tokenizer
 from magnet.tokenizer.vqvae import Conv, Decoder, Encoder, ResidualBlock, Upsample
-
-Span = tuple[int, int]
-"""Steps [first, stop) of a sequence."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,10 @@ class Taps:
         stop = (span[1] - 1) * self.stride - self.pad + self.dilation * (self.kernel - 1) + 1
         return max(first, 0), min(stop, length)
 
+    def final(self, steps: int) -> int:
+        return (steps - 1 - self.dilation * (self.kernel - 1) + self.pad) // self.stride + 1
+
     def __call__(self, x: Tensor, held: Span, span: Span, length: int, gelu: bool = False) -> Tensor:
-        """x (B, n, C), steps `held` of `length` -> the steps `span` of the output"""
         low = span[0] * self.stride - self.pad
         high = (span[1] - 1) * self.stride - self.pad + self.dilation * (self.kernel - 1) + 1
         first, stop = max(low, 0), min(high, length)
@@ -73,6 +74,9 @@ class LeanResidual:
     def needs(self, span: Span, length: int) -> Span:
         return self.taps.needs(span, length)
 
+    def final(self, steps: int) -> int:
+        return self.taps.final(steps)
+
     def __call__(self, x: Tensor, held: Span, span: Span, length: int) -> Tensor:
         seen = self.taps(F.gelu(self.before(x)), held, span, length)
         return self.proj(F.gelu(self.after(seen)), plus=x[:, span[0] - held[0] : span[1] - held[0]].contiguous())
@@ -87,6 +91,9 @@ class Each:
     def needs(self, span: Span, length: int) -> Span:
         return span
 
+    def final(self, steps: int) -> int:
+        return steps
+
     def __call__(self, x: Tensor, held: Span, span: Span, length: int) -> Tensor:
         return self.run(x[:, span[0] - held[0] : span[1] - held[0]])
 
@@ -97,28 +104,25 @@ class Twice:
     def needs(self, span: Span, length: int) -> Span:
         return span[0] // 2, (span[1] + 1) // 2
 
+    def final(self, steps: int) -> int:
+        return 2 * steps
+
     def __call__(self, x: Tensor, held: Span, span: Span, length: int) -> Tensor:
         begins = 2 * held[0]
         return x.repeat_interleave(2, dim=1)[:, span[0] - begins : span[1] - begins]
-
-
-Layer = Taps | LeanResidual | Each | Twice
 
 
 class LeanNetwork:
     """An encoder or decoder frozen for sampling, which computes spans of its output."""
 
     def __init__(self, network: Encoder | Decoder) -> None:
-        self.layers: list[Layer] = []
+        self.layers: list[SpanLayer] = []
         for layer in network.layers:
             self.layers += [lean_layer(each) for each in (layer if isinstance(layer, nn.Sequential) else [layer])]
 
     def __call__(self, x: Tensor, span: Span) -> Tensor:
         """Steps [first, stop) of what the network makes of x. (B, T, C) -> (B, stop - first, outputs)"""
-        lengths = [x.shape[1]]
-        for layer in self.layers[:-1]:
-            stride = layer.stride if isinstance(layer, Taps) else 1
-            lengths.append(lengths[-1] * 2 if isinstance(layer, Twice) else lengths[-1] // stride)
+        lengths = self.lengths(x.shape[1])[:-1]
         spans = [span]
         for layer, length in zip(reversed(self.layers), reversed(lengths), strict=True):
             spans.append(layer.needs(spans[-1], length))
@@ -129,8 +133,15 @@ class LeanNetwork:
             x, held = layer(x, held, wanted, length), wanted
         return x
 
+    def lengths(self, steps: int) -> list[int]:
+        lengths = [steps]
+        for layer in self.layers:
+            stride = layer.stride if isinstance(layer, Taps) else 1
+            lengths.append(lengths[-1] * 2 if isinstance(layer, Twice) else lengths[-1] // stride)
+        return lengths
 
-def lean_layer(layer: nn.Module) -> Layer:
+
+def lean_layer(layer: nn.Module) -> SpanLayer:
     if isinstance(layer, Conv):
         return Taps.of(layer)
     if isinstance(layer, ResidualBlock):
@@ -151,16 +162,44 @@ def usable(tokenizer: PoseTokenizer) -> bool:
     return tokenizer.device.type == "cpu" and dtype_of(tokenizer.vqvae.decoder) == torch.float32
 
 
+@dataclass
+class Growing:
+    """Says that a call goes on with the sequence of the one before, and where.
+
+    Attributes:
+        carried: what is kept between the calls.
+        first: the token, of the sequence, that the call's tokens begin with.
+        final: how many of the call's tokens will be the same in later calls.
+    """
+
+    carried: Carried
+    first: int
+    final: int
+
+
 @torch.no_grad()
-def decoded(tokenizer: PoseTokenizer, latent: Tensor, betas: Tensor, deltas: Tensor, frames: slice) -> Tensor:
+def decoded(
+    tokenizer: PoseTokenizer,
+    latent: Tensor,
+    betas: Tensor,
+    deltas: Tensor,
+    frames: slice,
+    growing: Growing | None = None,
+) -> Tensor:
     """Some frames of `PoseTokenizer.decode`. -> (B, stop - start, P, 135)"""
     if not usable(tokenizer):
         return tokenizer.decode(latent, betas, deltas)[:, frames]
     assert isinstance(tokenizer, Tokenizer)
     vqvae = tokenizer.vqvae
     inputs = vqvae.decoder_inputs(fold(latent), betas.flatten(0, 1), fold(deltas))
-    pose = vqvae.pose.denormalize(LEAN.of(vqvae.decoder)(inputs, (frames.start, frames.stop)))
-    return orthonormalize(unfold(pose, latent))
+    network, span = LEAN.of(vqvae.decoder), (frames.start, frames.stop)
+    if growing is None:
+        made = network(inputs, span)
+    else:
+        first, final = growing.first, growing.first + growing.final
+        begins = first * TOKEN_FRAMES
+        made = growing.carried(network, inputs, first, final, (begins + span[0], begins + span[1]))
+    return orthonormalize(unfold(vqvae.pose.denormalize(made), latent))
 
 
 def encoded_plainly(tokenizer: PoseTokenizer, scene: Scene, quantize: bool, tokens: slice) -> Tensor:
@@ -169,14 +208,29 @@ def encoded_plainly(tokenizer: PoseTokenizer, scene: Scene, quantize: bool, toke
 
 
 @torch.no_grad()
-def encoded(tokenizer: PoseTokenizer, scene: Scene, quantize: bool, tokens: slice) -> Tensor:
-    """As `encoded_plainly`, computing no others."""
+def encoded(
+    tokenizer: PoseTokenizer, scene: Scene, quantize: bool, tokens: slice, growing: Growing | None = None
+) -> Tensor:
+    """As `encoded_plainly`, computing no others.
+
+    In a `growing` scene a token more at each end stands in for the others (`Denoiser.encode`), which is not counted.
+    """
     if not usable(tokenizer) or scene.valid is not None or not scene.scenes:
         return encoded_plainly(tokenizer, scene, quantize, tokens)
     assert isinstance(tokenizer, Tokenizer)
     seen, vqvae = features(scene), tokenizer.vqvae
     known = torch.ones(1, 1, 2, dtype=torch.bool)
     inputs = vqvae.encoder_inputs(fold(seen.pose), seen.betas.flatten(0, 1), fold(seen.deltas), known)
-    latent = unfold(LEAN.of(vqvae.encoder)(inputs, (tokens.start, tokens.stop)), seen.pose)
+    network, span = LEAN.of(vqvae.encoder), (tokens.start, tokens.stop)
+    if growing is None:
+        made = network(inputs, span)
+    else:
+        first, final = growing.first, (growing.first + 1 + growing.final) * TOKEN_FRAMES
+        begins = first * TOKEN_FRAMES
+        # The delta into the first frame that is not held is another one where a window begins elsewhere.
+        made = growing.carried(
+            network, inputs, begins, final, (first + span[0], first + span[1]), edge=TOKEN_FRAMES + 1
+        )
+    latent = unfold(made, seen.pose)
     latent = tokenizer.quantizer.continuous(latent)
     return tokenizer.quantizer.nearest(latent) if quantize else latent
