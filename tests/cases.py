@@ -9,7 +9,11 @@ import pytest
 
 
 def some_slow(cases: Iterable[Any], *slow: Any) -> list[Any]:
-    """All cases for `parametrize`, of which some run with the slow tests alone."""
+    """All cases for `parametrize`, tuples those of several arguments, of which some run with the slow tests alone."""
     every = list(cases)
     assert set(slow) <= set(every), f"no cases {sorted(set(slow) - set(every))}"
-    return [pytest.param(case, marks=pytest.mark.slow) if case in slow else case for case in every]
+
+    def values(case: Any) -> tuple[Any, ...]:
+        return case if isinstance(case, tuple) else (case,)
+
+    return [pytest.param(*values(case), marks=pytest.mark.slow) if case in slow else case for case in every]

@@ -27,7 +27,11 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/own.md").read_text()
 COMMANDS = [
     line.partition("  #")[0].strip()
-    for line in re.findall(r"^ {4}magnet (.*)", PAGE.partition("## Files")[0], re.MULTILINE)
+    for line in re.findall(r"^ {4}magnet (.*)", PAGE.partition("## Without a training")[0], re.MULTILINE)
+]
+ANSWERS = [
+    line.partition("  #")[0].strip()
+    for line in re.findall(r"^ {4}magnet (predict .*)", PAGE.partition("## Without a training")[2], re.MULTILINE)
 ]
 CPU = ("--trainer.accelerator", "cpu")
 SMALL = {
@@ -87,6 +91,21 @@ def test_the_commands_of_the_page_lead_from_two_files_to_a_film(tmp_path: Path, 
     (film,), (strip,), (made,) = (Path("film").rglob(kind) for kind in ("*.gif", "*.png", "*.npz"))
     assert film.stat().st_size > 10_000 and strip.stat().st_size > 10_000
     assert Scene.load(made).present.sum(dim=1).tolist() == [2] * Scene.load(made).scenes
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_page_answer_to_files_as_they_are(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    strangers(tmp_path / "people")
+    for letter in "AB":
+        Path(f"people/dance_{letter}.bvh").rename(f"{letter}.bvh")
+    assert len(ANSWERS) >= 4
+    for command in ANSWERS:
+        words = shlex.split(command)
+        assert cli.main([*words, "--sampler.steps", "2"]) == 0, command
+        out = Path(words[words.index("--out") + 1])
+        assert out.stat().st_size > 10_000
+        out.unlink()
 
 
 @pytest.mark.slow

@@ -72,10 +72,25 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
         recipe.run(["false"], "a stage")
 
 
+def beginnings(folder: Path, frames: int = 300) -> Path:
+    """So many frames of a few recordings: couples to train, validate and test on, and somebody alone."""
+    folder.mkdir()
+    for name in ("60.asf", "61.asf", "02.asf"):
+        (source,) = Path(RECORDINGS).rglob(name)
+        (folder / name).write_bytes(source.read_bytes())
+    for take in ("01", "03", "05"):
+        for subject in ("60", "61") if take != "01" else ("60", "61", "02"):
+            (source,) = Path(RECORDINGS).rglob(f"{subject}_{take}.amc")
+            text = source.read_text(encoding="latin-1")
+            (folder / source.name).write_text(text.partition(f"\n{frames + 1}\n")[0] + "\n", encoding="latin-1")
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path(RECORDINGS).is_dir(), reason="needs CMU's recordings: set MAGNET_CMU")
 def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
-    monkeypatch.setenv("MAGNET_CMU", RECORDINGS)
+    monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = ["--", "--data.batch_size=4", "--data.epoch_size=8"]
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "decoder=1", *small])
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "decoder=1", *small])

@@ -162,7 +162,9 @@ class Evaluator(L.LightningModule):
         self.metrics[TRUTH] = ground_truth_metrics(fps, confidence=CONFIDENCE)
         if self.windows is not None:
             for name in (MODEL, TRUTH):
-                nearest = NearestTraining(self.windows, "truth" if name == TRUTH else "generated", None, CONFIDENCE)
+                nearest = NearestTraining(
+                    self.windows, of="truth" if name == TRUTH else "generated", confidence=CONFIDENCE
+                )
                 self.metrics[name].add_metrics({"memorisation": nearest})
         self.metrics = {name: metrics.to(self.denoiser.device) for name, metrics in self.metrics.items()}
         self.stats, self.scenes = SamplingStats(), 0

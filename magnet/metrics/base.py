@@ -120,7 +120,7 @@ class ClipMeans(MotionMetric):
     """Means of totals over counts, with each clip's share kept for confidence intervals.
 
     Args:
-        names: what is measured.
+        names: what is measured; None: all of `columns`.
         confidence: such as 0.95: adds `<name>_low` and `<name>_high`, by resampling independent units of clips;
             nothing where there is only one.
     """
@@ -130,16 +130,9 @@ class ClipMeans(MotionMetric):
     clips: list[Tensor]  # of (B, K, 2): total and count of each clip
     units: list[Tensor]  # of (B,) int: which of them are not independent; -1: of nobody else
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(of, agents, **kwargs)
-        self.names = tuple(names)
+    def __init__(self, names: Sequence[str] | None = None, confidence: float | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.names = tuple(self.columns if names is None else names)
         self.confidence = confidence
         self.add_sum("total", len(self.names))
         self.add_sum("count", len(self.names))

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, MotionMetric, Of, clip_sums
+from magnet.metrics.base import ClipMeans, MotionMetric, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
@@ -53,15 +53,8 @@ class PartnerBearing(ClipMeans):
         "behind": Column("behind", "", "real", "share of frames in which one has the other behind"),
     }
 
-    def __init__(
-        self,
-        within: float = 30.0,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["facing", "behind"], of, agents, confidence, **kwargs)
+    def __init__(self, within: float = 30.0, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.within = math.radians(within)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
@@ -92,8 +85,8 @@ class TurnRate(MotionMetric):
 
     turned: list[Tensor]  # of (P, 2) by slot: total and count
 
-    def __init__(self, fps: float = FPS, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
-        super().__init__(of, agents, **kwargs)
+    def __init__(self, fps: float = FPS, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.fps = fps
         self.add_keyed("turned", 2)
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.histogram import histogram_of, quantile
@@ -74,11 +74,9 @@ class BodyDepth(ClipMeans):
 
     histogram: Tensor  # (3, bins): all, without arm on arm, arm on arm
 
-    def __init__(
-        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
-    ) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         names = [f"{kind}_over_{share}cm" for kind in KINDS for share in (5, 10)]
-        super().__init__(names[:-1], of, agents, confidence, **kwargs)
+        super().__init__(names[:-1], **kwargs)
         self.add_sum("histogram", 3, round(self.DEEPEST / self.BIN) + 1)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

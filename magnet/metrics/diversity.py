@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 
@@ -42,11 +42,6 @@ class Diversity(ClipMeans):
     columns: ClassVar[Mapping[str, Column]] = {
         "div": Column("DIV", "m²", "high", "variance over the samples of a scene", main=True)
     }
-
-    def __init__(
-        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
-    ) -> None:
-        super().__init__(["div"], of, agents, confidence, **kwargs)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         places = futures.scored.sum(dim=(1, 2))

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from magnet.body.joints import FEET
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 
@@ -38,15 +38,8 @@ class Floating(ClipMeans):
         "floating_height": Column("float height", "m", "real", "how high the lowest foot is where both are over 6 cm"),
     }
 
-    def __init__(
-        self,
-        above: float = 0.06,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["floating", "floating_height"], of, agents, confidence, **kwargs)
+    def __init__(self, above: float = 0.06, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.above = above
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
@@ -75,15 +68,8 @@ class GroundPenetration(ClipMeans):
         "ground_penetration_depth": Column("floor depth", "m", "low", "how deep a foot is in the floor where it is"),
     }
 
-    def __init__(
-        self,
-        below: float = 0.02,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["ground_penetration", "ground_penetration_depth"], of, agents, confidence, **kwargs)
+    def __init__(self, below: float = 0.02, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.below = below
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

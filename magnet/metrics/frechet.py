@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, get_args
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.base import MotionMetric
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
@@ -107,15 +107,9 @@ class FrechetDistance(MotionMetric):
     outer: Tensor  # (2, 63, 63)
 
     def __init__(
-        self,
-        features: Features = "world_joints",
-        fps: float = FPS,
-        jitter: float = JITTER,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        **kwargs: Any,
+        self, features: Features = "world_joints", fps: float = FPS, jitter: float = JITTER, **kwargs: Any
     ) -> None:
-        super().__init__(of, agents, **kwargs)
+        super().__init__(**kwargs)
         self.features: Features = features
         self.fps = fps
         self.jitter = jitter
@@ -168,16 +162,8 @@ class FrechetBySecond(FrechetDistance):
 
     seconds: list[Tensor]  # of (N, 2, 64, 64) by second: sums of products of (1, features), generated and truth
 
-    def __init__(
-        self,
-        features: Features = "pair",
-        fps: float = FPS,
-        jitter: float = JITTER,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(features, fps, jitter, of, agents, **kwargs)
+    def __init__(self, features: Features = "pair", **kwargs: Any) -> None:
+        super().__init__(features, **kwargs)
         self.add_keyed("seconds", 2, FEATURES + 1, FEATURES + 1)
 
     def pool(self, which: int, features: Tensor, counts: Tensor) -> None:

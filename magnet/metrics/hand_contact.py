@@ -79,12 +79,10 @@ class HandContact(ClipMeans):
         within: float = WITHIN,
         beyond: float = BEYOND,
         of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
         **kwargs: Any,
     ) -> None:
         compared = ["hand_contact_precision", "hand_contact_recall"] if of == "generated" else []
-        super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of, agents, confidence, **kwargs)
+        super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of=of, **kwargs)
         self.fps = fps
         self.within = within
         self.beyond = beyond

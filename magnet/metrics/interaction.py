@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.base import MotionMetric
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 
@@ -85,10 +85,8 @@ class MotionInteraction(MotionMetric):
     clip_totals: list[Tensor]  # of (Q, 2, 2) by pair of slots: sum of correlations inside clips, and how many
     still: Tensor
 
-    def __init__(
-        self, per_clip: bool = False, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any
-    ) -> None:
-        super().__init__(of, agents, **kwargs)
+    def __init__(self, per_clip: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.per_clip = per_clip
         if per_clip:
             self.add_keyed("clip_totals", 2, 2)

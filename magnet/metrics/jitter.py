@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 from magnet.motion.scene import FPS
@@ -38,15 +38,8 @@ class Jitter(ClipMeans):
 
     columns: ClassVar[Mapping[str, Column]] = {"jitter": Column("jitter", "10 m/s³", "real", "mean third difference")}
 
-    def __init__(
-        self,
-        fps: float = FPS,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["jitter"], of, agents, confidence, **kwargs)
+    def __init__(self, fps: float = FPS, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.fps = fps
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

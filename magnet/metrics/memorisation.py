@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magnet.baselines.retrieval import assignments
 from magnet.baselines.windows import Windows
-from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 
@@ -54,15 +54,8 @@ class NearestTraining(ClipMeans):
         "nearest_training": Column("nearest", "m", "real", "distance to the nearest training window", main=True)
     }
 
-    def __init__(
-        self,
-        windows: Windows,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["nearest_training"], of, agents, confidence, **kwargs)
+    def __init__(self, windows: Windows, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.windows = windows
         self._placed: dict[int, Tensor] = {}
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from magnet.body.joints import PELVIS
-from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.base import MotionMetric
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.histogram import histogram_of, quantile
@@ -41,8 +41,8 @@ class PartnerDistance(MotionMetric):
 
     histogram: Tensor
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
-        super().__init__(of, agents, **kwargs)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.add_sum("histogram", round(self.FARTHEST / self.BIN) + 1)
 
     def add(self, futures: Futures) -> None:

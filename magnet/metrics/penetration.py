@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 
@@ -104,11 +104,6 @@ class Interpenetration(ClipMeans):
         "ip_mean_total_depth": Column("IP depth", "m", "low", "summed depth of penetration, mean over all frames"),
         "ip_mean_max_depth": Column("IP deepest", "m", "low", "deepest penetration, mean over frames with any"),
     }
-
-    def __init__(
-        self, of: Of = "generated", agents: Tensor | None = None, confidence: float | None = None, **kwargs: Any
-    ) -> None:
-        super().__init__(["ip_ratio", "ip_mean_total_depth", "ip_mean_max_depth"], of, agents, confidence, **kwargs)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         first, second, counts = futures.pairs()

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of
+from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
 from magnet.motion.scene import FPS
@@ -52,18 +52,10 @@ class PositionError(ClipMeans):
         "mpjpe_mean@1s": Column("MPJPE mean 1s", "m", "low", f"{OF_MEAN}, up to 1 s", main=True),
     }
 
-    def __init__(
-        self,
-        fps: float = FPS,
-        seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0),
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, fps: float = FPS, seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0), **kwargs: Any) -> None:
         horizons = ["", *(f"@{s:g}s" for s in seconds)]
         names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best", "mpjpe_mean")]
-        super().__init__(names, of, agents, confidence, **kwargs)
+        super().__init__(names, **kwargs)
         self.until = tuple(round(s * fps) for s in seconds)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.joints import TOES
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.motion.scene import FPS
@@ -65,12 +65,9 @@ class FootSkating(ClipMeans):
         preset: Literal["default", "reference"] = "default",
         height: float | None = None,
         speed: float | None = None,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(["fs", "fs_ratio", "fs_contact"], of, agents, confidence, **kwargs)
+        super().__init__(["fs", "fs_ratio", "fs_contact"], **kwargs)
         self.fps = fps
         self.height = PRESETS[preset][0] if height is None else height
         self.speed = PRESETS[preset][1] if speed is None else speed

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.histogram import histogram_of, quantile
@@ -39,17 +39,8 @@ class StandingToes(ClipMeans):
 
     histogram: Tensor
 
-    def __init__(
-        self,
-        fps: float = FPS,
-        height: float = 0.05,
-        still: float = 0.05,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["toe_still"], of, agents, confidence, **kwargs)
+    def __init__(self, fps: float = FPS, height: float = 0.05, still: float = 0.05, **kwargs: Any) -> None:
+        super().__init__(["toe_still"], **kwargs)
         self.fps = fps
         self.height = height
         self.still = still

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.metrics.base import MotionMetric, Of
+from magnet.metrics.base import MotionMetric
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -55,10 +55,8 @@ class TokenBorders(MotionMetric):
 
     sums: Tensor  # (2, 2, 2) acceleration and jerk, inside and at borders, total and count
 
-    def __init__(
-        self, stride: int = TOKEN_FRAMES, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any
-    ) -> None:
-        super().__init__(of, agents, **kwargs)
+    def __init__(self, stride: int = TOKEN_FRAMES, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         if stride < 4:
             raise ValueError(f"stride={stride}: a jerk spans 4 frames, so tokens of at least 4 have an inside")
         self.stride = stride

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from magnet.metrics.base import ClipMeans, Of, clip_sums
+from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.position_error import joint_error
@@ -47,16 +47,8 @@ class VelocityError(ClipMeans):
         "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities")
     }
 
-    def __init__(
-        self,
-        fps: float = FPS,
-        per_second: bool = False,
-        of: Of = "generated",
-        agents: Tensor | None = None,
-        confidence: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(["mpjve"], of, agents, confidence, **kwargs)
+    def __init__(self, fps: float = FPS, per_second: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.scale = fps if per_second else 1.0
         if per_second:
             self.columns = {name: shown._replace(unit="m/s") for name, shown in self.columns.items()}  # type: ignore[misc]

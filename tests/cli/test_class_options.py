@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import itertools
 import json
 import operator
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from magnet.cli.config_files import Layer, merged, read_layers
 from magnet.cli.main import TRAINER_COMMANDS
 from magnet.datamodules import registry
 from magnet.tasks import registry as task_registry
+from tests.cases import some_slow
 from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
@@ -86,11 +88,17 @@ def spelt(kind: type) -> dict[str, Any]:
 SPELT = spelt(DATA["Synthetic"])
 
 
+def in_turn(names: Iterable[str], commands: Iterable[str]) -> list[Any]:
+    """Every name with every command; quick ones are each name with one of them, in turn."""
+    every = list(itertools.product(names, commands))
+    turns = len(list(commands))
+    return some_slow(every, *(case for k, case in enumerate(every) if k % turns != k // turns % turns))
+
+
 # -- each class ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", TRAINER_COMMANDS)
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize(("name", "command"), in_turn(DATA, TRAINER_COMMANDS))
 def test_data_named_by_a_flag_have_their_own_defaults(
     name: str, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,8 +138,7 @@ def test_a_model_over_a_file_that_spells_the_other_out_has_its_own_defaults(
     )
 
 
-@pytest.mark.parametrize("command", ["test", "predict"])
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize(("name", "command"), in_turn(TASKS, ["test", "predict"]))
 def test_tasks_have_their_own_defaults(name: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     asked = printed(capsys, command, "--task", name)["task"]
     fields = {field.name: field for field in dataclasses.fields(TASKS[name]) if field.init}

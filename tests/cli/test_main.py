@@ -17,6 +17,7 @@ from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
 from tests import toys
+from tests.cases import some_slow
 from tests.toys import OtherData, ToyData
 
 ROOT = Path(__file__).parents[2]
@@ -109,7 +110,7 @@ def test_test_help_explains_sampling(toy: Path, capsys: pytest.CaptureFixture[st
     assert re.findall(r"--data\.(\w+) ", capsys.readouterr().out) == ["root", "takes", "window_frames", "max_agents"]
 
 
-@pytest.mark.parametrize("command", TRAINER_COMMANDS)
+@pytest.mark.parametrize("command", some_slow(TRAINER_COMMANDS, "validate", "predict", "fit"))
 def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
     capsys: pytest.CaptureFixture[str], command: str
 ) -> None:

@@ -24,8 +24,8 @@ SMALL = {
 }  # fmt: skip
 FRAMES = {"remocap": 40, "bvh": 40, "cmu": 40}
 """Of a fake's takes, where fitting 150 takes too long."""
-SLOW = ("bvh", "chi3d", "cmu", "remocap")
-"""Many frames are fitted or turned; `tests/test_own.py` goes the same way, and CMU's reader has tests of its own."""
+QUICK = ("interx", "scenes")
+"""One that needs a body and one that brings its own; the others' files are read in test_readers.py."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""
 
@@ -38,7 +38,7 @@ def flags(prefix: str, values: dict[str, str]) -> list[str]:
     return [word for name, value in values.items() for word in (f"--{prefix}.{name}", value)]
 
 
-@pytest.mark.parametrize("name", some_slow(registry.readers(), *SLOW))
+@pytest.mark.parametrize("name", some_slow(registry.readers(), *(set(registry.readers()) - set(QUICK))))
 def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     body = () if registry.reader(name).family == "positions" else ("--body", "dl/body.npz")
@@ -50,11 +50,12 @@ def test_from_a_fake_download_to_a_tested_tokenizer(name, tmp_path, monkeypatch,
     prepare_fit_and_test(name, body, (), capsys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
     [
         ("remocap", ("--reader.fits", "dl/fits")),
-        pytest.param("duobox", ("--reader.form", "skeleton", "--reader.phases", "1"), marks=pytest.mark.slow),
+        ("duobox", ("--reader.form", "skeleton", "--reader.phases", "1")),
     ],
 )
 def test_ready_fits_and_bare_skeletons_train_as_well(name, options, tmp_path, monkeypatch, capsys):
@@ -73,6 +74,7 @@ def test_ready_fits_and_bare_skeletons_train_as_well(name, options, tmp_path, mo
 FIRST = "000_ma_jab_liu_defense"
 
 
+@pytest.mark.slow
 def test_skeletons_that_no_body_fits_are_refused_and_listed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     magnet("data", "fake", "duobox", "dl", "--frames", "30", "--takes", "1")
@@ -86,6 +88,7 @@ def test_skeletons_that_no_body_fits_are_refused_and_listed(tmp_path, monkeypatc
     assert re.search(rf"none of \d takes could be used.*{FIRST}_tr0: .*mean error of [\d.]+ cm", said, re.S)
 
 
+@pytest.mark.slow
 def test_a_mixed_model_is_tested_on_scenes_of_each_size(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     magnet("data", "fake", "embody3d", "dl", "--frames", "40", "--takes", "12")

@@ -133,7 +133,7 @@ NO_LISTS = {
 """What is said where the data set's rule cannot do without lists."""
 
 
-@pytest.mark.parametrize("form", some_slow(DOWNLOADS, "bvh", "remocap"))
+@pytest.mark.parametrize("form", some_slow(DOWNLOADS, "bvh", "chi3d", "cmu", "remocap"))
 def test_a_users_list_needs_none_of_the_data_sets_own(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

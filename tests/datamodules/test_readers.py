@@ -87,7 +87,7 @@ def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp
     assert set(lengths) == {20}
 
 
-@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "duobox, bare skeleton"))
+@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d", "duobox, bare skeleton", "remocap"))
 def test_prepared_and_read_back_joints_are_those_that_were_written(form: str) -> None:
     fitted = FORMS[form][2] == FITTED
 
@@ -200,7 +200,7 @@ SAID = {
 """Where it is said otherwise."""
 
 
-@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d"))
+@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d", "remocap, ready fits"))
 def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import JointFuture
 from magnet.testing import tiny_denoiser
+from tests.cases import some_slow
 from tests.datamodules.fakes import random_clip
 from tests.evaluation.test_evaluator import FAST, data, run
 
@@ -100,7 +101,13 @@ def test_what_was_given_comes_back_as_it_was_given(task: object, scored: Tensor)
     assert not torch.equal(whole.T_world_root[:, ~given], truth.T_world_root[:, ~given])
 
 
-@EACH
+@pytest.mark.parametrize(
+    ("task", "scored"),
+    [
+        pytest.param(*case, id=name, marks=pytest.mark.slow if name in ("a key each 4", "a key each 2") else ())
+        for name, case in CASES.items()
+    ],
+)
 def test_baselines_are_scored_over_the_same_frames(task: object, scored: Tensor) -> None:
     datamodule = data(batch_size=9)
     batch = next(iter(datamodule.test_dataloader()))
@@ -138,7 +145,7 @@ def narrow() -> dict[str, dict[str, float]]:
     return rows(2, 2, baselines=True)
 
 
-@pytest.mark.parametrize("slots", [3, 9])
+@pytest.mark.parametrize("slots", some_slow([3, 9], 9))
 def test_free_slots_of_the_data_change_no_number(narrow: dict[str, dict[str, float]], slots: int) -> None:
     wide = rows(2, slots, baselines=True)
     assert wide.keys() == narrow.keys()

@@ -23,6 +23,7 @@ from magnet.export.rig import UP
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
+from tests.cases import some_slow
 from tests.export import strangers
 
 LIMBS = [1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21]
@@ -106,7 +107,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", some_slow(CASES, *list(CASES)[::2]))
 def test_a_person_comes_back_from_any_rig(case, truth: Truth, body: Body, tmp_path: Path):
     path = stranger(truth, body, tmp_path / "stranger.bvh", **CASES[case])
     found = load_bvh(path, body, keep_floor=True)
@@ -117,6 +118,7 @@ def test_a_person_comes_back_from_any_rig(case, truth: Truth, body: Body, tmp_pa
     assert angle[LIMBS].max() < 12 and angle.mean() < 7
 
 
+@pytest.mark.slow
 def test_rest_poses_make_no_difference(truth: Truth, body: Body, tmp_path: Path):
     scenes = [load_bvh(stranger(truth, body, tmp_path / f"{arms}.bvh", arms=arms), body).scene for arms in (0, 45, 90)]
     for scene in scenes[1:]:
@@ -131,7 +133,7 @@ def test_missing_toes_are_reported_and_feet_follow_the_ankles(truth: Truth, body
     assert distance[[7, 8]].max() < 0.015 and distance[[10, 11]].max() < 0.04
 
 
-@pytest.mark.parametrize(("legs", "arms"), [(1.15, 1.0), (0.9, 1.15), (1.0, 0.85)])
+@pytest.mark.parametrize(("legs", "arms"), some_slow([(1.15, 1.0), (0.9, 1.15), (1.0, 0.85)], (1.15, 1.0), (1.0, 0.85)))
 def test_other_proportions_keep_limbs_pointing_the_same_way(legs, arms, truth: Truth, body: Body, tmp_path: Path):
     rest_world, rest_at = turned(body, pose(), torch.eye(4), truth.scene.betas[0, 0])
     longer = rest_at.clone()
@@ -158,8 +160,8 @@ def test_people_keep_their_places_and_stand_on_the_floor(truth: Truth, body: Bod
     assert (apart - torch.tensor([1.5, 0.3, -1.0])).abs().max() < 5e-3
     lowest = body.vertices(found.scene)[0, ..., 1].amin(dim=(1, 2))
     assert lowest.median().abs() < 0.04
-    kept = body.joints(load_bvh(paths, body, keep_floor=True).scene)[0]
-    assert torch.allclose(kept[..., 1] - joints[..., 1], torch.tensor(found.floor), atol=1e-4)
+    kept = body.joints(load_bvh(paths[:1], body, keep_floor=True).scene)[0]
+    assert torch.allclose(kept[..., 1] - joints[:, :1, :, 1], torch.tensor(found.floor), atol=1e-4)
 
 
 def test_files_of_other_rates_and_lengths_need_a_word(body: Body, tmp_path: Path):

@@ -89,7 +89,7 @@ def until(true: Callable[[], bool], seconds: float = 500.0) -> None:
 
 
 @pytest.mark.parametrize("workers", some_slow([1, 2], 2))
-@pytest.mark.parametrize("during", ["conversion", "packing"])
+@pytest.mark.parametrize("during", some_slow(["conversion", "packing"], "packing"))
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp_path, during, workers):
     out, reached = tmp_path / "killed", tmp_path / "reached"
     process = multiprocessing.get_context("fork").Process(target=doomed, args=(couples, out, during, workers, reached))
