@@ -66,6 +66,8 @@ class ViewerBase:
         self.server.gui.main_panel.dock_right()
         self.server.gui.main_panel.set_width(300)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(56, 128, 222))
+        self.placed: set[int] = set()  # browsers whose cameras have come to where they were sent
+        self.server.on_client_disconnect(lambda client: self.placed.discard(client.client_id))
         self._look_from("three quarters", 4.0)
 
     # -- controls ------------------------------------------------------------------------------
@@ -263,11 +265,12 @@ class ViewerBase:
         away = self.places_in_sight(frame) - self.centre
         reach = max(float(np.linalg.norm(away[:, [0, 2]], axis=1).max()) + ROOM, 1.2)
         for client in self.server.get_clients().values():
-            camera = client.camera
-            if not camera.image_height:
-                continue  # it has not told yet how it looks
+            camera, aim = client.camera, np.array([0.0, AIM, 0.0])
+            if client.client_id not in self.placed:
+                if not np.allclose(camera.look_at, aim, atol=1e-3):
+                    continue  # it still tells of a camera of its own, which may stand below the floor
+                self.placed.add(client.client_id)
             half = min(camera.fov / 2, float(np.arctan(np.tan(camera.fov / 2) * camera.aspect)))
-            aim = np.array([0.0, AIM, 0.0])
             view = np.asarray(camera.position) - aim
             far, needed = float(np.linalg.norm(view)), reach / float(np.sin(half))
             if 1e-3 < far < needed:

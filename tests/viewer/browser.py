@@ -18,6 +18,8 @@ from magnet.generation.live import Live
 from magnet.testing import tiny_denoiser
 
 SHOTS = Path(__file__).parents[2] / "runs" / "viewer"
+STAGE = np.s_[:350, :480]
+"""Of a screenshot, what lies beside the panel and above the timeline of two people, whose tracks have their colours."""
 
 
 def wait(done: Callable[[], Any], seconds: float = 300.0) -> Any:
@@ -198,11 +200,11 @@ def drag_handle(page: Any, name: str, moved: Callable[[], bool]) -> None:
 
 
 def seen(page: Any, name: str, right: Callable[[np.ndarray], Any]) -> np.ndarray:
-    """A screenshot of the stage beside the panel, taken again until it looks right: rendering without a GPU is slow."""
+    """A screenshot of the stage, taken again until it looks right: rendering without a GPU is slow."""
 
     def stage() -> np.ndarray | None:
         page.wait_for_timeout(2000)
-        image = shot(page, name)[:, :480]
+        image = shot(page, name)[STAGE]
         return image if right(image) else None
 
     end = time.monotonic() + 120

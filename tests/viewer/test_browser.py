@@ -19,8 +19,8 @@ from tests.viewer.browser import blue, grey, orange, pale_orange, seen, shipped,
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-GHOSTS = 10_000
-"""Grey pixels of a stage above which there are ghosts: they make 7,500, lines and trails 7,000."""
+GHOSTS = 6_000
+"""Grey pixels of a stage above which there are ghosts: they make 3,500, lines and trails 4,300."""
 
 
 def test_files_play_pause_step_and_scrub(page, panel, handshake, body) -> None:

@@ -75,9 +75,11 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
     viewer = Viewer([take("dance", scene.replace(T_world_root=roots))], body, port=0)
 
     class Client:
+        client_id = 0
+
         def __init__(self) -> None:
             self.camera = SimpleNamespace(
-                position=np.array([0.0, 0.85, 4.0]), look_at=np.zeros(3), fov=0.7, aspect=1.5, image_height=100
+                position=np.array([0.0, -0.2, -4.0]), look_at=np.zeros(3), fov=0.7, aspect=1.5
             )
 
         def atomic(self):
@@ -86,6 +88,10 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
     client = Client()
     monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: client})
     try:
+        viewer.clock.seek(1)
+        viewer.draw()
+        before = client.camera.position
+        client.camera.position, client.camera.look_at = np.array([0.0, 0.85, 4.0]), np.array([0.0, 0.85, 0.0])
         viewer.clock.seek(2)
         viewer.draw()
         near = np.linalg.norm(client.camera.position - np.array([0.0, 0.85, 0.0]))
@@ -94,6 +100,7 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
         far = client.camera.position - np.array([0.0, 0.85, 0.0])
     finally:
         viewer.stop()
+    assert before[1] == -0.2  # a browser that has not been told where to stand is left alone
     assert near == pytest.approx(4.0, rel=0.1)
     assert np.linalg.norm(far) * np.sin(0.35) >= 3.0
     assert np.allclose(far / np.linalg.norm(far), [0, 0, 1])  # on the line that it looked along
