@@ -13,7 +13,7 @@ from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
 from magnet.body.drift import undrifted
 from magnet.body.settle import Settle, corrected, correction
-from magnet.body.settle_wishes import SLIDES, Wishes, holds
+from magnet.body.settle_wishes import SLIDES, Wishes
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import FPS, Scene
 
@@ -70,21 +70,38 @@ def repaired(
     every = max(round(scene.fps / FPS), 1)
     if drifting:
         scene = undrifted(scene, body, fixed, slides)
-    start = moved_apart(scene, body, DEEP[how], fixed, begun)
     few = torch.arange(0, scene.frames, every, device=scene.device)
     seen = scene.frames_at(few).replace(fps=scene.fps / every)
-    wishes = Wishes.of(seen, body, how, slides, begun=begun)
-    coarse = start.frames_at(few)
-    # Whoever was moved far from somebody does not reach after their hands.
-    left = (holds(body.joints(coarse), scene.present)[1] - wishes.between).norm(dim=-1)
-    wishes = replace(wishes, held=wishes.held & (left < LET_GO))
     stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., few, :]
-    offset = correction(coarse, body, wishes, stay, settle, begun)
+    offset = settling(seen, body, how, stay, settle, begun, slides=slides)
     if every > 1:
         offset = between_frames(offset, few, scene.frames)
     if fixed is not None:
         offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
-    return corrected(start, offset)
+    return corrected(scene, offset)
+
+
+def settling(
+    scene: Scene,
+    body: Body,
+    how: str = "firm",
+    fixed: Tensor | None = None,
+    settle: Settle | None = None,
+    begun: bool = False,
+    past: Tensor | None = None,
+    slides: float = SLIDES,
+) -> Tensor:
+    """The correction (B, T, P, DOFS) that puts a scene right: people move apart, poses do the rest.
+
+    Arguments as for `repaired` and `correction`.
+    """
+    toward = kept_apart(body.joints(scene), scene.present, fixed, DEEP[how], begun, scene.fps)
+    wishes = Wishes.of(scene, body, how, slides, begun=begun)
+    first, second = torch.triu_indices(scene.agents, scene.agents, 1)
+    left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
+    # Whoever is moved far from somebody does not reach after their hands.
+    wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
+    return correction(scene, body, wishes, fixed, settle, begun, past, toward)
 
 
 def between_frames(offset: Tensor, few: Tensor, frames: int) -> Tensor:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import roma
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from magnet.body.base import Body
 from magnet.body.fitted_capsules import fit_capsules
@@ -27,8 +26,17 @@ MOVED: tuple[int, ...] = (0, SPINE2, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS
 DOFS = 3 + 3 * len(MOVED)
 """Numbers that correct a pose: the root's shift in metres, then a rotation vector of each joint in `MOVED`, radians."""
 
+LEAD = 2
+"""Frames of the past that a correction goes on from."""
+
 RAMP = 6
 """Frames after a past that stays over which wishes grow to their full weight."""
+
+FOLLOWS = 20.0
+"""Cost of a squared metre between where people are first moved to and a smooth way there."""
+
+WINDOW, AHEAD = 240, 24
+"""Frames that are corrected together, and how many after them are looked at: the cost of a frame does not grow."""
 
 DONE = 1e-10
 """Gain that is left at which conjugate gradients stop."""
@@ -44,15 +52,17 @@ class Settle:
         stay: cost of a correction itself, of a metre or radian.
         speed: cost of its change from frame to frame.
         bend: cost of the second difference.
-        tilt: how many times more than other joints it costs to turn the whole body or the back.
+        root: how many times more than to turn a limb it costs to move the whole body.
+        tilt: the same of turning the whole body or the back.
         most: metres or radians that one step changes at most.
     """
 
     iterations: int = 8
     inner: int = 40
-    stay: float = 0.02
+    stay: float = 0.05
     speed: float = 0.3
-    bend: float = 30.0
+    bend: float = 1000.0
+    root: float = 3.0
     tilt: float = 3.0
     most: float = 0.15
 
@@ -109,48 +119,68 @@ def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tenso
     return torch.cat([along, own.flatten(1)], dim=-1)
 
 
-class _Damping:
-    """The cost of corrections: (stay + speed D1'D1 + bend D2'D2) x along time, each number of a correction for itself.
+def stiffness(settle: Settle, frames: int) -> Tensor:
+    """The cost of a correction over time, quadratic: of itself and of its first two differences. -> (T, T)"""
+    eye = torch.eye(frames, dtype=torch.float64)
+    total = settle.stay * eye
+    for order, cost in ((1, settle.speed), (2, settle.bend)):
+        if frames > order:
+            change = eye.diff(n=order, dim=0)
+            total = total + cost * change.T @ change
+    return total
 
-    Where the motion goes on from a past that stays, its last two frames come before: `past` (B, 2, P, DOFS).
+
+class Smoothness:
+    """The cost of corrections, each number for itself, and what undoes it: whatever a step is made of is smooth.
+
+    Args:
+        settle: the costs.
+        free: (B, T, P) bool, whoever may move.
+        past: (B, L, P, DOFS) corrections just before, which stay; None: there are none.
     """
 
-    def __init__(self, settle: Settle, frames: int, past: Tensor | None, like: Tensor) -> None:
-        self.settle, self.past, self.lead = settle, past, 0 if past is None else past.shape[1]
+    def __init__(self, settle: Settle, free: Tensor, past: Tensor | None, like: Tensor) -> None:
+        self.past, self.lead = past, 0 if past is None else past.shape[1]
+        self.start = torch.zeros_like(like)  # corrections that cost nothing
         self.scale = torch.ones(DOFS, dtype=like.dtype, device=like.device)
-        self.scale[3:9] = settle.tilt
-        # The operator's diagonal: every fifth impulse is looked at by itself, so that they do not overlap.
-        diagonal = like.new_zeros(frames)
-        for k in range(5):
-            impulses = torch.zeros_like(diagonal)
-            impulses[k::5] = 1.0
-            diagonal[k::5] = self._along_time(impulses[None, :, None])[0, k::5, 0]
-        self.diagonal = diagonal[:, None] * self.scale
+        self.scale[:3], self.scale[3:9] = settle.root, settle.tilt
+        whole = stiffness(settle, self.lead + free.shape[1])
+        self.cost = whole.to(like)[self.lead :]  # (T, L + T)
+        keep = free.transpose(1, 2)  # (B, P, T)
+        self.free = keep[..., None] & keep[..., None, :]
+        self.undone = self.inverse(0.0)  # (B, P, T, T)
 
-    def _along_time(self, x: Tensor, past: Tensor | None = None) -> Tensor:
-        """(B, T, D) -> same"""
-        x = F.pad(x, (0, 0, self.lead, 0)) if past is None else torch.cat([past, x], dim=1)
-        total = self.settle.stay * x
-        for order, cost in ((1, self.settle.speed), (2, self.settle.bend)):
-            if x.shape[1] > order:
-                change = x.diff(n=order, dim=1)
-                for _ in range(order):  # the transposed difference
-                    change = F.pad(change, (0, 0, 1, 0)) - F.pad(change, (0, 0, 0, 1))
-                total = total + cost * change
-        return total[:, self.lead :]
+    def inverse(self, pull: float) -> Tensor:
+        """Of the cost of one number, and of so much more for each frame. -> (B, P, T, T)"""
+        T = self.cost.shape[0]
+        own = self.cost[:, self.lead :].double()
+        eye = torch.eye(T, dtype=own.dtype, device=own.device)
+        return torch.linalg.inv(torch.where(self.free, own + pull * eye, eye)).to(self.cost)
+
+    def toward(self, ground: Tensor) -> Tensor:
+        """A smooth correction that moves people over the ground about so far. (B, T, P, 2) metres -> (B, T, P, DOFS)"""
+        pull = FOLLOWS / float(self.scale[0])
+        offset = ground.new_zeros(*ground.shape[:3], DOFS)
+        offset[..., [0, 2]] = pull * (self.inverse(pull) @ ground.transpose(1, 2)).transpose(1, 2)
+        return offset
 
     def __call__(self, offset: Tensor) -> Tensor:
         """(B, T, P, DOFS) -> same"""
-        return self._along_time(offset.flatten(2)).view(offset.shape) * self.scale
+        return torch.einsum("st,btpd->bspd", self.cost[:, self.lead :], offset) * self.scale
 
     def slope(self, offset: Tensor) -> Tensor:
-        """The same, counted from the corrections of the past. (B, T, P, DOFS) -> same"""
-        past = None if self.past is None else self.past.flatten(2)
-        return self._along_time(offset.flatten(2), past).view(offset.shape) * self.scale
+        """The same, counted from the corrections of the past, and from `start`. (B, T, P, DOFS) -> same"""
+        offset = offset - self.start
+        whole = offset if self.past is None else torch.cat([self.past, offset], dim=1)
+        return torch.einsum("st,btpd->bspd", self.cost, whole) * self.scale
+
+    def undo(self, force: Tensor) -> Tensor:
+        """(B, T, P, DOFS) -> same"""
+        return (self.undone @ force.transpose(1, 2)).transpose(1, 2) / self.scale
 
 
 def solve(
-    rows: Rows, first: Tensor, second: Tensor, damping: _Damping, offset: Tensor, free: Tensor, inner: int
+    rows: Rows, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, free: Tensor, inner: int
 ) -> Tensor:
     """One Gauss-Newton step by preconditioned conjugate gradients. -> (B, T, P, DOFS)
 
@@ -172,32 +202,23 @@ def solve(
         flat.index_add_(0, a, first * u[:, None]).index_add_(0, b, -second * u[:, None])
         return flat.view(shape)
 
-    blocks = offset.new_zeros(free.numel(), DOFS, DOFS)
-    blocks.index_add_(0, a, first[:, :, None] * first[:, None, :])
-    blocks.index_add_(0, b, second[:, :, None] * second[:, None, :])
-    blocks = blocks.view(*shape, DOFS) + torch.diag_embed(damping.diagonal[:, None].expand(shape[1:]))
-    factor = torch.linalg.cholesky(blocks)
-
-    def preconditioned(r: Tensor) -> Tensor:
-        return torch.cholesky_solve(r[..., None], factor)[..., 0] * keep
-
     def product(x: Tensor, y: Tensor) -> Tensor:
         """Of each scene by itself, so that scenes do not depend on those beside them. -> (B, 1, 1, 1)"""
         return (x * y).sum(dim=(1, 2, 3), keepdim=True)
 
-    residual = -(back(rows.root_weight * rows.residual) + damping.slope(offset)) * keep
+    residual = -(back(rows.root_weight * rows.residual) + smooth.slope(offset)) * keep
     step = torch.zeros_like(offset)
-    z = preconditioned(residual)
+    z = smooth.undo(residual) * keep
     direction, rz = z, product(residual, z)
     for _ in range(inner):
         going = rz > DONE
         if not bool(going.any()):
             break
-        turned = (back(across(direction)) + damping(direction)) * keep
+        turned = (back(across(direction)) + smooth(direction)) * keep
         length = torch.where(going, rz / product(direction, turned).clamp_min(1e-20), 0.0)
         step = step + length * direction
         residual = residual - length * turned
-        z = preconditioned(residual)
+        z = smooth.undo(residual) * keep
         rz, before = product(residual, z), rz
         direction = z + torch.where(going, rz / before.clamp_min(1e-20), 0.0) * direction
     return step
@@ -212,6 +233,7 @@ def correction(
     settle: Settle | None = None,
     begun: bool = False,
     past: Tensor | None = None,
+    toward: Tensor | None = None,
 ) -> Tensor:
     """The correction of a scene's poses that meets wishes, for `corrected`. -> (B, T, P, DOFS)
 
@@ -223,8 +245,34 @@ def correction(
         settle: how.
         begun: the motion goes on from a past that stays where it is, so that corrections grow from 0.
         past: (B, 2, P, DOFS) corrections of the two frames before, which this one goes on from; None: `begun` says.
+        toward: (B, T, P, 2) metres over the ground that people are moved before anything else, which decides on which
+            side of each other they end.
     """
-    settle = settle or Settle()
+    T = scene.frames
+    if T > WINDOW + AHEAD:
+        parts: list[Tensor] = []
+        for start in range(0, T, WINDOW):
+            stop = min(start + WINDOW + AHEAD, T)
+            stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., start:stop, :]
+            push = None if toward is None else toward[:, start:stop]
+            more = (stay, settle, begun or start > 0, parts[-1][:, -LEAD:] if parts else past, push)
+            made = correction(scene.slice(start, stop), body, wishes.slice(start, stop), *more)
+            parts.append(made[:, :WINDOW])
+        return torch.cat(parts, dim=1)
+    return correct_window(scene, body, wishes, fixed, settle or Settle(), begun, past, toward)
+
+
+def correct_window(
+    scene: Scene,
+    body: Body,
+    wishes: Wishes,
+    fixed: Tensor | None,
+    settle: Settle,
+    begun: bool,
+    past: Tensor | None,
+    toward: Tensor | None,
+) -> Tensor:
+    """Arguments as for `correction`, of frames that are corrected together."""
     B, T, P = scene.T_world_root.shape[:3]
     free = scene.present[:, None].expand(B, T, P).clone()
     if fixed is not None:
@@ -234,8 +282,10 @@ def correction(
         return offset
     capsules = fit_capsules(body, scene.betas)
     if past is None and begun:
-        past = offset.new_zeros(B, 2, P, DOFS)
-    damping = _Damping(settle, T, past, offset)
+        past = offset.new_zeros(B, LEAD, P, DOFS)
+    smooth = Smoothness(settle, free, past, offset)
+    if toward is not None and bool(toward.any()):
+        offset = smooth.start = smooth.toward(torch.where(free[..., None], toward, 0.0))
     rest = body.rest_joints(scene.betas[:, None])
     for _ in range(settle.iterations):
         now = corrected(scene, offset)
@@ -250,7 +300,7 @@ def correction(
         first = jacobian(seen, rows.node, rows.bone, rows.point, rows.along) * rows.root_weight[:, None]
         second = jacobian(seen, rows.other, rows.other_bone, rows.other_point, rows.along)
         second = second * (rows.root_weight * rows.two)[:, None]
-        step = solve(rows, first, second, damping, offset, free, settle.inner)
-        size = step.abs().amax(dim=-1, keepdim=True)
+        step = solve(rows, first, second, smooth, offset, free, settle.inner)
+        size = step.abs().amax(dim=(1, 2, 3), keepdim=True)
         offset = offset + step * (settle.most / size.clamp_min(settle.most))
     return offset

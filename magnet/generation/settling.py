@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body, load_body
-from magnet.body.repair import repaired
-from magnet.body.settle import Settle, corrected, correction
-from magnet.body.settle_wishes import Wishes
+from magnet.body.repair import repaired, settling
+from magnet.body.settle import Settle, corrected
 from magnet.generation.separation import Decode
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene
@@ -119,7 +118,6 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) ->
     """
     body = open_body_on(scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
-    wishes = Wishes.of(shaped, body, how, begun=past is not None)
-    offset = correction(shaped, body, wishes, fixed, past=past)
+    offset = settling(shaped, body, how, fixed, begun=past is not None, past=past)
     made = corrected(shaped, offset)
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]
