@@ -254,7 +254,8 @@ def make(store: Path, frames: int, clip_frames: int = 300, persons: int = 2) -> 
     from magnet.datamodules.preparing.pack import PackSource, pack
     from magnet.datamodules.preparing.prepare import SHARD_ROWS
     from magnet.datamodules.reading.recording import Recording, Take
-    from magnet.datamodules.store.reader import body_hash, encode
+    from magnet.datamodules.store.reader import body_hash
+    from magnet.datamodules.store.rows import encode
 
     body, parts = made_up_body(), []
     for seed in range(16):

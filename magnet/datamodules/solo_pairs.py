@@ -13,7 +13,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.mixed import Parts
 from magnet.datamodules.registry import register_data
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_agents
 from magnet.seeding import derive
 
 SHORTEST = 48
@@ -142,21 +142,6 @@ def paired(solo: Scene, name: str, delay: int, clearance: float, generator: torc
         copy = place(follower, T_world_mid, distance, torch.tensor(side))
         apart = (leader.T_world_root - copy.T_world_root)[..., [0, 2], 3].norm(dim=-1)
         if float(apart.min()) >= clearance:
-            return _together(leader, copy)
+            valid = None if leader.valid is None or copy.valid is None else leader.valid & copy.valid
+            return cat_agents([leader, copy]).replace(valid=valid, names=())
     return None
-
-
-def _together(one: Scene, other: Scene) -> Scene:
-    """Two people of equal length as one scene; a frame is valid where both are."""
-    valid = None
-    if one.valid is not None and other.valid is not None:
-        valid = one.valid & other.valid
-    return one.replace(
-        body_rot=torch.cat([one.body_rot, other.body_rot], dim=2),
-        T_world_root=torch.cat([one.T_world_root, other.T_world_root], dim=2),
-        betas=torch.cat([one.betas, other.betas], dim=1),
-        present=torch.cat([one.present, other.present], dim=1),
-        valid=valid,
-        given=None,
-        names=(),
-    )

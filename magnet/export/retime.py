@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from magnet.motion.resample import resampled
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_agents
 
 
 def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | None = None, trim: bool = False) -> Scene:
@@ -49,15 +49,7 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
             torch.zeros_like(p.T_world_root[..., 0, 0], dtype=torch.bool) if p.given is None else p.given
             for p in people
         ]
-    return people[0].replace(
-        body_rot=torch.cat([person.body_rot for person in people], dim=2),
-        T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
-        betas=torch.cat([person.betas for person in people], dim=1),
-        present=torch.cat([person.present for person in people], dim=1),
-        valid=valid,
-        given=None if given is None else torch.cat(given, dim=2),
-        names=people[0].names,
-    )
+    return cat_agents(people).replace(valid=valid, given=None if given is None else torch.cat(given, dim=2))
 
 
 def _each(labels: Sequence[str], what: Sequence[str]) -> str:

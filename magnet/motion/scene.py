@@ -187,13 +187,8 @@ class Scene:
         if extra == 0:
             return self
         empty = empty_scene(self.scenes, self.frames, extra, self.T_world_root)
-        return self.replace(
-            body_rot=torch.cat([self.body_rot, empty.body_rot], dim=2),
-            T_world_root=torch.cat([self.T_world_root, empty.T_world_root], dim=2),
-            betas=torch.cat([self.betas, empty.betas], dim=1),
-            present=torch.cat([self.present, empty.present], dim=1),
-            given=None if self.given is None else torch.nn.functional.pad(self.given, (0, extra)),
-        )
+        given = None if self.given is None else torch.nn.functional.pad(self.given, (0, extra))
+        return cat_agents([self, empty]).replace(given=given)
 
     def transformed(self, T_new_world: Tensor) -> Scene:
         """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
@@ -269,6 +264,17 @@ def concatenate(scenes: Sequence[Scene]) -> Scene:
         valid=valid,
         names=tuple(name for s in scenes for name in s.names) if named else (),
         given=torch.cat(given) if len(given) == len(padded) else None,
+    )
+
+
+def cat_agents(people: Sequence[Scene]) -> Scene:
+    """Agents of several scenes side by side in the same world; `given` is dropped, all else is that of the first."""
+    return people[0].replace(
+        body_rot=torch.cat([person.body_rot for person in people], dim=2),
+        T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
+        betas=torch.cat([person.betas for person in people], dim=1),
+        present=torch.cat([person.present for person in people], dim=1),
+        given=None,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -22,7 +22,7 @@ from magnet.datamodules.reading.recording import Axis, DataError, Family, Record
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.runs import true_runs
-from magnet.motion.scene import BODY_JOINTS, FPS, Scene
+from magnet.motion.scene import BODY_JOINTS, FPS, Scene, cat_agents
 
 CANONICALIZE_VERSION = 3
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
@@ -240,7 +240,7 @@ def _fitted(
     try:
         if recording.skeletons:
             people, offs = zip(*(rig.onto(body, up, FPS) for rig in recording.skeletons), strict=True)
-            scene = _side_by_side(people)
+            scene = cat_agents(people)
             residual = torch.stack(offs, dim=1)
         else:
             fit = fit_positions(recording, targets, good, body, up)
@@ -291,16 +291,6 @@ def fit_positions(
         grounded=True,
         fps=FPS,
         progress=progress,
-    )
-
-
-def _side_by_side(people: Sequence[Scene]) -> Scene:
-    return people[0].replace(
-        body_rot=torch.cat([person.body_rot for person in people], dim=2),
-        T_world_root=torch.cat([person.T_world_root for person in people], dim=2),
-        betas=torch.cat([person.betas for person in people], dim=1),
-        present=torch.cat([person.present for person in people], dim=1),
-        valid=None,
     )
 
 

@@ -19,8 +19,10 @@ from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Prog
 from magnet.datamodules.preparing.prepare import absent_note, select_takes
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.recording import DataError, Reader
-from magnet.datamodules.store.reader import SCALE, StoreError, StoreReader, StoreSplit, body_hash, decode, file_hash
+from magnet.datamodules.store.reader import StoreError, StoreReader, StoreSplit, body_hash
+from magnet.datamodules.store.rows import SCALE, scene_of
 from magnet.export.picture import contact_sheet
+from magnet.files import file_hash
 from magnet.motion.scene import FPS, Scene
 
 UNIT = 2.0
@@ -174,19 +176,10 @@ def _scenes(folder: StoreReader, part: StoreSplit, most: int) -> list[tuple[str,
     good = np.flatnonzero(part.frames >= min(SHOWN_FRAMES, longest))
     count = min(most, 2, len(good))
     chosen_clips = good[np.arange(count) * len(good) // max(count, 1)]
-    return [(part.name[c], _scene(part.rows(c), part.betas_of(c), folder.body)) for c in chosen_clips.tolist()]
-
-
-def _scene(rows: np.ndarray, betas: np.ndarray, body: str) -> Scene:
-    rows = rows[:, :SHOWN_FRAMES]
-    body_rot, T_world_root = decode(*(torch.from_numpy(rows[key].copy()) for key in ("rotations", "pelvis")))
-    return Scene(
-        body_rot=body_rot.transpose(0, 1)[None],
-        T_world_root=T_world_root.transpose(0, 1)[None],
-        betas=torch.from_numpy(np.array(betas))[None],
-        present=torch.ones(1, len(rows), dtype=torch.bool),
-        body=body,
-    )
+    return [
+        (part.name[c], scene_of(part.rows(c)[:, :SHOWN_FRAMES], part.betas_of(c), folder.body, FPS))
+        for c in chosen_clips.tolist()
+    ]
 
 
 # -- a download --------------------------------------------------------------------------------
@@ -265,7 +258,8 @@ def check_download(
     for take, part in convert_all(job, takes, lambda take: None, workers, progress):
         if part.error is None and len(found.scenes) < SHOWN:
             P, T = part.people[0], part.frames[0]
-            found.scenes.append((part.names[0], _scene(part.rows[: P * T].reshape(P, T), part.betas[:P], body.id)))
+            rows = part.rows[: P * T].reshape(P, T)[:, :SHOWN_FRAMES]
+            found.scenes.append((part.names[0], scene_of(rows, part.betas[:P], body.id, FPS)))
         parts[take.name] = part
     for take in takes:
         part = parts[take.name]

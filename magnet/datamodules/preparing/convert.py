@@ -26,8 +26,9 @@ from magnet.datamodules.preparing.canonicalize import CANONICALIZE_VERSION, Cano
 from magnet.datamodules.preparing.check_people import check_shapes
 from magnet.datamodules.preparing.genders import load_bodies, one_body
 from magnet.datamodules.reading.recording import Gender, Reader, Take
-from magnet.datamodules.store.reader import FORMAT, body_hash, file_hash, write_whole
+from magnet.datamodules.store.reader import FORMAT, body_hash
 from magnet.datamodules.store.rows import ROW, encode
+from magnet.files import file_hash, write_whole
 from magnet.threads import one_thread
 
 PART_VERSION = 2

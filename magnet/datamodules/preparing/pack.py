@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.preparing.convert import ConvertedTake
 from magnet.datamodules.reading.recording import Take
-from magnet.datamodules.store.reader import FORMAT, MANIFEST, StoreReader, as_json, write_whole
+from magnet.datamodules.store.reader import FORMAT, MANIFEST, StoreReader, as_json
 from magnet.datamodules.store.rows import ROW
+from magnet.files import write_whole
 from magnet.motion.scene import FPS
 
 

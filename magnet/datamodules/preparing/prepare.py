@@ -16,8 +16,8 @@ from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all, take_key
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.reading.recording import DataError, Reader, Take
-from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json, file_hash, write_whole
-from magnet.files import writing
+from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
+from magnet.files import file_hash, write_whole, writing
 
 SHARD_ROWS = 2**18
 """Rows of a shard at most, 49 MB; small enough that ten million frames spread over some forty processes."""

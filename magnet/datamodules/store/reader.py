@@ -18,27 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from magnet.body import Body
 from magnet.datamodules.clip import SPLITS, Clip, Ints, Split
-from magnet.datamodules.store.rows import ROW, SCALE, decode, encode
-from magnet.files import file_hash, inside, write_whole
-from magnet.motion.scene import Scene
-
-__all__ = [
-    "ROW",
-    "SCALE",
-    "StoreError",
-    "StoreReader",
-    "StoreSplit",
-    "body_hash",
-    "decode",
-    "encode",
-    "file_hash",
-    "write_whole",
-]
+from magnet.datamodules.store.rows import ROW, scene_of
+from magnet.files import inside
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -243,20 +228,7 @@ class StoreReader:
         clips = []
         for c, name in enumerate(part.name):
             order = slot_order[c, : part.people[c]]
-            rows = part.rows(c)[order]
-            body_rot, T_world_root = decode(
-                torch.from_numpy(rows["rotations"].copy()), torch.from_numpy(rows["pelvis"].copy())
-            )
-            P = len(rows)
-            scene = Scene(
-                body_rot=body_rot.transpose(0, 1)[None],
-                T_world_root=T_world_root.transpose(0, 1)[None],
-                betas=torch.from_numpy(part.betas_of(c)[order])[None],
-                present=torch.ones(1, P, dtype=torch.bool),
-                fps=self.fps,
-                body=self.body,
-                names=(name,),
-            )
+            scene = scene_of(part.rows(c)[order], part.betas_of(c)[order], self.body, self.fps, name)
             clips.append(Clip(scene, name, self.manifest["name"], split))
         return clips
 

@@ -87,6 +87,20 @@ def _nine(rotations: NDArray[np.int16]) -> NDArray[np.float32]:
     return out
 
 
+def scene_of(rows: NDArray[np.void], betas: NDArray[np.float32], body: str, fps: float, name: str = "") -> Scene:
+    """The scene (B = 1) that rows (P, T) of `ROW` are of people with shapes (P, 10)."""
+    body_rot, T_world_root = decode(*(torch.from_numpy(rows[key].copy()) for key in ("rotations", "pelvis")))
+    return Scene(
+        body_rot=body_rot.transpose(0, 1)[None],
+        T_world_root=T_world_root.transpose(0, 1)[None],
+        betas=torch.from_numpy(np.array(betas))[None],
+        present=torch.ones(1, len(rows), dtype=torch.bool),
+        fps=fps,
+        body=body,
+        names=(name,) if name else (),
+    )
+
+
 def decode(rotations: Tensor, pelvis: Tensor) -> tuple[Tensor, Tensor]:
     """body_rot (..., 21, 3, 3) and T_world_root (..., 4, 4) of rows' (..., 22, 4) int16 and (..., 3) float32."""
     return matrices(rotations[..., 1:, :]), rigid(matrices(rotations[..., 0, :]), pelvis)

@@ -15,8 +15,8 @@ from magnet.datamodules.options import Augmentation
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.store.mapped import MappedStore, RawBatch
 from magnet.datamodules.store.memory import MemoryStore
-from magnet.datamodules.store.reader import ROW, StoreError
-from magnet.datamodules.store.rows import CACHED, SCALE, matrices, nine_at_once
+from magnet.datamodules.store.reader import StoreError
+from magnet.datamodules.store.rows import CACHED, ROW, SCALE, matrices, nine_at_once
 from tests.datamodules import made
 from tests.datamodules.fakes import FakeTrainer, Recorder, quiet
 from tests.datamodules.made import data

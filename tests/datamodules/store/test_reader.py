@@ -18,7 +18,8 @@ from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob, convert, encode
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import Recording
-from magnet.datamodules.store.reader import ROW, StoreError, StoreReader, decode
+from magnet.datamodules.store.reader import StoreError, StoreReader
+from magnet.datamodules.store.rows import ROW, decode
 from magnet.testing import random_scene
 from tests.datamodules import made
 from tests.datamodules.made import data

@@ -16,7 +16,8 @@ from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.store.mapped import MappedStore, SplitData
-from magnet.datamodules.store.reader import ROW, StoreReader
+from magnet.datamodules.store.reader import StoreReader
+from magnet.datamodules.store.rows import ROW
 from magnet.datamodules.store.windows import RandomWindows
 from tests.datamodules import made
 from tests.datamodules.fakes import PLAIN, FakeData, FakeTrainer, random_clip
