@@ -71,6 +71,7 @@ class Quantizer(Protocol):
     num_quantizers: int  # codebooks in a row
     frozen: bool  # nothing moves, also in training
     initialized: Tensor | bool  # codes mean something
+    waits: bool  # not rounding to codes until they are started
     unit_input: bool  # whether the encoder's output is brought to unit spread first
 
     def __call__(

@@ -31,6 +31,7 @@ class FSQ(Float32):
     unit_input = False
     num_quantizers = 1
     initialized = True
+    waits = False
     half_range: Tensor  # (C,) how far a bounded number reaches to either side, in steps between levels
     offset: Tensor  # (C,) 0.5 where the number of levels is even
     shift: Tensor  # (C,) what a vector of 0 must be moved by to stay 0

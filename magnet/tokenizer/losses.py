@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.body.energy import hand_points
 from magnet.body.joints import FEET, TOES
 from magnet.motion.frames import from_9d
 from magnet.motion.rotations import from_6d, geodesic
@@ -16,7 +17,7 @@ from magnet.motion.scene import FPS
 STANDS = (0.05, 0.2)
 """Height in metres and speed in m/s under which a recorded toe stands."""
 
-JOINT_LOSSES = ("joint", "velocity", "foot_velocity", "foot_contact")
+JOINT_LOSSES = ("joint", "hand", "velocity", "foot_velocity", "foot_contact")
 """Terms that need joints, and so a body."""
 
 BODY = 21 * 6
@@ -54,7 +55,7 @@ def reconstruction_losses(
     deltas: Tensor | None = None,
     true_deltas: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The terms of paper Eq. 4, each a mean over people, frames and joints; and four of ours.
+    """The terms of paper Eq. 4, each a mean over people, frames and joints; and five of ours.
 
     A smooth L1 of the angle is quadratic below 1 radian and linear above, so that a few flips do not dominate it.
 
@@ -62,17 +63,18 @@ def reconstruction_losses(
         decoded: (B, T, P, 135), any scale of 6-D numbers.
         truth: the same of the recording.
         mask: (B, T, P) bool, the frames that count.
-        joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`,
+        joints: poses (..., 135) to joint positions (..., 22, 3) in the canonical frame; adds `joint`, `hand`,
             `velocity` and `foot_velocity` (ours).
         deltas: (B, T, P, 9) canonical deltas that the decoder was given; adds `foot_contact` (ours).
         true_deltas: the same of the recording.
 
     Returns:
         joint_rotation: angle of the 21 joints. root_rotation, root_translation: T_can_root (Eq. 5). joint: distance of
-        the joints, metres. velocity: error of the joints' velocities, m/s; small errors that flicker cost little
-        elsewhere, and are the first that one sees. foot_velocity: the same of ankles and toes alone, where flicker
-        looks like sliding. foot_contact: error of the velocities over the ground, m/s, of toes that stand in the
-        recording, with roots moved by the given deltas.
+        the joints, metres. hand: distance of the middles of the hands, metres; who holds hands needs them more exact
+        than a mean over all joints asks for. velocity: error of the joints' velocities, m/s; small errors that flicker
+        cost little elsewhere, and are the first that one sees. foot_velocity: the same of ankles and toes alone, where
+        flicker looks like sliding. foot_contact: error of the velocities over the ground, m/s, of toes that stand in
+        the recording, with roots moved by the given deltas.
     """
     truth = torch.where(mask[..., None], truth, decoded.detach())
     body, T_can_root = matrices(decoded)
@@ -89,6 +91,7 @@ def reconstruction_losses(
         mine, real = joints(decoded), joints(truth)
         away = mine - real
         losses["joint"] = masked_mean(length(away), mask)
+        losses["hand"] = masked_mean(length(hand_points(mine) - hand_points(real)), mask)
         slip = FPS * length(away.diff(dim=1))
         losses["velocity"] = masked_mean(slip, both)
         losses["foot_velocity"] = masked_mean(slip[..., FEET], both)

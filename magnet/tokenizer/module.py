@@ -53,6 +53,7 @@ def make_quantizer(options: QuantizerOptions) -> ResidualVQ | FSQ:
         options.num_quantizers,
         options.ema_decay,
         options.dead_code_threshold,
+        waits=options.continuous_steps > 0,
     )
 
 
@@ -96,16 +97,8 @@ class Tokenizer(L.LightningModule):
         self.save_hyperparameters(plain({**groups, "optimizer": self.optimizer, **rest}))
         self.quantizer = made = make_quantizer(options)
         self.codebook_dim = made.dim
-        self.vqvae = VQVAE(
-            POSE_FEATURES,
-            made.dim,
-            network.width,
-            network.depth,
-            network.causal,
-            TOKEN_FRAMES,
-            made.unit_input,
-            network.lookahead,
-        )
+        sizes = (network.width, network.depth, network.causal)
+        self.vqvae = VQVAE(POSE_FEATURES, made.dim, *sizes, TOKEN_FRAMES, made.unit_input, network.lookahead)
         self.body: Body | None = None
         self.mpjpe = MeanMetric()
         self.local_mpjpe = MeanMetric()
@@ -201,7 +194,10 @@ class Tokenizer(L.LightningModule):
 
     @torch.no_grad()
     def init_codebook(self, scenes: Iterable[Scene]) -> None:
-        """Fit normalizers, then initialize the codebook by k-means, on the first training batches; only once."""
+        """Fit normalizers, then initialize the codebook by k-means, on the first training batches; only once.
+
+        Codes wait for the `continuous_steps` of training that go without them.
+        """
         some = []
         for number, scene in enumerate(scenes):
             some.append(scene.to(self.device))
@@ -209,7 +205,7 @@ class Tokenizer(L.LightningModule):
                 break
         if not self.vqvae.pose.ready:
             self.fit_normalizers(some)
-        if self.quantizer.initialized:
+        if self.quantizer.initialized or self.quantizer.waits:
             return
         vectors: list[Tensor] = []
         for scene in some:
@@ -254,6 +250,12 @@ class Tokenizer(L.LightningModule):
     def on_train_start(self) -> None:
         if not self._initialized:
             self.init_codebook(self.trainer.train_dataloader)  # type: ignore[arg-type]
+
+    def on_train_batch_start(self, batch: Scene, batch_idx: int) -> None:
+        if self.quantizer.waits and self.global_step >= self.hparams["quantizer"]["continuous_steps"]:
+            self.quantizer.waits = False
+            batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
+            self.init_codebook([batch] if batches is None else batches())
 
     def take_weights(self, path: str | Path) -> None:
         """Take over another tokenizer's networks and statistics, and its codes where there are as many."""

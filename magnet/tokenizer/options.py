@@ -17,9 +17,8 @@ class AutoencoderOptions:
     Args:
         width: channels of the convolutions, paper Table A.2.
         depth: residual blocks in each of the two stages; the paper does not say.
-        causal: no token sees later frames, so tokens of a growing clip never change (ours, for streaming).
-        lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1 (ours): with 1, frames are final one
-            token late, and smoother at the borders of tokens.
+        causal: no token sees later frames (ours, for streaming).
+        lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1 (ours).
     """
 
     width: int = 512
@@ -44,9 +43,10 @@ class QuantizerOptions:
             which has no codebook to learn (ours): each number of a code is rounded to one of a few levels.
         codebook_size: codes in each codebook, paper Table A.2. Only of `residual_vq`, as all that follows up to levels.
         codebook_dim: numbers in a code, paper Table A.2.
-        num_quantizers: codebooks in a row, each coding what the ones before left over (ours); the paper has 1.
+        num_quantizers: codebooks in a row, each coding what is left over (ours); the paper has 1.
         ema_decay: of the moving averages that the codes follow.
-        dead_code_threshold: a code chosen less often than this a batch is moved to a vector of the batch.
+        dead_code_threshold: codes chosen less often than this a batch start anew.
+        continuous_steps: training steps before there are codes (ours).
         levels: of `fsq`, so many values each number of a code can have. The default makes 64,000 codes (Mentzer et al.
             2023, Finite scalar quantization: VQ-VAE made simple, Table 1).
     """
@@ -57,12 +57,14 @@ class QuantizerOptions:
     num_quantizers: int = 1
     ema_decay: float = 0.99
     dead_code_threshold: float = 1.0
+    continuous_steps: int = 0
     levels: tuple[int, ...] = (8, 8, 8, 5, 5, 5)
 
     def __post_init__(self) -> None:
         require_choice("kind", self.kind, QuantizerKind)
         for name in ("codebook_size", "codebook_dim", "num_quantizers"):
             require_whole(name, getattr(self, name), 1)
+        require_whole("continuous_steps", self.continuous_steps, 0)
         require_number("ema_decay", self.ema_decay, 0, 1)
         require_number("dead_code_threshold", self.dead_code_threshold, least=0)
         object.__setattr__(self, "levels", tuple(self.levels))  # lists come from files
@@ -82,9 +84,10 @@ class TokenizerLoss:
         root_translation: lambda_r of paper Eq. 4, on the translation of Eq. 5.
         commitment: pulls embeddings to their codes; the paper does not say.
         joint: distance of the decoded joints, in metres (ours).
+        hand: distance of the middles of the hands, in metres (ours).
         velocity: error of the decoded joints' velocities, in m/s, against flicker (ours).
         foot_velocity: the same of ankles and toes alone, against sliding feet (ours).
-        foot_contact: speed over the ground at which toes slide that stand in the recording, in m/s (ours).
+        foot_contact: sliding of toes that stand in the recording, in m/s (ours).
     """
 
     joint_rotation: float = 1.0
@@ -92,6 +95,7 @@ class TokenizerLoss:
     root_translation: float = 0.5
     commitment: float = 0.3
     joint: float = 0.0
+    hand: float = 0.0
     velocity: float = 0.0
     foot_velocity: float = 0.0
     foot_contact: float = 0.0

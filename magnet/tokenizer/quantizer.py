@@ -34,6 +34,7 @@ class ResidualVQ(Float32):
         dead_code_threshold: a code whose average count per batch falls below this is replaced by a vector of the batch.
             With fewer than 4 vectors per code in a batch the threshold is lowered in proportion; otherwise small
             batches would replace good codes (ours).
+        waits: vectors are left as they are until there are codes.
     """
 
     unit_input = True
@@ -49,8 +50,10 @@ class ResidualVQ(Float32):
         num_quantizers: int = 1,
         ema_decay: float = 0.99,
         dead_code_threshold: float = 1.0,
+        waits: bool = False,
     ) -> None:
         super().__init__()
+        self.waits = waits
         self.size, self.dim, self.num_quantizers = codebook_size, codebook_dim, num_quantizers
         self.ema_decay, self.dead_code_threshold = ema_decay, dead_code_threshold
         self.frozen = False
@@ -74,6 +77,10 @@ class ResidualVQ(Float32):
         """
         with torch.autocast(vectors.device.type, enabled=False):
             flat = vectors.float().flatten(0, -2)
+            if self.waiting:
+                none = flat.new_full((*vectors.shape[:-1], self.num_quantizers), -1, dtype=torch.long)
+                unused = flat.new_zeros(self.num_quantizers, self.size)
+                return Quantized(flat.view(vectors.shape), none, flat.new_zeros(()), unused)
             keep = torch.ones_like(flat[:, 0], dtype=torch.bool) if mask is None else mask.flatten()
             update = self.training and not self.frozen
             if update and not bool(self.initialized):
@@ -97,6 +104,11 @@ class ResidualVQ(Float32):
                 counts=torch.stack(counts),
             )
 
+    @property
+    def waiting(self) -> bool:
+        """Whether vectors are left as they are, because there are no codes yet."""
+        return self.waits and not bool(self.initialized)
+
     def continuous(self, vectors: Tensor) -> Tensor:
         """The vectors unchanged: codes lie in the same space."""
         return vectors.float()
@@ -104,6 +116,8 @@ class ResidualVQ(Float32):
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
         """The sum of the nearest codes, codebook by codebook; nothing is updated. (..., D) -> (..., D) float32"""
+        if self.waiting:
+            return self.continuous(vectors)
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
             latent = torch.zeros_like(residual)

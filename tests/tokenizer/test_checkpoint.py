@@ -46,6 +46,21 @@ def test_resumed_training_ends_bit_identical(
     assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
 
 
+def test_codes_start_after_the_steps_without_them_also_where_training_was_stopped(tmp_path: Path, scene: Scene) -> None:
+    waiting = {"quantizer": {"continuous_steps": 6, "num_quantizers": 2}}
+    first, keep = tiny(**waiting), ModelCheckpoint(tmp_path, filename="{epoch}", save_top_k=-1)
+    trainer(tmp_path, max_epochs=3, callbacks=[keep]).fit(first, datamodule=Scenes())
+    stopped, begun = (Tokenizer.load(tmp_path / f"epoch={epoch}.ckpt") for epoch in (0, 1))  # after 4 and 8 steps
+    assert not stopped.quantizer.initialized and not stopped.quantizer.codes.any()
+    torch.testing.assert_close(stopped.encode_scene(scene), stopped.encode_scene(scene, quantize=False))
+    assert begun.quantizer.initialized and not torch.equal(begun.encode_scene(scene), begun.encode_scene(scene, False))
+    again = tiny(**waiting)
+    resume = {"ckpt_path": tmp_path / "epoch=0.ckpt", "weights_only": True}
+    trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
+    state = first.state_dict()
+    assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
+
+
 def test_training_the_decoder_alone_leaves_the_meaning_of_codes(
     run: tuple[Tokenizer, Path], tmp_path: Path, scene: Scene
 ) -> None:

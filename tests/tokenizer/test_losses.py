@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from magnet.body import load_body
+from magnet.body.joints import ELBOWS, WRISTS
 from magnet.motion.frames import canonical_frame, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_deltas
@@ -71,3 +72,29 @@ def test_foot_contact_is_the_speed_at_which_given_steps_make_standing_toes_slide
 def test_moving_points_is_what_a_turn_and_a_shift_do():
     quarter = torch.tensor([math.cos(math.pi / 2), 0, -1, 0, 1, 0, 1.0, 0, 2.0])
     assert torch.allclose(moved(quarter, torch.tensor([[0.0, 1.0, 1.0]])), torch.tensor([[2.0, 1.0, 2.0]]), atol=1e-6)
+
+
+def test_the_hand_term_is_how_far_the_middles_of_the_hands_are_off(body, generator):
+    """Forearms turned at the elbow by an angle: the hand, 8 cm beyond the wrist, swings on that circle."""
+    scene = random_scene(1, 4, 1, generator)
+    pose, angle = pose_features(scene), 0.3
+    bent = scene.body_rot.clone()
+    for elbow in ELBOWS:
+        turn = torch.tensor(
+            [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]]
+        )
+        bent[..., elbow - 1, :, :] = bent[..., elbow - 1, :, :] @ turn
+    off = pose_features(scene.replace(body_rot=bent))
+
+    def joints(pose: torch.Tensor) -> torch.Tensor:
+        return body.forward_kinematics(*matrices(pose), scene.betas[:, None])
+
+    mask = torch.ones(pose.shape[:3], dtype=torch.bool)
+    hands = []
+    for wrist, elbow in zip(WRISTS, ELBOWS, strict=True):
+        for points in (joints(pose), joints(off)):
+            arm = points[..., wrist, :] - points[..., elbow, :]
+            hands.append(points[..., elbow, :] + arm * (1 + 0.08 / arm.norm(dim=-1, keepdim=True)))
+    expected = torch.stack([(hands[1] - hands[0]).norm(dim=-1), (hands[3] - hands[2]).norm(dim=-1)]).mean()
+    got = reconstruction_losses(off, pose, mask, joints)["hand"]
+    assert got > 0.02 and got == pytest.approx(float(expected), rel=1e-3)
