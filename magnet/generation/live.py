@@ -17,6 +17,7 @@ from torch import Tensor
 from magnet.denoiser.module import Denoiser
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
+from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
@@ -28,6 +29,7 @@ from magnet.tasks import registry
 from magnet.tasks.base import Task
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
+from magnet.tasks.partner import MotionControl
 
 CONTEXT = 32
 """Frames that each chunk goes on from."""
@@ -71,9 +73,10 @@ class LiveChunk:
 class Live:
     """A scene that grows; `given` marks what the model did not generate.
 
-    Each chunk is a sample of the chosen task that continues the last `CONTEXT` frames. Where a task is given
-    somebody's future (as `motion_control` is), that future comes first: from `partner`, if there is one; from
-    in-betweening towards that agent's goal, if it is steered; else from a joint prediction.
+    Each chunk is a sample of the chosen task that continues the last `CONTEXT` frames; in `motion_control` it is the
+    answer of a `Partner`. Where a task is given somebody's future (as that one is), that future comes first: from
+    `partner`, if there is one; from in-betweening towards that agent's goal, if it is steered; else from a joint
+    prediction.
 
     Args:
         model: a trained denoiser.
@@ -111,6 +114,7 @@ class Live:
         self.lock = threading.RLock()
         self.version = 0  # grows when frames that were there have changed
         self.made, self.spent = 0, 0.0
+        self._partner: tuple[Any, Partner] | None = None  # who answers, and what for
         self.scene: Scene
         self.begin(people, start)
 
@@ -214,8 +218,22 @@ class Live:
                 "try joint_future, motion_control or inbetweening"
             )
         given = self._future(past, scene.frames, known, frames)
-        chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
+        if isinstance(task, MotionControl):
+            chunk = self._answered(task, given, version)
+        else:
+            chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return self._append(scene, chunk, version, begun)
+
+    def _answered(self, task: MotionControl, given: Scene, version: int) -> Scene:
+        """The answer to a given future, by the partner who has answered so far. given (1, `CONTEXT` + T) -> (1, T)"""
+        options = self._options()
+        key = (version, task, options)
+        if self._partner is None or self._partner[0] != key:
+            past = given.slice(0, CONTEXT)
+            partner = Partner(self.model, past, task.target, options, self.generator, task.block)
+            self._partner = (key, partner)
+        answer = self._partner[1].answer(given.slice(CONTEXT)).to("cpu")
+        return answer.replace(names=(), given=None if given.given is None else given.given[:, CONTEXT:])
 
     def between(self) -> LiveChunk:
         """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
@@ -263,6 +281,11 @@ class Live:
             return LiveChunk(scene.frames, chunk.frames, took)
 
     def sample(self, scene: Scene, task: Task, context: int, frames: int) -> Scene:
+        options = self._options()
+        longer = generate(self.model, scene, task, context, frames, options=options, generator=self.generator)
+        return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
+
+    def _options(self) -> SamplerOptions:
         # A chunk fits into the window, so denoising it all at once costs the fewest steps.
         # What it has made itself is not asked where its floor is.
         settings = self.settings
@@ -272,12 +295,13 @@ class Live:
             "pyramid_offset": 0,
             "any_floor": True,
         }
-        options = dataclasses.replace(settings.sampler, **own)
-        longer = generate(self.model, scene, task, context, frames, options=options, generator=self.generator)
-        return longer.permute_agents(torch.arange(scene.agents)).to("cpu").replace(names=())
+        return dataclasses.replace(settings.sampler, **own)
 
     def _length(self, kind: type) -> int:
-        return REACH if kind is Inbetweening else max(self.settings.chunk // TOKEN_FRAMES, 1) * TOKEN_FRAMES
+        if kind is Inbetweening:
+            return REACH
+        block = TOKEN_FRAMES * (int(self.settings.fields.get("block", 1)) if kind is MotionControl else 1)
+        return max(self.settings.chunk // block, 1) * block
 
     def _steered(self) -> list[int]:
         return sorted(agent for agent in self.settings.goals if agent < self.scene.agents)

@@ -85,7 +85,7 @@ def generate(
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
     more = (options, generator, progress, stats)
-    return cat_time(list(stream(model, scene, task, context, frames, samples, *more, cond=cond)))
+    return cat_time(list(stream(model, scene, task, context, frames, samples, *more, CHUNK, cond)))
 
 
 def stream(
@@ -99,22 +99,24 @@ def stream(
     generator: Generators = None,
     progress: Callable[[int], None] | None = None,
     stats: SamplingStats | None = None,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     cond: Tensor | None = None,
 ) -> Iterator[Scene]:
     """Sample a task in consecutive chunks of frames, which together are what `generate` returns.
 
-    Memory does not grow with the scene's length, unless a keyframe far ahead decides where everything before it is
-    placed. Arguments as for `generate`, and:
+    A chunk comes when its bodies are final: so many tokens after its own as the decoder looks ahead, and a seam before
+    what is given later. Memory does not grow with the scene's length, unless a keyframe far ahead decides where
+    everything before it is placed. Arguments as for `generate`, and:
 
     Args:
         frames: None: endless, for tasks that are given nothing after the context.
-        chunk: token steps decoded and handed out at a time. Smaller chunks come sooner and cost more; poses
-            differ by rounding.
+        chunk: token steps decoded and handed out at a time. Smaller chunks come sooner. With the precision `reference`
+            they cost more, and poses differ by rounding. None: 1, or 64 where poses are settled, chunk by chunk.
 
     Raises:
         ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
     """
+    chunk = (1 if options is None or options.settle == "off" else CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
     more = (options, generator, progress, stats, chunk, cond)
@@ -243,7 +245,7 @@ class Rollout:
         if self.world.causal:
             return before + 2, 0
         seam = -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
-        return before + seam + 1, after + seam
+        return before + seam + 1, after + seam * (self.limits is not None or self.options.precision == "reference")
 
     # Each call enters its contexts itself: held across a yield they would apply to the caller too.
 

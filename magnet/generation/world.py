@@ -40,9 +40,8 @@ if TYPE_CHECKING:
 class WorldState:
     """World poses of the scene while it is generated.
 
-    After each stage the new tokens are made consistent before the model sees them again: latents are moved to
-    their nearest codes, transforms projected to planar ones, agents placed in the world, and deltas and pairwise
-    transforms computed again from there.
+    After each stage the new tokens are made consistent before the model sees them again: latents moved to their nearest
+    codes, transforms projected to planar ones, agents placed, and deltas and pairwise transforms computed from there.
 
     Args:
         model: whose tokens these are.
@@ -361,21 +360,22 @@ class WorldState:
         """
         if self.causal:
             return finalized_bodies(self, tokens, first, len(self.known) if stop is None else stop)
-        layout, blend = self.model.layout, -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
+        blend = -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
         stop = len(self.known) if stop is None else stop
-        low, high = max(first - blend, 0), min(stop + blend, len(self.known))
+        # Only what is given later has a seam before it; the plain network rounds otherwise in another window.
+        later = self.options.precision == "reference" or bool(self.known[stop : stop + blend].any())
+        low, high = max(first - blend, 0), min(stop + blend * later, len(self.known))
         behind, ahead = receptive_field(self.model)
         near = slice(max(low - behind, 0), high + ahead)
-        latent, deltas, _ = layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
+        latent, deltas, _ = self.model.layout.unpack(self.model.normalizer.denormalize(tokens[:, near]))
         frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
         features = decoded_frames(self, latent, deltas, frames, near.start, latent.shape[1])
         given = self.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
         T_world_can = self.T_world_can[:, low * TOKEN_FRAMES : high * TOKEN_FRAMES]
         decoded = posed(features, T_world_can, given)
         if self.options.keep_given:
-            decoded = crossfade_given(
-                decoded, given, T_world_can, self.by_frame(self.known[low:high]), self.options.blend
-            )
+            keep = self.by_frame(self.known[low:high])
+            decoded = crossfade_given(decoded, given, T_world_can, keep, self.options.blend)
         decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
         if self.options.settle != "off":
             fixed = self.by_frame(self.known[first:stop])

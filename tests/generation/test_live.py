@@ -8,9 +8,11 @@ import torch
 
 from magnet.generation.keyframes import Goal, keyframe, reached, speeds, with_keyframes
 from magnet.generation.live import CONTEXT, FIRST, REACH, Live, LiveChunk
+from magnet.generation.partner import Partner
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 from magnet.viewer.worker import Worker
@@ -113,6 +115,24 @@ def test_who_is_steered_comes_nearer_and_the_others_are_generated_from_that(live
     for _ in range(8):
         live.advance()
     assert (live.scene.T_world_root[0, -1, 1, [0, 2], 3] - goal).norm() < 1.2
+
+
+def test_a_live_answer_is_that_of_a_partner_bit_for_bit(model) -> None:
+    """One who goes on from chunk to chunk, until the settings change or the scene is restarted."""
+    recorded = random_scene(1, 100, 2, torch.Generator().manual_seed(2))
+    live = Live(model, start=recorded.slice(0, 40), partner=recorded, generator=torch.Generator().manual_seed(3))
+    live.settings.task, live.settings.steps = "motion_control", 2
+    options = SamplerOptions(steps=2, pyramid_offset=0, any_floor=True)
+    partner = Partner(model, recorded.slice(8, 40), (0,), options, torch.Generator().manual_seed(3), 2)
+    for first in (40, 56):
+        live.advance()
+        answer = partner.answer(recorded.slice(first, first + 16))
+        assert torch.equal(live.scene.body_rot[:, first:], answer.body_rot)
+        assert torch.equal(live.scene.T_world_root[:, first:], answer.T_world_root)
+    live.settings.fields = {"block": 3}
+    assert live.advance().frames == 12
+    live.restart(60)
+    assert live.advance().start == 60
 
 
 def test_a_partners_recording_is_given_as_it_is(model) -> None:

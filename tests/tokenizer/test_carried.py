@@ -10,7 +10,11 @@ from magnet.testing.models import random_scene, tiny_tokenizer
 from magnet.tokenizer.carried import Carried
 from magnet.tokenizer.lean import LEAN, Growing, Taps, decoded, encoded
 
-KINDS = {"sees both ways": {}, "causal": {"causal": True}}
+KINDS = {
+    "sees both ways": {},
+    "causal": {"causal": True},
+    "causal, a token ahead": {"causal": True, "lookahead": 1},
+}
 
 
 @pytest.fixture(scope="module", params=KINDS.values(), ids=KINDS)
