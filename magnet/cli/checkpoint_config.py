@@ -1,8 +1,7 @@
 """Options stored in a checkpoint, as defaults below everything that the user says.
 
-Two traps of LightningCLI are met here: it lets a checkpoint's options beat explicit ones, and it does not
-restore linked options. So its own reading of checkpoints is switched off, and the options that a checkpoint
-keeps go in front of the user's arguments, where whatever comes later wins.
+LightningCLI lets a checkpoint's options beat explicit ones, and does not restore linked options. So its own reading of
+checkpoints is switched off: a checkpoint's options become the lowest layer, and whatever the user says wins.
 """
 
 from __future__ import annotations
@@ -236,13 +235,13 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
 
 
 OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
-"""Options of a model that one which starts from it does not take over."""
+"""Options that a model does not take over from the one that it starts from."""
 
 
 def started(name: str, given: Arguments, models: dict[str, str], data_default: str) -> dict[str, Any]:
     """Options of the checkpoint that training starts from (`--model.start_from`), as the lowest layer.
 
-    Sizes have to be the same, and losses and noise had better be; the data are told how many people and frames.
+    Sizes, losses and noise are those of the checkpoint, and the data have its number of people and frames.
 
     Args:
         name: a shipped model's, or a path.

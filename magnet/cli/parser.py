@@ -34,7 +34,7 @@ CKPT_PATH = {
 """What --ckpt_path says in place of Lightning's text, whose title is cut off and whose words mean other things here."""
 
 CANDIDATES = r",\s+known\s+subclasses:\s[^)]*\)"
-"""Class paths that jsonargparse lists behind an option: a screen of them for the Trainer's."""
+"""Class paths that jsonargparse lists behind an option; of the Trainer's options they fill a screen."""
 
 GROUP = "Path to a configuration file."
 """What jsonargparse says of an option that stands for a group of others; the group's heading says more."""
@@ -72,7 +72,7 @@ class Parser(LightningArgumentParser):
         return super().parse_args(args, namespace, **kwargs)
 
     def format_help(self, *args: Any, **kwargs: Any) -> str:
-        """What a run has in all cases and which topics there are; or one topic; or all of it (`TOPICS`)."""
+        """Options of every run and the list of topics; or the options of one topic; or all of them."""
         if not self.command:
             return super().format_help(*args, **kwargs)
         for key, classes in self.classes.items():
@@ -128,7 +128,7 @@ class Parser(LightningArgumentParser):
         return parts
 
     def _name_choices(self, key: str) -> None:
-        """Head a group by what can be chosen, in place of class paths and of what base classes say of themselves."""
+        """Give a group a heading with the names to choose from, instead of class paths and the base class's text."""
         names = ", ".join(self.classes[key])
         for group in self._action_groups:
             for action in group._group_actions:
@@ -201,7 +201,7 @@ class Parser(LightningArgumentParser):
         return next((word[1] for word in words if word), otherwise)
 
     def _had_by_others(self, name: str) -> str:
-        """That another class has the option which the chosen one lacks; empty where none has."""
+        """Names another class that has the option; empty if there is none."""
         key, _, field = name.lstrip("-").partition(".")
         classes = self.classes.get(key, {})
         having = [each for each, kind in classes.items() if f"{key}.{field}" in _options(key, kind)] if field else []

@@ -1,4 +1,4 @@
-"""What a run leaves behind: its folder, configuration, provenance, logs and checkpoints."""
+"""The folder of a run: configuration, provenance, logs and checkpoints."""
 
 from __future__ import annotations
 
@@ -111,8 +111,10 @@ class ProgressLines(ProgressBar):
     def disable(self) -> None:
         self.seconds = float("inf")
 
-    def _start(self) -> None:
+    def _start(self, *_: Any, **__: Any) -> None:
         self.began = self.said = time.monotonic()
+
+    on_test_start = on_predict_start = _start
 
     def _step(self, what: str, done: int, total: float, more: str = "") -> None:
         now = time.monotonic()
@@ -134,14 +136,8 @@ class ProgressLines(ProgressBar):
         more = "".join(f", {key} {value:.4g}" for key, value in numbers.items() if isinstance(value, float))
         self._step("train: step", trainer.global_step - self.first, total, more)
 
-    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._start()
-
     def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
         self._step("test: batch", args[2] + 1, float(sum(trainer.num_test_batches)))
-
-    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._start()
 
     def on_predict_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
         self._step("predict: batch", args[2] + 1, float(sum(trainer.num_predict_batches)))
@@ -178,25 +174,18 @@ class SamplingProgress(ProgressBar):
         elif self.enabled:
             self.lines._step(f"{self.what}: denoising step", self.done, self.total)
 
-    def _end(self) -> None:
+    def _end(self, *_: Any, **__: Any) -> None:
         if self.bar is not None:
             self.bar.stop()
             self.bar = None
+
+    on_test_end = on_predict_end = on_exception = _end
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begin("test", sum(trainer.num_test_batches), trainer, pl_module)
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begin("predict", sum(trainer.num_predict_batches), trainer, pl_module)
-
-    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._end()
-
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._end()
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._end()
 
 
 def clock(seconds: float) -> str:
@@ -252,7 +241,7 @@ class Record(Callback):
 
 
 def point(link: Path, folder: Path) -> None:
-    """Make `link` lead to `folder` beside it, where links can be made at all."""
+    """Make `link` a symbolic link to `folder` beside it; say so where the file system allows none."""
     if link.exists() and not link.is_symlink():
         return  # somebody's own folder
     part = link.with_name(f".{link.name}.part")

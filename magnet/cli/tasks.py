@@ -123,7 +123,7 @@ def task_parser(kind: type | None, **settings: Any) -> ArgumentParser:
 def read_fields(
     parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
 ) -> dict[str, Any]:
-    """What flags say over options from files.
+    """Options from files, overridden by flags.
 
     Raises:
         CommandError: an option that there is not, or a value that does not fit.
@@ -145,7 +145,7 @@ def read_fields(
 
 
 def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
-    """What is said of an option that there is not."""
+    """The message for an option that does not exist."""
     flags = [each for action in parser._actions for each in action.option_strings if each.startswith("--")]
     known = [
         each

@@ -48,9 +48,9 @@ SILENCED = (
     ".*The dirpath has changed.*",
     ".*in eval mode at the start of training.*",
 )
-"""Lightning's hints that nobody here can follow."""
+"""Warnings of Lightning's that do not apply to this command."""
 UNSAID = ("Tip:", "`weights_only` was not set")
-"""Of its log: the second reads like a hole, and our checkpoints are never unpickled (`magnet.checkpoints`)."""
+"""Lines of its log that are left out; the second does not apply: our checkpoints are never unpickled."""
 
 
 def run_trainer(command: str, arguments: list[str]) -> int:

@@ -123,7 +123,7 @@ class MotionDataModule(LightningDataModule):
         return self._stores[split, device]
 
     def open_store(self, split: Split) -> MemoryStore:
-        """The clips of a split as a store on the CPU; all in memory, unless a data set knows better.
+        """The clips of a split as a store on the CPU; in memory unless a data set overrides this.
 
         Raises:
             EmptySplitError: the split has no clips.
@@ -214,7 +214,7 @@ class MotionDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def _some(self, split: Split, windows: WindowIndex, frames: int) -> WindowIndex:
-        """The windows, when there are any."""
+        """The windows; an error if there are none."""
         if not len(windows):
             raise ValueError(
                 f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import roma
@@ -121,14 +121,12 @@ class BVHReader(OwnReader[BvhTrack]):
     def __init__(
         self,
         root: str | Path,
-        pattern: str | None = None,
-        table: Path | None = None,
-        split: Literal["scenes", "time"] | None = None,
         unit: Unit | None = None,
         joints: Path | None = None,
         worst_fit: float = 0.04,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(root, pattern, table, split)
+        super().__init__(root, **kwargs)
         self.unit, self.worst_fit = unit, worst_fit
         self.joints = {} if joints is None else read_joints(Path(joints))
 

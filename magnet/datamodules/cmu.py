@@ -15,7 +15,8 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.preparing.fit_cache import FitCache
 from magnet.datamodules.preparing.fit_whole import Fitted, fit_whole
-from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.asf import read_asf
+from magnet.datamodules.reading.asf_amc import read_amc
 from magnet.datamodules.reading.cmu_glitches import Glitches
 from magnet.datamodules.reading.cmu_joints import check_rate, measured
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of

@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import roma
@@ -105,15 +105,8 @@ class ScenesReader(OwnReader[PosedTrack]):
     )
     one_person_a_file: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        root: str | Path,
-        pattern: str | None = None,
-        table: Path | None = None,
-        split: Literal["scenes", "time"] | None = None,
-        fps: float | None = None,
-    ) -> None:
-        super().__init__(root, pattern, table, split)
+    def __init__(self, root: str | Path, fps: float | None = None, **kwargs: Any) -> None:
+        super().__init__(root, **kwargs)
         if fps is not None and not fps > 0:
             raise ValueError(f"fps: got {fps:g}, expected more than 0")
         self.fps = fps

@@ -50,7 +50,7 @@ WINDOW_STRIDE = 5
 """Frames between the training windows that the regression is fitted to and the nearest one is looked for among."""
 
 MAX_WINDOWS = 1500
-"""About so many of them, mirror images apart: where there is more to choose from they lie further apart."""
+"""At most about so many of them, mirror images not counted; with more data their stride is larger."""
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""
@@ -78,7 +78,7 @@ class Evaluator(L.LightningModule):
     Attributes:
         results: the table, once a test has ended.
         progress: told 1 after each denoising step.
-        stats: how well what was sampled hangs together, and what it cost.
+        stats: consistency and cost of what was sampled.
 
     Raises:
         ValueError: no samples or no stride.

@@ -12,7 +12,8 @@ from torch import Tensor
 from magnet.body import JOINT_NAMES, PARENTS, Body, load_body
 from magnet.body.fit import FitSettings, clearance, fit_body, kabsch, shape_from_lengths, swing
 from magnet.datamodules.preparing.fit_whole import LIMBS, fit_recordings
-from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.asf import read_asf
+from magnet.datamodules.reading.asf_amc import read_amc
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene

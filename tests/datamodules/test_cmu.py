@@ -18,7 +18,8 @@ from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.fit_whole import fit_recordings, wrists_apart
 from magnet.datamodules.preparing.prepare import prepare
-from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.asf import read_asf
+from magnet.datamodules.reading.asf_amc import read_amc
 from magnet.datamodules.reading.cmu_joints import ENDS, check_rate
 from magnet.datamodules.reading.recording import DataError
 from magnet.motion.scene import Scene

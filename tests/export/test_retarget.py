@@ -15,7 +15,8 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.datamodules.preparing.fit_whole import fit_recordings
-from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, read_asf
+from magnet.datamodules.reading.asf import read_asf
+from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc
 from magnet.export import load_bvh, save_bvh
 from magnet.export.naming import recognised
 from magnet.export.retarget import Imported

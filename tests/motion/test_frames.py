@@ -2,7 +2,8 @@ import pytest
 import roma
 import torch
 
-from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.asf import read_asf
+from magnet.datamodules.reading.asf_amc import read_amc
 from magnet.motion.frames import (
     align_planar,
     canonical_deltas,

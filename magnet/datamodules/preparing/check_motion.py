@@ -22,7 +22,7 @@ FEET = ((7, 10), (8, 11))
 WALKING = [PELVIS, L_ANKLE, L_FOOT, R_ANKLE, R_FOOT]
 """Joints that tell the frame rate: the pelvis, then each foot's two."""
 TURN = 2 * math.pi * 1.05
-"""A rotation vector longer than a full turn is not one; recordings that unwrap angles stay below."""
+"""Longest rotation vector in radians; even recordings with unwrapped angles stay below."""
 STANDING, BESIDE = 0.5, 0.75
 """Metres that heads must be over ankles, and the share of it that another axis may have, for an axis to be up."""
 APART, SPAN, BOB, HIGH, INSIDE = 20.0, 150.0, 3.0, 30.0, 0.02
@@ -129,7 +129,7 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
         declared: by the reader, or by the user.
         joints: in the file's axes, metres or not; NaN where a joint is not known.
         valid: (T, P).
-        chosen: the user says so, and knows of people who lie: only a clear contradiction is refused.
+        chosen: the user gave the axis, perhaps because people lie down: only a clear contradiction is refused.
 
     Raises:
         DataError: another axis is the dominant one, or none is.

@@ -118,7 +118,7 @@ class PrepareJob:
         return bodies
 
     def settings(self, body: Body) -> dict[str, Any]:
-        """Everything besides a take's files that its part depends on."""
+        """Everything that a take's part depends on besides its files."""
         kind = registry.reader(self.name)
         return {
             "format": FORMAT,
@@ -195,7 +195,7 @@ class ConvertedTake:
         write_whole(path.parent, lambda _: path.name, write)
 
     def saved(self, path: Path) -> ConvertedTake:
-        """Itself without rows, once it is on disk."""
+        """Write it, and return it without its rows."""
         self.save(path)
         return replace(self, rows=self.rows[:0])
 

@@ -1,4 +1,4 @@
-"""A whole take fitted to a body at full precision, with its masked frames, and what a report says of the fit."""
+"""A whole take fitted to a body, with masked frames, and the report of the fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shapes of gendered bodies converted to the one body of training."""
+"""Shape numbers of gendered bodies, converted to those of the one body that is trained on."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
 
 
 def absent_note(names: list[str], most: int = 5) -> str:
-    """What lists of splits name and a download lacks: was it unpacked whole?"""
+    """Says which names of the lists the download lacks; perhaps it was not unpacked completely."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{len(names)} names of the lists are not in the download: {', '.join(names[:most])}{more}"
 

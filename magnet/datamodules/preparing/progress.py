@@ -1,4 +1,4 @@
-"""A bar of what is being done and how long it will take, for what takes minutes."""
+"""A progress bar with the time left, for work that takes minutes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def on_a_terminal() -> dict[str, Any]:
-    """Options of a bar: elsewhere it would leave an empty line in front of what is said."""
+    """Options that show a progress bar on a terminal only: in a file it would leave an empty line."""
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -17,7 +17,7 @@ def on_a_terminal() -> dict[str, Any]:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Something to call with what is being done, how much is done, and how much there is."""
+    """Yields a function that shows (what is being done, amount done, total)."""
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))

@@ -1,4 +1,4 @@
-"""What splits lack, in words: an empty one, or one without scenes of as many people as another has."""
+"""Warnings of splits that are empty, or that lack a number of people which another split has."""
 
 from __future__ import annotations
 

@@ -15,20 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.datamodules.reading.arrays import AGAIN
-from magnet.datamodules.reading.asf import (
-    ROTATIONS,
-    TRANSLATIONS,
-    AsfSkeleton,
-    Floats,
-    euler,
-    numbers,
-    read_asf,
-    said_lines,
-)
+from magnet.datamodules.reading.asf import ROTATIONS, TRANSLATIONS, AsfSkeleton, Floats, euler, numbers, said_lines
 from magnet.datamodules.reading.recording import DataError
 from magnet.motion.resample import slerp
-
-__all__ = ["AmcRecording", "AsfSkeleton", "Bools", "Floats", "euler", "read_amc", "read_asf", "together"]
 
 Bools = NDArray[np.bool_]
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnet.datamodules.reading.asf_amc import AmcRecording, Bools, Floats
+from magnet.datamodules.reading.asf import Floats
+from magnet.datamodules.reading.asf_amc import AmcRecording, Bools
 from magnet.motion.runs import true_runs
 
 JUMP = 0.15

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.body.fit import swing
-from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
+from magnet.datamodules.reading.asf import AsfSkeleton, euler
+from magnet.datamodules.reading.asf_amc import AmcRecording, together
 from magnet.datamodules.reading.cmu_glitches import Glitches, repaired
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.rotations import geodesic

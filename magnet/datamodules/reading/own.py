@@ -1,4 +1,4 @@
-"""Recordings of a user's own: files in a folder, brought together to scenes; what they hold is a subclass's affair."""
+"""A user's own recordings: which files of a folder form a scene. Subclasses read the files."""
 
 from __future__ import annotations
 

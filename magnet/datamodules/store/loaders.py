@@ -77,10 +77,9 @@ class TrainLoader:
     draws from clips of its own, its samples are numbered on their own.
 
     Args:
-        draw: (epoch, first sample, count) to the windows drawn.
-        fetch: windows drawn to what `finish` takes; the part that threads do ahead. Its result must depend on the
-            windows alone.
-        finish: what `fetch` gave to the batch.
+        draw: the windows of some samples: (epoch, first sample, count) -> WindowIndex.
+        fetch: reads what windows need; threads may run it ahead, so its result must depend on the windows alone.
+        finish: turns the result of `fetch` into the batch.
         batch_size: scenes a batch and process.
         epoch_size: samples an epoch, over all processes; rounded down to whole batches, at least one.
         rank: of this process.
@@ -153,7 +152,7 @@ class FixedLoader:
 
     Args:
         windows: all windows.
-        gather: windows drawn to the batch.
+        gather: makes the batch of some windows.
         batch_size: scenes a batch and process at most; one more where shards of odd sizes need it.
         rank: of this process.
         world: number of processes.

@@ -21,8 +21,8 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 class MemoryStore:
     """All clips of a split as flat tensors on one device; rows are frames of one person.
 
-    Row 0 is an absent person, so that gathering a batch is one `index_select` a tensor, whoever is there. What
-    keeps its frames elsewhere overrides `gather`, `good`, `to` and `__init__`, and calls `_index`.
+    Row 0 is an absent person, so that a batch is one `index_select` a tensor. A subclass that keeps frames elsewhere
+    overrides `gather`, `good`, `to` and `__init__`, and calls `_index`.
 
     Args:
         clips: at least one, all of one fps and body.
@@ -67,7 +67,7 @@ class MemoryStore:
         fps: float,
         body: str,
     ) -> None:
-        """What is known of each clip besides its frames."""
+        """Keep what is known of each clip besides its frames, and check the number of people."""
         self.names, self.sources = list(names), np.array(sources, dtype=object)
         self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
         self.whole = np.array(whole, dtype=bool)  # every frame is valid
