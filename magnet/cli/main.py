@@ -22,6 +22,7 @@ LIGHT_COMMANDS = {
     "demo": "the main job on the embedded default, from nothing to a table and pictures",
     "data": "prepare, check, describe, fake and download data sets",
     "bench": "measure how fast a model samples on this machine",
+    "agent": "be one agent of a scene in a process of its own, together with others",
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",

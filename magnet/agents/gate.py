@@ -1,0 +1,124 @@
+"""What is let in from the network: messages whose form, numbers, rate and sender are right, and nothing else."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from magnet.agents.message import POSE, TOKEN, Message, RefusedMessage, unpack
+
+FAR = 1000.0
+"""Metres from the origin, at most."""
+HIGH = 10.0
+"""Metres that a pelvis is over or under the floor, at most."""
+STEP = 1.0
+"""Metres that a pelvis moves from one frame to the next, at most: 30 m/s."""
+SHAPE = 10.0
+"""Numbers of a body shape, at most."""
+LATENT = 100.0
+"""Normalized numbers of a latent, at most."""
+UNIT = 1e-2
+"""How far the length of a quaternion may be from 1; it is made 1 when it is read."""
+AHEAD, BEHIND = 300, 300
+"""Frames before and after one's own that are of use."""
+
+
+class Gate:
+    """Takes the parts of messages and gives those that are right.
+
+    Args:
+        names: the agents of the scene.
+        me: who does not hear itself.
+        model: fingerprint of one's own model; tokens of another are left out, and the poses are taken.
+        latent: numbers of a latent.
+        rate: messages a second that a sender may send in the long run.
+        burst: messages that a sender may send at once.
+
+    Attributes:
+        taken: how many were.
+        refused: how many were not, by the reason.
+        now: own frame, about which frames of others are taken; None: any.
+    """
+
+    def __init__(
+        self, names: Sequence[str], me: str, model: str, latent: int, rate: float = 120.0, burst: float = 240.0
+    ) -> None:
+        self.names, self.me, self.model, self.latent = tuple(names), me, model, latent
+        self.rate, self.burst = rate, burst
+        self.taken, self.refused = 0, Counter[str]()
+        self.now: int | None = None
+        self._sessions: dict[str, int] = {}
+        self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
+
+    def take(self, parts: Sequence[bytes], at: float, peer: str | None = None) -> Message | None:
+        """A message, if it is right; None, and a count more, if not.
+
+        Args:
+            parts: as they came.
+            at: now, in seconds of any clock that does not go back.
+            peer: who is known to be at the other end; None: not known.
+        """
+        try:
+            message = unpack(parts)
+            self._sent_by(message, at, peer)
+            self._numbers(message)
+        except RefusedMessage as reason:
+            self.refused[str(reason)] += 1
+            return None
+        self._sessions[message.sender] = message.session
+        self.taken += 1
+        return message
+
+    def _sent_by(self, message: Message, at: float, peer: str | None) -> None:
+        sender = message.sender
+        if sender not in self.names or sender == self.me or peer not in (None, sender):
+            raise RefusedMessage("sender")
+        if message.agent not in (sender, self.me):
+            raise RefusedMessage("agent")
+        if message.session < self._sessions.get(sender, 0):
+            raise RefusedMessage("session")
+        left, since = self._left.get(sender, (self.burst, at))
+        left = min(self.burst, left + self.rate * max(at - since, 0.0))
+        self._left[sender] = (max(left - 1, 0.0), at)
+        if left < 1:
+            raise RefusedMessage("rate")
+        if message.kind == "frames":
+            first, last = message.frame, message.frame + len(message.poses) - 1
+            if first < 0 or first // TOKEN != last // TOKEN:
+                raise RefusedMessage("frame")
+            if self.now is not None and not self.now - BEHIND <= first <= self.now + AHEAD:
+                raise RefusedMessage("frame")
+
+    def _numbers(self, message: Message) -> None:
+        poses = message.poses
+        if not np.isfinite(poses).all() or max(map(abs, message.betas)) > SHAPE:
+            raise RefusedMessage("range")
+        place, units = poses[:, :3], poses[:, 3:].reshape(len(poses), (POSE - 3) // 4, 4)
+        if (np.abs(place[:, [0, 2]]) > FAR).any() or (np.abs(place[:, 1]) > HIGH).any():
+            raise RefusedMessage("range")
+        if (np.linalg.norm(np.diff(place, axis=0), axis=1) > STEP).any():
+            raise RefusedMessage("speed")
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(units.astype(np.float64), axis=2)
+        if (np.abs(lengths - 1) > UNIT).any():
+            raise RefusedMessage("rotation")
+        if message.token is not None and message.model == self.model:
+            self._token(message.token, place)
+
+    def _token(self, token: np.ndarray, place: np.ndarray) -> None:
+        if len(token) != self.latent + TOKEN * 16:
+            raise RefusedMessage("shape")
+        if not np.isfinite(token).all() or (np.abs(token[: self.latent]) > LATENT).any():
+            raise RefusedMessage("range")
+        frames = token[self.latent :].reshape(TOKEN, 4, 4).astype(np.float64)
+        flat = frames.copy()
+        flat[:, [0, 2], 3] = 0.0  # turns about the vertical, and places on the floor
+        turn = flat[:, :3, :3]
+        if np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() > 1e-3 or (np.linalg.det(turn) < 0).any():
+            raise RefusedMessage("rotation")
+        if np.abs(flat[:, 1] - [0, 1, 0, 0]).max() > 1e-3 or np.abs(flat[:, 3] - [0, 0, 0, 1]).max() > 1e-6:
+            raise RefusedMessage("rotation")
+        if (np.abs(frames[:, [0, 2], 3] - place[:, [0, 2]]) > STEP).any():
+            raise RefusedMessage("range")

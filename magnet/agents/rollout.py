@@ -1,0 +1,172 @@
+"""One agent's rollout: it generates its own tokens and is told those of the others, as far as they have come."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import receptive_field
+from magnet.generation.rollout import CHUNK, Rollout
+from magnet.motion.frames import canonical_frame, pairwise, to_9d
+from magnet.motion.scene import Scene, cat_time
+from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
+from magnet.sampling.noise import LEVELS
+from magnet.sampling.options import SamplerOptions
+from magnet.sampling.schedule import Stage
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
+
+
+@dataclass(frozen=True)
+class OwnToken:
+    """What an agent has generated of itself.
+
+    Attributes:
+        row: token step, counted from the first of the rollout's past.
+        motion: (1, 4, 1) the body in the world.
+        latent: (C,) what the bodies were decoded from, normalized as the model sees it.
+        T_world_can: (4, 4, 4) canonical frames.
+    """
+
+    row: int
+    motion: Scene
+    latent: Tensor
+    T_world_can: Tensor
+
+
+class OwnRollout(Rollout):
+    """The part of an agentic task that one agent computes, in its own view.
+
+    What has not come of another agent is unknown, at level K, as what a view hides is; it is filled in when it comes
+    (`fill`). With everything there in time, the tokens are those of `AgenticAsync` or `AgenticSync` in one process.
+
+    Args:
+        model: the trained denoiser.
+        past: one scene of everybody, whole tokens.
+        agent: the slot that is generated.
+        task: in turns (`AgenticAsync` with offset 1) or in step (`AgenticSync`); blocks of one token.
+        options: how to sample.
+        generator: source of noise; of the same seed in all processes.
+        missing: (N, P) bool, token steps of the past that are not known.
+
+    Raises:
+        ValueError: another offset or block, several scenes, no such agent, or what `Rollout` refuses.
+    """
+
+    def __init__(
+        self,
+        model: Denoiser,
+        past: Scene,
+        agent: int,
+        task: AgenticAsync | AgenticSync,
+        options: SamplerOptions | None = None,
+        generator: torch.Generator | None = None,
+        missing: Tensor | None = None,
+    ) -> None:
+        if task.block != 1 or (isinstance(task, AgenticAsync) and task.offset != 1):
+            raise ValueError(f"task: got {task}, expected blocks of one token, and turns with offset 1")
+        if past.scenes != 1 or not 0 <= agent < past.agents or not bool(past.present[0, agent]):
+            raise ValueError(
+                f"past: got {past.scenes} scenes of {past.agents} agents, expected one, agent {agent} in it"
+            )
+        options = options or SamplerOptions()
+        if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
+            options = dataclasses.replace(options, placement="integrate")
+        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
+        self.agent, self.names = agent, past.agents
+        self.row = past.frames // TOKEN_FRAMES  # the next that is generated
+        with torch.no_grad():
+            self._bring_in(self.row)
+        if missing is not None:
+            self._forget(missing)
+
+    def _forget(self, missing: Tensor) -> None:
+        """Make token steps of the past unknown. missing (N, P) bool"""
+        rows, slots = missing.nonzero(as_tuple=True)
+        kept = slots != self.agent
+        self.world.placed[rows[kept], slots[kept]] = False
+        self.world.known[rows[kept], slots[kept]] = False
+
+    def has(self, row: int, slot: int) -> bool:
+        """Whether a token is known, or was long ago."""
+        return row < self.first or (row < self.stop and bool(self.world.placed[row - self.first, slot]))
+
+    def be_there(self, slot: int, there: bool) -> None:
+        """Say that somebody has come or gone."""
+        given = self.world.given
+        if bool(given.present[0, slot]) != there:
+            present = given.present.clone()
+            present[0, slot] = there
+            self.world.given = given.replace(present=present)
+            self.world.there = present[0].nonzero()[:, 0]
+
+    @torch.no_grad()
+    def advance(self) -> OwnToken:
+        """Generate the next token of the agent from what is known of the others."""
+        stage = None
+        while stage is None or not bool((stage.levels[0] != stage.levels[-1])[:, self.agent].any()):
+            stage, _, needed = next(self.plan)
+        row = stage.active[0]
+        with torch.autocast(self._autocast[0], enabled=False):
+            self._bring_in(row + 1)
+        self._run(self._in_own_view(stage))
+        self._finalize(row + 1, row + 1)
+        local = row - self.first
+        latent = self.tokens[0, local, self.agent, : self.model.layout.latent].clone()
+        T_world_can = self.world.T_world_can[0, local * TOKEN_FRAMES : (local + 1) * TOKEN_FRAMES, self.agent].clone()
+        motion = self._decoded(row, row + 1, None, needed).permute_agents(torch.tensor([self.agent]))
+        self.row = row + 1
+        return OwnToken(row, motion.replace(given=None, names=()).to("cpu"), latent, T_world_can)
+
+    def _in_own_view(self, stage: Stage) -> Stage:
+        """A stage as one agent runs it: others' tokens are as they are, and unknown where they have not come."""
+        own = torch.arange(stage.levels.shape[2]) == self.agent
+        there = self.world.placed[stage.start - self.first : stage.stop - self.first]
+        others = torch.where(there, 0, LEVELS).to(stage.levels)
+        levels = torch.where(own, stage.levels, others)
+        visible = there | own | ~self.world.given.present[0].cpu()
+        visibility = None if bool(visible.all()) else visible.expand(len(own), -1, -1)
+        return dataclasses.replace(stage, levels=levels, visibility=visibility)
+
+    @torch.no_grad()
+    def fill(self, row: int, slot: int, T_world_can: Tensor, latent: Tensor) -> bool:
+        """Enter a token of somebody else, as an `OwnToken` has it; whether it is of any use still. (4, 4, 4), (C,)"""
+        if slot == self.agent or row <= self.first or self.has(row, slot):
+            return False
+        with torch.autocast(self._autocast[0], enabled=False):
+            self._bring_in(row + 1)
+            local, world, layout = row - self.first, self.world, self.model.layout
+            frames = slice(local * TOKEN_FRAMES, (local + 1) * TOKEN_FRAMES)
+            world.T_world_can[0, frames, slot] = T_world_can.to(world.T_world_can)
+            world.placed[local, slot] = True
+            stop = min(local + 2, len(world.placed))  # a token that came earlier begins where this one ends
+            moved = torch.zeros_like(world.placed)
+            moved[local:stop, slot] = world.placed[local:stop, slot]
+            held = self.tokens[:, local:stop]
+            frames = slice(local * TOKEN_FRAMES, stop * TOKEN_FRAMES)
+            pairs = pairwise_by_token(to_9d(pairwise(world.T_world_can[:, frames])))
+            latents = held.new_zeros(*held.shape[:3], layout.latent)
+            made = self.model.normalizer.normalize(layout.pack(latents, world.placed_deltas(local, stop), pairs))
+            made[..., : layout.latent] = held[..., : layout.latent]
+            made[0, 0, slot, : layout.latent] = latent.to(made)
+            changed = layout.spread(world._ready(local, stop) & world._touched(moved[local:stop])).to(made.device)
+            self.tokens[:, local:stop] = torch.where(changed, made, held)
+        return True
+
+    @torch.no_grad()
+    def encode(self, frames: Sequence[Scene]) -> Tensor:
+        """The latent of the last of consecutive tokens of one person, known by poses alone. (1, 4, 1) each -> (C,)"""
+        wanted = frames[-1 - receptive_field(self.model)[0] :]
+        scene = cat_time([each.replace(given=None, valid=None, names=()) for each in wanted]).to(self.model.device)
+        packed = self.options.precision != "reference"
+        latent = self.model.encode(scene, slice(len(wanted) - 1, len(wanted)), packed)[0, 0]
+        rest = latent.new_zeros(1, self.model.layout.width - self.model.layout.latent)
+        return self.model.normalizer.normalize(torch.cat([latent, rest], dim=1))[0, : self.model.layout.latent]
+
+    def canonical(self, frames: Scene) -> Tensor:
+        """Canonical frames of a token of one person. (1, 4, 1) -> (4, 4, 4)"""
+        return canonical_frame(frames.T_world_root)[0, :, 0]

@@ -1,0 +1,243 @@
+"""An agent's process: it meets the others, keeps their pace, and goes on whatever of them is late or lost."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from magnet.agents.agent import Member
+from magnet.agents.gate import Gate
+from magnet.agents.message import TOKEN, Message, pack
+from magnet.motion.scene import FPS
+
+PERIOD = TOKEN / FPS
+"""Seconds of a token."""
+HELLO = 0.1
+"""Seconds between two hellos of who has not begun."""
+GATHER = 0.5
+"""Seconds for which somebody who comes back listens to what it is told."""
+PULL = 0.1
+"""Share of the difference to the others' pace that is taken up with each token."""
+MOST = 0.005
+"""Seconds that are taken up with each token, at most."""
+LOST = 1.0
+"""Seconds behind after which one's own clock is set anew."""
+
+
+class Channel(Protocol):
+    """What messages pass by: `magnet.agents.zeromq.Link`, or a test's."""
+
+    def send(self, parts: list[bytes]) -> None: ...
+    def receive(self, seconds: float) -> list[tuple[str, list[bytes]]]: ...
+
+
+@dataclass
+class Pace:
+    """When tokens are due: so that all keep one pace though their clocks do not.
+
+    Each agent compares how late after their time the others' tokens come with how late its own are sent, and moves
+    its clock a little towards their middle. No clock is ever read by another.
+
+    Args:
+        start: when token `first` is due, in seconds.
+        first: a token.
+    """
+
+    start: float
+    first: int = 0
+    lateness: dict[str, float] = field(default_factory=dict)
+    resets: int = 0
+
+    def due(self, index: int) -> float:
+        return self.start + (index - self.first) * PERIOD
+
+    def heard(self, name: str, index: int, at: float) -> None:
+        """A token of somebody has come."""
+        now = at - self.due(index)
+        if abs(now) < LOST:
+            self.lateness[name] = 0.7 * self.lateness.get(name, now) + 0.3 * now
+
+    def sent(self, index: int, at: float) -> float:
+        """An own token has been sent. Returns by how much it was late."""
+        late = at - self.due(index)
+        if late > LOST:
+            self.start, self.resets = self.start + late, self.resets + 1
+            self.lateness.clear()
+        elif self.lateness:
+            off = statistics.median(self.lateness.values()) - late
+            self.start += max(-MOST, min(MOST, PULL * off))
+        return late
+
+
+@dataclass
+class Report:
+    """What an agent's process has to say in the end.
+
+    Attributes:
+        tokens: how many were made.
+        late: how many of them after they were due.
+        joined: the first token, where others had begun before.
+    """
+
+    tokens: int = 0
+    late: int = 0
+    joined: int = 0
+    took: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
+    lateness: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
+
+    def told(self, member: Member, gate: Gate, pace: Pace | None) -> dict[str, Any]:
+        """All counts, JSON-ready."""
+        took, late = sorted(self.took), sorted(self.lateness)
+        middle = 1000 * statistics.median(took) if took else None
+        return {
+            "tokens": self.tokens, "joined": self.joined, "next": member.next, "late": self.late,
+            "late_ms_p99": 1000 * late[int(0.99 * len(late))] if late else None,
+            "late_ms_most": 1000 * late[-1] if late else None, "made_in_ms": middle,
+            "gaps": member.gaps, "filled": member.filled,
+            "taken": gate.taken, "refused": dict(gate.refused), "resets": pace.resets if pace else 0,
+        }  # fmt: skip
+
+
+class Process:
+    """An agent's process.
+
+    Args:
+        member: who takes part.
+        link: what messages pass by.
+        gate: what lets them in.
+        others: whom to meet.
+        real_time: keep the pace of the motion; False: as fast as the others' tokens come.
+        patience: seconds to wait for a token of somebody, without real time.
+        meet: seconds to wait for the others to come.
+        session: when this process began, in nanoseconds.
+        clock: seconds of a clock that does not go back.
+        kept: called with each own message.
+    """
+
+    def __init__(
+        self,
+        member: Member,
+        link: Channel,
+        gate: Gate,
+        others: set[str],
+        real_time: bool = True,
+        patience: float = 5.0,
+        meet: float = 30.0,
+        session: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        kept: Callable[[Message], object] = lambda _: None,
+    ) -> None:
+        self.member, self.link, self.gate, self.others = member, link, gate, others
+        self.real_time, self.patience, self.meet, self.clock, self.kept = real_time, patience, meet, clock, kept
+        self.session = time.time_ns() if session is None else session
+        self.name = member.names[member.me]
+        self.pace: Pace | None = None
+        self.report = Report()
+        self._heard: set[str] = set()
+        self._heard_by: set[str] = set()
+        self._running: set[str] = set()
+        self._answered: Counter[str] = Counter()
+
+    def listen(self, seconds: float) -> None:
+        """Take in what comes within some time, and what has come."""
+        for peer, parts in self.link.receive(seconds):
+            at = self.clock()
+            message = self.gate.take(parts, at, peer)
+            if message is None:
+                continue
+            self._heard.add(message.sender)
+            if message.kind == "hello":
+                if self.name in message.heard:
+                    self._heard_by.add(message.sender)
+                if self.pace is not None:
+                    self._answer(message, at)
+                continue
+            self._running.add(message.sender)
+            self.member.hear(message)
+            if self.pace is not None and message.agent == message.sender:
+                self.pace.heard(message.sender, message.frame // TOKEN, at)
+
+    def _answer(self, hello: Message, at: float) -> None:
+        """Tell somebody who has come back how things are, at most every two seconds."""
+        if self._answered[hello.sender] < int(at / 2.0) + 1:
+            self._answered[hello.sender] = int(at / 2.0) + 1
+            for message in self.member.history(self.member.names.index(hello.sender)):
+                self._send(message)
+
+    def _send(self, message: Message) -> None:
+        self.link.send(pack(replace(message, session=self.session, clock=time.time())))
+
+    def _hello(self) -> None:
+        self._send(Message("hello", self.name, self.name, 0, -1, 0.0, heard=tuple(sorted(self._heard))))
+
+    def begin(self) -> None:
+        """Meet the others, and begin with them; or join them where they are."""
+        end = self.clock() + self.meet
+        while self.clock() < end and not self._running:
+            self._hello()
+            if self.others <= self._heard_by and self.others <= self._heard:
+                break
+            self.listen(HELLO)
+        self._hello()
+        member = self.member
+        if self._running:
+            self._gather(GATHER)
+            if member.newest() > 2 if self.real_time else any(map(self._far_on, self._running)):
+                member.join()
+                self.report.joined = member.next
+        self.pace = Pace(self.clock() + PERIOD, member.next)
+
+    def _far_on(self, name: str) -> bool:
+        """Whether somebody's first tokens are no longer to be had."""
+        pieces = self.member.pieces[self.member.names.index(name)]
+        return any(index >= 0 for index in pieces) and not all(index in pieces for index in range(max(pieces) + 1))
+
+    def _gather(self, seconds: float) -> None:
+        end = self.clock() + seconds
+        while self.clock() < end:
+            self._hello()
+            self.listen(min(HELLO, max(end - self.clock(), 0.0)))
+
+    def turn(self) -> bool:
+        """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
+        member, pace, cost = self.member, self.pace, statistics.median(self.report.took or [0.0])
+        assert pace is not None
+        index = member.next
+        self.gate.now = index * TOKEN
+        given_up = self.clock() + self.patience
+        while True:
+            now = self.clock()
+            if self.real_time:
+                earliest, latest = pace.due(index) - PERIOD, pace.due(index) - 1.2 * cost
+                wait = (latest if member.awaited() else min(earliest, latest)) - now
+            else:
+                wait = given_up - now if member.awaited() else 0.0
+            if wait <= 0:
+                break
+            self.listen(min(wait, 0.05))
+        self.listen(0.0)
+        begun = self.clock()
+        message = member.step()
+        if message is None:
+            return False
+        self._send(message)
+        ended = self.clock()
+        self.report.took.append(ended - begun)
+        self.report.tokens += 1
+        late = pace.sent(index, ended)
+        if self.real_time:
+            self.report.lateness.append(late)
+            self.report.late += late > 0
+        self.kept(message)
+        return True
+
+    def run(self, tokens: int | None = None) -> dict[str, Any]:
+        """Take part for so many tokens, or until it is over. Returns the report."""
+        self.begin()
+        while (tokens is None or self.report.tokens < tokens) and self.turn():
+            pass
+        return self.report.told(self.member, self.gate, self.pace)

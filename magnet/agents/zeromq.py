@@ -1,0 +1,123 @@
+"""Messages over ZeroMQ: one PUB socket that tells, one SUB socket for each agent that is heard (docs/agents.md)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from magnet.agents.message import LARGEST, VERSION
+
+QUEUE = 64
+"""Messages that wait for somebody who does not read; after that they are lost."""
+HERE = re.compile(r"ipc://.+|inproc://.+|tcp://(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+")
+
+
+def engine() -> ModuleType:
+    """ZeroMQ for Python.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    try:
+        import zmq
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError('agents need ZeroMQ: pip install "magnet-motion[agents]"') from error
+    return zmq
+
+
+class Link:
+    """What an agent sends and hears by.
+
+    Args:
+        name: whose link it is.
+        listen: where it tells, such as tcp://127.0.0.1:5601 or ipc:///run/user/1000/a.
+        connect: where each of the others tells.
+        keys: folder of CURVE keys, as `make_keys` writes it: own NAME.key_secret, everybody's NAME.key. None: nothing
+            is encrypted and nobody proves who they are, so addresses must be of this machine.
+
+    Raises:
+        ValueError: an address of another machine without keys, a key that is not there, or an address that is taken.
+    """
+
+    def __init__(self, name: str, listen: str, connect: Mapping[str, str], keys: Path | None = None) -> None:
+        zmq = engine()
+        if keys is None:
+            for address in (listen, *connect.values()):
+                if not HERE.fullmatch(address):
+                    raise ValueError(
+                        f"{address} is not an address of this machine (tcp://127.0.0.1:PORT, ipc://PATH): give keys "
+                        "(--keys) to send to others"
+                    )
+        self._zmq, self.context = zmq, zmq.Context()
+        self._guard: Any = None
+        try:
+            self._open(name, listen, connect, keys)
+        except (zmq.ZMQError, OSError) as error:
+            self.close()
+            raise ValueError(f"{listen}: {error}; choose another address, or look into the folder of keys") from error
+
+    def _open(self, name: str, listen: str, connect: Mapping[str, str], keys: Path | None) -> None:
+        zmq = self._zmq
+        self.out = self.context.socket(zmq.PUB)
+        self.out.set_hwm(QUEUE)
+        self.out.linger = 0
+        mine: tuple[Any, Any] | None = None
+        if keys is not None:
+            import zmq.auth
+            from zmq.auth.thread import ThreadAuthenticator
+
+            mine = zmq.auth.load_certificate(keys / f"{name}.key_secret")
+            self._guard = ThreadAuthenticator(self.context)
+            self._guard.start()
+            self._guard.configure_curve(domain="*", location=str(keys))
+            self.out.curve_publickey, self.out.curve_secretkey = mine
+            self.out.curve_server = True
+        self.out.bind(listen)
+        self.poller = zmq.Poller()
+        self.inn: dict[Any, str] = {}
+        for other, address in connect.items():
+            socket = self.context.socket(zmq.SUB)
+            socket.set_hwm(QUEUE)
+            socket.linger = 0
+            socket.maxmsgsize = LARGEST
+            if keys is not None and mine is not None:
+                socket.curve_publickey, socket.curve_secretkey = mine
+                socket.curve_serverkey = zmq.auth.load_certificate(keys / f"{other}.key")[0]
+            socket.subscribe(b"magnet/")
+            socket.connect(address)
+            self.poller.register(socket, zmq.POLLIN)
+            self.inn[socket] = other
+
+    def send(self, parts: list[bytes]) -> None:
+        """Tell all who listen; never waits."""
+        self.out.send_multipart(parts)
+
+    def receive(self, seconds: float) -> list[tuple[str, list[bytes]]]:
+        """What has come, with the name that its address was given for; waits so long for the first."""
+        found = []
+        for socket, _ in self.poller.poll(max(int(1000 * seconds), 0)):
+            for _ in range(QUEUE):
+                try:
+                    found.append((self.inn[socket], socket.recv_multipart(self._zmq.NOBLOCK)))
+                except self._zmq.Again:
+                    break
+        return found
+
+    def close(self) -> None:
+        if self._guard is not None:
+            self._guard.stop()
+        self.context.destroy(linger=0)
+
+
+def make_keys(folder: Path, name: str) -> Path:
+    """Make a pair of CURVE keys: NAME.key, which the others need, and NAME.key_secret, which nobody else may see."""
+    engine()
+    import zmq.auth
+
+    folder.mkdir(parents=True, exist_ok=True)
+    _, secret = zmq.auth.create_certificates(folder, name, metadata={"magnet": str(VERSION)})
+    Path(secret).chmod(0o600)
+    return Path(secret)

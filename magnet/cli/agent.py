@@ -1,0 +1,169 @@
+"""`magnet agent --name A --scene START ...`: one agent of a scene in a process of its own, together with others."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import string
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from magnet.agents.agent import Member
+    from magnet.agents.zeromq import Link
+    from magnet.motion.scene import Scene
+
+EPILOG = """\
+START is a scene of everybody, the same for all processes: a second is enough. Each process generates one agent of it
+(or plays a recording, --play) and hears the others by ZeroMQ. What is lost or late is unknown to the model, and filled
+in when it comes. docs/agents.md describes the message, for programs of other kinds. Addresses of other machines need
+keys: `--make_keys --keys FOLDER --name A` writes A.key, which the others need, and A.key_secret, which stays here.
+
+for example, in two terminals:
+  magnet agent --name A --scene start.npz --listen tcp://127.0.0.1:5601 --connect B=tcp://127.0.0.1:5602
+  magnet agent --name B --scene start.npz --listen tcp://127.0.0.1:5602 --connect A=tcp://127.0.0.1:5601
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    options = argparse.ArgumentParser(
+        "magnet agent",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = options.add_argument
+    add("--name", required=True, help="which agent this process is")
+    add("--scene", metavar="START", help="scene that it begins with, of everybody")
+    add("--names", metavar="A,B", help="all agents, in the order of the scene's slots (default: A, B, C ...)")
+    add("--listen", metavar="ADDRESS", help="where the others hear it, such as tcp://127.0.0.1:5601")
+    add("--connect", action="append", default=[], metavar="NAME=ADDRESS", help="where another is heard; repeated")
+    add("--task", choices=("agentic_sync", "agentic_async"), default="agentic_sync", help="in step, or in turns")
+    add("--model", default=None, metavar="NAME", help="shipped model or checkpoint")
+    add("--steps", type=int, default=4, help="denoising steps (default: %(default)s)")
+    add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
+    add("--seed", type=int, default=0, help="of the noise, the same for all (default: %(default)s)")
+    add("--play", metavar="FILE", help="play the motion in this file instead of generating any")
+    add("--person", type=int, default=0, help="who of that file (default: the first)")
+    add("--seconds", type=float, default=None, help="how long to take part (default: until interrupted)")
+    add("--pace", choices=("real", "others"), default="real", help="of the clock, or as soon as all have told")
+    add("--patience", type=float, default=5.0, help="seconds to wait for a token with --pace others")
+    add("--meet", type=float, default=30.0, help="seconds to wait for the others to come (default: %(default)s)")
+    add("--keys", type=Path, metavar="FOLDER", help="CURVE keys; without them only this machine is spoken to")
+    add("--make_keys", action="store_true", help="write this agent's keys into --keys, and stop")
+    add("--threads", type=int, default=1, help="threads of torch (default: %(default)s)")
+    add("--out", type=Path, metavar="NPZ", help="write the agent's own motion")
+    add("--report", type=Path, metavar="JSON", help="write counts: late tokens, gaps, refused messages")
+    return options
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: scenes, addresses or keys that cannot be used; says what to do.
+    """
+    given = parser().parse_args(list(arguments))
+    from magnet.agents import zeromq
+    from magnet.cli.errors import CommandError
+
+    if given.make_keys:
+        if given.keys is None:
+            raise CommandError("--make_keys writes into a folder: name it with --keys FOLDER")
+        print(f"written: {zeromq.make_keys(given.keys, given.name)}")
+        return 0
+    if given.scene is None or given.listen is None:
+        raise CommandError("--scene START and --listen ADDRESS say what to begin with and where the others hear it")
+    if given.threads < 1:
+        raise CommandError(f"--threads is {given.threads}, expected at least 1")
+    import torch
+
+    from magnet.api import read
+
+    torch.set_num_threads(given.threads)
+    start = read(given.scene).plain()
+    names = tuple(given.names.split(",")) if given.names else tuple(string.ascii_uppercase[: start.agents])
+    connect = peers(given.connect, names, given.name)
+    member = member_of(given, start, names)
+    link = zeromq.Link(given.name, given.listen, connect, given.keys)
+    try:
+        take_part(given, member, link, set(connect))
+    finally:
+        link.close()
+    return 0
+
+
+def peers(connect: Sequence[str], names: Sequence[str], me: str) -> dict[str, str]:
+    """Addresses by name.
+
+    Raises:
+        CommandError: not of the form NAME=ADDRESS, or nobody of the scene.
+    """
+    from magnet.cli.errors import CommandError
+
+    found = {}
+    for each in connect:
+        name, equals, address = each.partition("=")
+        if not equals or name not in names or name == me:
+            others = ", ".join(other for other in names if other != me)
+            raise CommandError(f"--connect {each}: expected NAME=ADDRESS, with a name of {others}")
+        found[name] = address
+    return found
+
+
+def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> Member:
+    """The agent, or the recording that stands for one."""
+    import torch
+
+    from magnet.agents.agent import Agent, Player
+    from magnet.api import read
+    from magnet.cli.errors import CommandError
+    from magnet.denoiser.module import Denoiser
+    from magnet.sampling.options import SamplerOptions
+    from magnet.tasks.agentic import AgenticAsync, AgenticSync
+
+    if given.play is not None:
+        recording = read(given.play).plain()
+        if not 0 <= given.person < recording.agents:
+            raise CommandError(f"--person {given.person}: {given.play} has people 0 to {recording.agents - 1}")
+        return Player(recording.permute_agents(torch.tensor([given.person])), start, names, given.name)
+    precision = {} if given.precision is None else {"precision": given.precision}
+    options = SamplerOptions(steps=given.steps, **precision)
+    task = AgenticSync() if given.task == "agentic_sync" else AgenticAsync()
+    return Agent(Denoiser.load(given.model), start, names, given.name, task, options, given.seed)
+
+
+def take_part(given: argparse.Namespace, member: Member, link: Link, others: set[str]) -> None:
+    """Run until it is over, and write what was asked for."""
+    from magnet.agents.agent import Agent, motion_of
+    from magnet.agents.gate import Gate
+    from magnet.agents.message import Message
+    from magnet.agents.run import PERIOD, Process
+    from magnet.motion.scene import cat_time
+
+    told: list[Message] = []
+    code, latent = (member.print, member.model.layout.latent) if isinstance(member, Agent) else ("", 0)
+    gate = Gate(member.names, given.name, code, latent)
+    process = Process(
+        member,
+        link,
+        gate,
+        others,
+        given.pace == "real",
+        given.patience,
+        given.meet,
+        kept=told.append if given.out else lambda _: None,
+    )
+    with contextlib.suppress(KeyboardInterrupt):
+        process.run(None if given.seconds is None else round(given.seconds / PERIOD))
+    report = process.report.told(member, gate, process.pace)
+    print(json.dumps(report))
+    if given.report is not None:
+        given.report.parent.mkdir(parents=True, exist_ok=True)
+        given.report.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    if given.out is not None and told:
+        print(f"written: {cat_time([motion_of(each.poses, each.betas) for each in told]).save(given.out)}")

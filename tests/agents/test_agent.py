@@ -1,0 +1,164 @@
+"""Agents that hear each other: as in one process while nothing is lost, and going on when something is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+import torch
+
+from magnet.agents.agent import Agent, Player, motion_of, poses_of
+from magnet.agents.gate import Gate
+from magnet.agents.lossy import Lossy
+from magnet.agents.message import pack
+from magnet.generation.rollout import generate
+from magnet.motion.scene import Scene, cat_time
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
+from magnet.testing import random_scene, tiny_denoiser
+
+NAMES = ("A", "B", "C")
+REFERENCE = SamplerOptions(steps=3, precision="reference", any_floor=True)
+TASKS = {"in step": AgenticSync(), "in turns": AgenticAsync(order=(1, 0, 2))}
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    return tiny_denoiser(max_agents=4, window=8)
+
+
+@pytest.fixture(scope="module")
+def start() -> Scene:
+    return random_scene(1, 24, 3, torch.Generator().manual_seed(5))
+
+
+def group(denoiser, start: Scene, task, options=REFERENCE) -> list[Agent]:
+    return [Agent(denoiser, start, NAMES, name, task, options, seed=1) for name in NAMES]
+
+
+def together(members: Sequence, tokens: int, link: Lossy, order=(1, 0, 2)) -> list[list[Scene]]:
+    """What each makes, all at one pace. Messages pass as bytes, by the gates."""
+    gates = [Gate(NAMES, name, members[0].print, 16, 1e9, 1e9) for name in NAMES]
+    made: list[list[Scene]] = [[] for _ in members]
+    for turn in range(tokens):
+        for slot in order:
+            for parts in link.due(slot, turn):
+                message = gates[slot].take(parts, turn)
+                assert message is not None
+                members[slot].hear(message)
+            told = members[slot].step()
+            made[slot].append(motion_of(told.poses, told.betas))
+            for other in range(len(members)):
+                if other != slot:
+                    link.send(other, pack(told), turn)
+    return made
+
+
+@pytest.mark.parametrize("kind", TASKS)
+def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(denoiser, start, kind):
+    task, frames = TASKS[kind], 4 * 12
+    whole = generate(denoiser, start, task, 24, frames, 1, REFERENCE, torch.Generator().manual_seed(1)).slice(24)
+    agents = group(denoiser, start, task)
+    made = together(agents, 12, Lossy(delay=int(kind == "in step")))
+    for slot, agent in enumerate(agents):
+        told = poses_of(whole.permute_agents(torch.tensor([slot])))
+        assert (poses_of(cat_time(made[slot])) - told).max() < 1e-6
+        assert torch.equal(
+            torch.stack([torch.from_numpy(agent.pieces[slot][n].poses) for n in range(12)]).flatten(0, 1),
+            torch.from_numpy(told),
+        )
+        assert agent.gaps == 0
+
+
+def test_what_is_missing_is_unknown_and_is_filled_in_when_it_comes(denoiser, start):
+    """Half of what is told is lost, the rest comes late and in another order: the motion goes on, and is another."""
+    link = Lossy(loss=0.5, delay=1, jitter=3, generator=torch.Generator().manual_seed(0))
+    agents = group(denoiser, start, AgenticSync())
+    made = [cat_time(each) for each in together(agents, 14, link)]
+    sure = [cat_time(each) for each in together(group(denoiser, start, AgenticSync()), 3, Lossy(delay=1))]
+    for slot, agent in enumerate(agents):
+        assert made[slot].T_world_root.isfinite().all() and made[slot].frames == 56
+        assert agent.gaps > 10 and agent.filled > 2
+        assert torch.equal(made[slot].T_world_root[:, :4], sure[slot].T_world_root[:, :4])
+        assert not torch.equal(made[slot].T_world_root[:, 8:12], sure[slot].T_world_root[:, 8:])
+    late = Lossy(delay=1, jitter=2, generator=torch.Generator().manual_seed(0))
+    agents = group(denoiser, start, AgenticSync())
+    together(agents, 10, late)
+    rollout = agents[0].rollout
+    placed = rollout.world.placed[: rollout.row - rollout.first - 3, :3]
+    assert placed.all() and agents[0].filled > 0  # all that was late has been filled in
+
+
+def test_a_token_in_parts_is_unknown_until_it_is_whole(denoiser, start):
+    agents = group(denoiser, start, AgenticSync())
+    told = agents[1].step()
+    for first, last in ((0, 2), (3, 4)):
+        part = type(told)("frames", "B", "B", 0, first, 0.0, told.betas, told.poses[first:last])
+        agents[0].hear(part)
+    agents[0].step()
+    assert not agents[0].come(1, 0) and agents[0].awaited() == [1, 2]
+    agents[0].hear(type(told)("frames", "B", "B", 0, 2, 0.0, told.betas, told.poses[2:3]))
+    assert agents[0].awaited() == [2] and torch.equal(
+        torch.from_numpy(agents[0].pieces[1][0].poses), torch.from_numpy(told.poses)
+    )
+
+
+def test_poses_alone_are_understood_and_a_recording_can_take_part(denoiser, start):
+    """Of somebody without the model, a headset say, nothing but poses comes; the others answer them."""
+    recording = random_scene(1, 32, 1, torch.Generator().manual_seed(9))
+    made = []
+    for shift in (0.0, 2.0):
+        moved = recording.T_world_root.clone()
+        moved[..., 0, 3] += shift
+        members = [
+            *group(denoiser, start, AgenticSync())[:2],
+            Player(recording.replace(T_world_root=moved), start, NAMES, "C"),
+        ]
+        played = together(members, 8, Lossy(delay=1), order=(0, 1, 2))
+        assert (cat_time(played[2]).T_world_root - moved).abs().max() < 1e-5
+        made.append(cat_time(played[0]).T_world_root)
+        assert members[0].gaps == 0
+        assert members[2].step() is None
+    assert torch.equal(made[0][:, :4], made[1][:, :4]) and not torch.equal(made[0][:, 4:], made[1][:, 4:])
+
+
+def test_who_falls_silent_is_gone_and_who_comes_back_goes_on_where_it_was(denoiser, start):
+    """The process of C ends after six tokens; a new one is told by the others how things are."""
+    agents: list = group(denoiser, start, AgenticSync())
+    together(agents, 6, Lossy(delay=1))
+    last = torch.from_numpy(agents[0].pieces[2][4].poses[-1, :3])
+    for _ in range(10):  # A and B alone
+        told = [agent.step() for agent in agents[:2]]
+        agents[0].hear(told[1])
+        agents[1].hear(told[0])
+    assert agents[0].rollout.world.given.present[0, :3].tolist() == [True, True, False]
+    back = Agent(denoiser, start, NAMES, "C", AgenticSync(), REFERENCE, seed=1)
+    for agent in agents[:2]:
+        for message in agent.history(2):
+            back.hear(message)
+    back.join()
+    assert back.next == 16 and back.awaited() == []
+    assert (back.rollout.scene.T_world_root[0, 0, 2, :3, 3] - last).norm() < 1e-5
+    first = back.step()
+    assert (torch.from_numpy(first.poses[0, :3]) - last).norm() < 1.0
+    for agent in agents[:2]:
+        agent.hear(first)
+        agent.step()
+        agent.step()
+        assert agent.rollout.world.given.present[0, 2]
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow(denoiser, start):
+    agents = group(denoiser, start, AgenticSync())
+    together(agents, 6, Lossy(delay=1))
+    for _ in range(200):
+        agents[0].step()
+    assert agents[0].rollout.tokens.shape[1] <= 160 and max(map(len, agents[0].pieces)) <= 100
+
+
+def test_what_cannot_be_is_named(denoiser, start):
+    with pytest.raises(ValueError, match="a name for each slot"):
+        Agent(denoiser, start, ("A", "B"), "A", AgenticSync())
+    with pytest.raises(ValueError, match="turns with offset 1"):
+        Agent(denoiser, start, NAMES, "A", AgenticAsync(offset=0.5))

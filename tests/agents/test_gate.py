@@ -1,0 +1,141 @@
+"""What is let in from the network, and what is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import random
+
+import numpy as np
+import pytest
+
+from magnet.agents.gate import Gate
+from magnet.agents.message import POSE, Message, pack, sealed, unpack
+
+LATENT = 16
+
+
+def gate(**options) -> Gate:
+    return Gate(("A", "B"), "A", "feed", LATENT, **{"rate": 1e9, "burst": 1e9, **options})
+
+
+def message(frame: int = 8, count: int = 4, token: bool = True) -> Message:
+    poses = np.zeros((count, POSE), np.float32)
+    poses[:, 1] = 0.9
+    poses[:, 6::4] = 1.0  # w
+    canonical = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1)).ravel()
+    told = np.concatenate([np.linspace(-1, 1, LATENT).astype(np.float32), canonical]) if token else None
+    return Message("frames", "B", "B", 7, frame, 1.5, poses=poses, model="feed" if token else "", token=told)
+
+
+def test_a_message_comes_back_as_it_was():
+    for sent in (message(), message(9, 2, token=False), Message("hello", "B", "B", 1, -1, 0.0, heard=("A",))):
+        back = unpack(pack(sent))
+        for field in dataclasses.fields(Message):
+            ours, theirs = getattr(sent, field.name), getattr(back, field.name)
+            assert np.array_equal(ours, theirs) if isinstance(ours, np.ndarray) else ours == theirs
+        assert gate().take(pack(sent), 0.0) is not None
+
+
+def changed(**fields) -> list[bytes]:
+    """A message with other values in its header, and the checksum of those."""
+    parts = pack(message())
+    return sealed([parts[0], json.dumps(json.loads(parts[1]) | fields).encode(), *parts[2:4]])
+
+
+def posed(column: int, value: float) -> list[bytes]:
+    sent = message()
+    sent.poses[1, column] = value
+    return pack(sent)
+
+
+def told(number: int, value: float) -> list[bytes]:
+    sent = message()
+    assert sent.token is not None
+    sent.token[number] = value
+    return pack(sent)
+
+
+WRONG = {
+    "version": [changed(v=2), changed(v="1")],
+    "header": [
+        changed(extra=1), changed(frame="8"), changed(frame=8.5), changed(frame=True), changed(frame=-2),
+        changed(count=5), changed(session=-1), changed(betas=[0] * 9), changed(betas=[None] * 10), changed(clock="now"),
+        changed(heard="A"), changed(heard=[1]), changed(sender=3), changed(model="f" * 65), changed(clock=10**400),
+        sealed([b"magnet/B", b"[" * 2000, b"", b""]), sealed([b"magnet/B", b"\xff{}", b"", b""]),
+        changed(betas=[float("nan")] * 10), sealed([b"magnet/B", b"7", b"", b""]),
+    ],
+    "kind": [changed(kind="order"), changed(kind="hello"), changed(count=0), changed(kind=["frames"])],
+    "topic": [changed(sender="A"), changed(sender="")],
+    "shape": [changed(count=3), changed(model=""), sealed([*pack(message())[:3], b"\0" * 256])],
+    "agent": [changed(agent="C")],
+    "frame": [changed(frame=9), changed(frame=2**39), changed(frame=-1)],
+    "range": [
+        posed(0, np.nan), posed(2, 1e30), posed(1, 11), posed(9, np.inf), changed(betas=[11] + 9 * [0]),
+        told(0, np.nan), told(0, 101), told(LATENT + 3, 1.5), told(LATENT + 63, np.inf),
+    ],
+    "speed": [posed(0, 1.2)],
+    "rotation": [posed(6, 0.9), posed(6, -1e30), told(LATENT, 1.1), told(LATENT + 7, 0.2), told(LATENT + 12, 1e-3)],
+    "size": [[], pack(message())[:4], [*pack(message()), b""], sealed([b"magnet/B", b"{}", b"\0" * 70000, b""])],
+    "checksum": [[*pack(message())[:4], b"\0\0\0\0"]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", WRONG)
+def test_each_thing_that_can_be_wrong_is_refused_by_name(reason):
+    for parts in WRONG[reason]:
+        ours = gate()
+        ours.now = 8
+        assert ours.take(parts, 0.0) is None
+        assert dict(ours.refused) == {reason: 1}, parts[1:2]
+
+
+def test_of_ten_thousand_broken_messages_none_is_taken_and_none_harms():
+    """Bits turned, bytes lost, parts cut, exchanged or made up; and numbers of any kind behind a right checksum."""
+    draw, ours = random.Random(0), gate()
+    ours.now = 8
+    wrong = [parts for group in WRONG.values() for parts in group]
+    whole = pack(message())
+    for number in range(10_000):
+        kind, parts = number % 5, list(draw.choice([whole, *wrong]))
+        place = draw.randrange(len(parts)) if parts else 0
+        part = bytearray(parts[place]) if parts else bytearray()
+        if kind == 0:
+            part = part or bytearray(b"?")
+            for _ in range(draw.randint(1, 4)):
+                part[draw.randrange(len(part))] ^= 1 << draw.randrange(8)
+        elif kind == 1:
+            part = part[: draw.randrange(len(part))] if len(part) else bytearray(b"?")
+        elif kind == 2:
+            part[draw.randint(0, len(part)) :] = draw.randbytes(draw.randint(1, 64))
+        elif kind == 3:
+            parts = [draw.randbytes(draw.randint(0, 300)) for _ in range(draw.randint(0, 7))]
+        else:  # by somebody who knows how to seal a message
+            body = [whole[0], whole[1], bytes(np.frombuffer(draw.randbytes(4 * 4 * POSE), "<f4").tobytes()), whole[3]]
+            if draw.random() < 0.5:
+                body[1] = bytes(draw.choice(b'"{}[]:,0-9eE.') if draw.random() < 0.05 else byte for byte in whole[1])
+                body[2] = draw.randbytes(draw.randrange(2000))
+            parts = sealed(body)
+        if kind < 3 and parts:
+            parts[place] = bytes(part)
+        if parts == whole:
+            continue
+        assert ours.take(parts, number / 100) is None, parts
+    assert ours.taken == 0 and sum(ours.refused.values()) > 9_900
+
+
+def test_who_sends_too_fast_for_somebody_else_or_from_an_ended_process_is_not_heard():
+    ours = gate(rate=10, burst=5)
+    taken = [ours.take(pack(message()), 0.001 * number) is not None for number in range(100)]
+    assert sum(taken) == 5 and ours.take(pack(message()), 1.0) is not None
+    assert gate().take(pack(message()), 0.0, peer="B") and not gate().take(pack(message()), 0.0, peer="C")
+    ours = gate()
+    assert ours.take(pack(dataclasses.replace(message(), session=9)), 0.0)
+    assert not ours.take(pack(message()), 0.1) and ours.refused["session"] == 1
+    mine = gate().take(sealed([b"magnet/A", pack(message())[1].replace(b'"B"', b'"A"'), *pack(message())[2:4]]), 0.0)
+    assert mine is None
+
+
+def test_a_token_of_another_model_does_not_matter_and_the_poses_are_taken():
+    sent = dataclasses.replace(message(), model="other", token=np.full(9999, np.nan, np.float32))
+    assert gate().take(pack(sent), 0.0) is not None

@@ -1,0 +1,167 @@
+"""Agents in real processes, by ZeroMQ."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from magnet.agents.agent import poses_of
+from magnet.agents.message import unpack
+from magnet.agents.zeromq import Link, make_keys
+from magnet.denoiser.module import Denoiser
+from magnet.generation.rollout import generate
+from magnet.motion.scene import Scene
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
+from magnet.testing import random_scene, tiny_denoiser
+from tests.denoiser.test_module import save
+
+DOCS = Path(__file__).parents[2] / "docs" / "agents.md"
+
+
+def ports(count: int) -> list[int]:
+    """Free ports of this machine."""
+    sockets = [socket.socket() for _ in range(count)]
+    for each in sockets:
+        each.bind(("127.0.0.1", 0))
+    found = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
+        each.close()
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A small model and a start scene."""
+    folder = tmp_path_factory.mktemp("agents")
+    save(tiny_denoiser(max_agents=4, window=8), folder / "model.ckpt")
+    random_scene(1, 24, 4, torch.Generator().manual_seed(5)).save(folder / "four.npz")
+    random_scene(1, 24, 2, torch.Generator().manual_seed(5)).save(folder / "two.npz")
+    return folder
+
+
+def started(folder: Path, people: int, name: str, addresses: dict[str, str], *more: str) -> subprocess.Popen:
+    scene = {2: "two.npz", 4: "four.npz"}[people]
+    words = [sys.executable, "-m", "magnet", "agent", "--name", name, "--scene", scene, "--listen", addresses[name]]
+    for other in sorted(set(addresses) - {name}):
+        words += ["--connect", f"{other}={addresses[other]}"]
+    words += ["--model", "model.ckpt", "--steps", "2", "--out", f"{name}.npz", "--report", f"{name}.json", *more]
+    return subprocess.Popen(words, cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def addresses_of(names: str) -> dict[str, str]:
+    return {name: f"tcp://127.0.0.1:{port}" for name, port in zip(names, ports(len(names)), strict=True)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["agentic_sync", "agentic_async"])
+def test_two_processes_make_what_one_makes_bit_for_bit(folder, task):
+    addresses = addresses_of("AB")
+    exact = ("--task", task, "--pace", "others", "--precision", "reference", "--seconds", "2", "--patience", "60")
+    both = [started(folder, 2, name, addresses, *exact, "--meet", "120") for name in "AB"]
+    assert [each.wait(300) for each in both] == [0, 0]
+    start = Scene.load(folder / "two.npz")
+    plan, options = (
+        AgenticSync() if task == "agentic_sync" else AgenticAsync(),
+        SamplerOptions(2, precision="reference"),
+    )
+    model = Denoiser.load(folder / "model.ckpt")
+    whole = generate(model, start, plan, 24, 60, 1, options, torch.Generator().manual_seed(0)).slice(24)
+    for slot, name in enumerate("AB"):
+        told = poses_of(whole.permute_agents(torch.tensor([slot])))
+        made = poses_of(Scene.load(folder / f"{name}.npz"))
+        assert (torch.from_numpy(made) - torch.from_numpy(told)).abs().max() < 1e-6
+        assert json.loads((folder / f"{name}.json").read_text())["gaps"] == 0
+
+
+@pytest.mark.slow
+def test_three_go_on_when_one_is_killed_and_it_comes_back(folder):
+    addresses = addresses_of("ABCD")
+    meet = ("--meet", "120")
+    group = {name: started(folder, 4, name, addresses, *meet, "--seconds", "900") for name in "ABCD"}
+    link = Link("watcher", f"tcp://127.0.0.1:{ports(1)[0]}", addresses)
+    seen: dict[str, int] = {}
+
+    def watch(until, seconds: float = 300) -> None:
+        end = time.monotonic() + seconds
+        while not until() and time.monotonic() < end:
+            for peer, parts in link.receive(0.2):
+                message = unpack(parts)
+                if message.kind == "frames" and message.agent == peer:
+                    seen[peer] = message.frame
+        assert until(), seen
+
+    watch(lambda: all(seen.get(name, 0) > 40 for name in "ABCD"))
+    os.kill(group["D"].pid, signal.SIGKILL)
+    group["D"].wait()
+    at = dict(seen)
+    watch(lambda: all(seen[name] > at[name] + 40 for name in "ABC"))
+    group["D"] = started(folder, 4, "D", addresses, *meet, "--seconds", "4")
+    watch(lambda: seen["D"] > at["D"] + 40)
+    assert group["D"].wait(120) == 0
+    for name in "ABC":
+        group[name].send_signal(signal.SIGINT)
+    assert [group[name].wait(120) for name in "ABC"] == [0, 0, 0]
+    link.close()
+    back = json.loads((folder / "D.json").read_text())
+    assert back["joined"] * 4 >= at["D"] and back["tokens"] == 30 and back["refused"] == {}
+
+
+@pytest.mark.slow
+def test_the_client_in_the_docs_is_heard_and_hears(folder):
+    """As it stands there, in a process of its own, without this package."""
+    block = next(part.split("```")[0] for part in DOCS.read_text().split("```python\n")[1:] if "OTHERS" in part)
+    assert "magnet." not in block and len(block.strip().splitlines()) <= 66
+    (folder / "client.py").write_text(block)
+    addresses = addresses_of("AB")
+    agent = started(folder, 2, "A", addresses, "--seconds", "3", "--meet", "6")
+    client = subprocess.Popen(
+        [sys.executable, "client.py", "B", addresses["B"], addresses["A"]],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert agent.wait(180) == 0
+    client.kill()
+    heard = client.communicate()[0].splitlines()
+    report = json.loads((folder / "A.json").read_text())
+    assert report["taken"] > 3 and report["refused"] == {} and report["tokens"] == 22
+    assert len(heard) > 3 and heard[-1].startswith("A ")
+
+
+def test_without_keys_only_this_machine_is_spoken_to():
+    with pytest.raises(ValueError, match="not an address of this machine"):
+        Link("A", "tcp://0.0.0.0:5601", {})
+    with pytest.raises(ValueError, match="not an address of this machine"):
+        Link("A", "tcp://127.0.0.1:5601", {"B": "tcp://192.168.0.2:5602"})
+
+
+def test_with_keys_members_hear_each_other_and_strangers_hear_nothing(tmp_path):
+    for name in "AB":
+        make_keys(tmp_path / "ours", name)
+    make_keys(tmp_path / "theirs", "B")
+    (tmp_path / "theirs" / "A.key").write_text((tmp_path / "ours" / "A.key").read_text())
+    addresses = addresses_of("ABX")
+    one = Link("A", addresses["A"], {"B": addresses["B"]}, tmp_path / "ours")
+    two = Link("B", addresses["B"], {"A": addresses["A"]}, tmp_path / "ours")
+    stranger = Link("B", addresses["X"], {"A": addresses["A"]}, tmp_path / "theirs")
+    plain = Link("C", f"tcp://127.0.0.1:{ports(1)[0]}", {"A": addresses["A"]})
+    end, heard = time.monotonic() + 10, []
+    while not heard and time.monotonic() < end:
+        one.send([b"magnet/A", b"hello"])
+        heard = two.receive(0.05)
+    assert heard and heard[0] == ("A", [b"magnet/A", b"hello"])
+    for _ in range(3):
+        one.send([b"magnet/A", b"hello"])
+    assert stranger.receive(0.2) == [] and plain.receive(0.1) == []
+    for link in (one, two, stranger, plain):
+        link.close()
