@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
@@ -36,6 +37,7 @@ def imports(module: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
                 yield from whole & known.keys() or {base}
 
 
+@functools.cache
 def arrows(package: Path) -> dict[str, set[str]]:
     """Which modules each module imports."""
     known = modules(package)

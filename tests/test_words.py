@@ -45,6 +45,18 @@ def test_every_page_that_the_code_names_is_in_the_repository():
     assert not missing, missing
 
 
+def test_every_dotted_name_that_a_docstring_gives_is_there():
+    lost = []
+    for path in SOURCES:
+        for name in re.findall(r"`(magnet(?:\.\w+)+)`", path.read_text()):
+            place, last = ROOT.joinpath(*name.split(".")[:-1]), name.rpartition(".")[2]
+            modules = (place / f"{last}.py", place / last / "__init__.py")
+            inside = [file.read_text() for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()]
+            if not any(map(Path.is_file, modules)) and not any(re.search(rf"\b{last}\b", text) for text in inside):
+                lost.append(f"{path.relative_to(ROOT)}: {name}")
+    assert not lost, lost
+
+
 def glossary() -> list[tuple[str, str]]:
     """(word, what it is called in the code) of every row of the glossary's tables of three columns."""
     rows = re.findall(r"(?m)^\| ([^|]+) \| ([^|]+) \| [^|]+ \|$", GLOSSARY.partition("## Words of earlier")[0])

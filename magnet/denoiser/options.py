@@ -147,7 +147,7 @@ class SelfForcing:
 
     Args:
         share: of the training scenes with a past, how many show it as the model would have made it.
-        placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.frames.place`.
+        placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.placement.place`.
         pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
         displaced: share of the training scenes in which people stand a little off at first and come back, as those must
             who have drifted while they were generated; see `displaced_at_first`.

@@ -18,6 +18,7 @@ from magnet.datamodules.embody3d import Embody3D, Embody3DReader
 from magnet.datamodules.fakes.embody3d import write
 from magnet.datamodules.preparing.check import recognise
 from magnet.datamodules.reading.recording import DataError, Take
+from tests.cases import some_slow
 from tests.datamodules.readers import Foreign, cut, refused
 
 
@@ -107,7 +108,7 @@ def test_sessions_stay_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("having", [(3, 3), (4, 5), (9, 6), (22, 22)], ids=str)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", some_slow(range(3), 1, 2))
 def test_a_list_like_the_official_one_leaves_no_number_of_people_out_of_a_split(
     tmp_path: Path, having: tuple[int, int], seed: int
 ) -> None:
