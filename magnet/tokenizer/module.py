@@ -252,7 +252,10 @@ class Tokenizer(L.LightningModule):
             self.init_codebook(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
     def on_train_batch_start(self, batch: Scene, batch_idx: int) -> None:
-        if self.quantizer.waits and self.global_step >= self.hparams["quantizer"]["continuous_steps"]:
+        if not self.quantizer.waits:
+            return
+        wished, half = self.hparams["quantizer"]["continuous_steps"], self.trainer.estimated_stepping_batches / 2
+        if self.global_step >= min(wished, half):  # a training of few steps ends with codes as well
             self.quantizer.waits = False
             batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
             self.init_codebook([batch] if batches is None else batches())

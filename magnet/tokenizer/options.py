@@ -46,7 +46,7 @@ class QuantizerOptions:
         num_quantizers: codebooks in a row, each coding what is left over (ours); the paper has 1.
         ema_decay: of the moving averages that the codes follow.
         dead_code_threshold: codes chosen less often than this a batch start anew.
-        continuous_steps: training steps before there are codes (ours).
+        continuous_steps: training steps before there are codes, half of all at most (ours).
         levels: of `fsq`, so many values each number of a code can have. The default makes 64,000 codes (Mentzer et al.
             2023, Finite scalar quantization: VQ-VAE made simple, Table 1).
     """
