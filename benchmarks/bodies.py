@@ -41,6 +41,7 @@ def ways(options: SamplerOptions, which: list[str]) -> dict[str, SamplerOptions]
         "guidance firm": replace(options, body_guidance="firm"),
         "settle light": replace(options, settle="light"),
         "settle firm": replace(options, settle="firm"),
+        "settle blocks": replace(options, settle="firm", settle_blocks=True),
         "both light": replace(options, body_guidance="light", settle="light"),
         "both firm": replace(options, body_guidance="firm", settle="firm"),
     }
@@ -81,7 +82,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2)
     parser.add_argument("--frames", type=int, default=96)
     parser.add_argument("--steps", type=int, default=8)
-    parser.add_argument("--ways", nargs="+", default=["off", "guidance firm", "both firm"])
+    parser.add_argument("--ways", nargs="+", default=["off", "settle firm", "both firm"])
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -95,7 +95,8 @@ def settling(
 
     Arguments as for `repaired` and `correction`.
     """
-    toward = kept_apart(body.joints(scene), scene.present, fixed, DEEP[how], begun, scene.fps)
+    held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
+    toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[how], begun, scene.fps)
     wishes = Wishes.of(scene, body, how, slides, begun=begun)
     first, second = torch.triu_indices(scene.agents, scene.agents, 1)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)

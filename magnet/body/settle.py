@@ -281,11 +281,15 @@ def correct_window(
     if not bool(free.any()):
         return offset
     capsules = fit_capsules(body, scene.betas)
-    if past is None and begun:
+    ramp = begun and past is None
+    if ramp:
         past = offset.new_zeros(B, LEAD, P, DOFS)
     smooth = Smoothness(settle, free, past, offset)
     if toward is not None and bool(toward.any()):
-        offset = smooth.start = smooth.toward(torch.where(free[..., None], toward, 0.0))
+        smooth.start = smooth.toward(torch.where(free[..., None], toward, 0.0))
+    if past is not None:
+        offset = torch.where(free[..., None], past[:, -1:], offset)
+    offset = offset + smooth.start
     rest = body.rest_joints(scene.betas[:, None])
     for _ in range(settle.iterations):
         now = corrected(scene, offset)
@@ -294,7 +298,7 @@ def correct_window(
         rows = all_rows(seen, capsules, wishes, free)
         if not len(rows.node):
             break
-        if begun:
+        if ramp:
             grown = ((rows.node // P % T + 1) / RAMP).clamp(max=1.0)
             rows = replace(rows, root_weight=rows.root_weight * grown)
         first = jacobian(seen, rows.node, rows.bone, rows.point, rows.along) * rows.root_weight[:, None]

@@ -14,7 +14,7 @@ from magnet.body.fitted_capsules import FittedCapsules
 from magnet.body.joints import FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
 
-WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 10.0, "floor": 30.0, "float": 60.0}
+WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
 """Cost of a squared metre of each kind of row."""
 
 REACH = 1.6
@@ -171,7 +171,7 @@ def stand_rows(seen: Seen, wishes: Wishes) -> Rows:
 
 
 def height_rows(seen: Seen, wishes: Wishes) -> Rows:
-    """Toes that stand stay as high as they stood."""
+    """Low toes stay as high as they were."""
     b, t, p, i = wishes.heights.isfinite().nonzero(as_tuple=True)
     toes = torch.tensor(TOES, device=b.device)[i]
     point = seen.by_frame[b, t, p, toes]

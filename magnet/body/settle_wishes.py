@@ -34,7 +34,7 @@ class Wishes:
         present: (B, P) bool, who is there.
         clearance: (B, P, 4) height of the feet's joints over the sole, metres.
         stands: (B, T - 1, P, 2) bool, toes that are to stand still in that step.
-        heights: (B, T, P, 2) metres that standing toes are to be over y = 0, NaN where they do not stand.
+        heights: (B, T, P, 2) metres that low toes are to be over y = 0, NaN where they are not low.
         floats: (B, T, P) bool, people whose lower foot is to come down to the floor.
         held: (B, T, Q, 2, 2) bool, hands of each pair of people, in the order of `combinations`, that hold.
         between: (B, T, Q, 2, 2, 3) from the second's hands to the first's, as they are to be.
@@ -80,7 +80,7 @@ class Wishes:
         joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
         held, between = holds(joints, scene.present)
         stands = standing(joints, above, scene.fps, slides) & there[..., None]
-        on = F.pad(stands, (0, 0, 0, 0, 0, 1)) | F.pad(stands, (0, 0, 0, 0, 1, 0))
+        on = low_toes(joints, above) & there[..., None]
         toes = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
         heights = torch.where(on, toes, torch.nan)
         return cls(CONTACT[how], scene.present, above, stands, heights, floats, held, between, still, scene.fps)
@@ -131,11 +131,15 @@ def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) 
 
     joints (B, T, P, 22, 3), above (B, P, 4) clearance of the feet's joints
     """
-    toes = joints[..., TOES, :]
-    lowest = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
-    low = toes[..., 1] - lowest < LOW
-    speed = toes[..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
+    low = low_toes(joints, above)
+    speed = joints[..., TOES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
     return low[:, 1:] & low[:, :-1] & (speed < slides)
+
+
+def low_toes(joints: Tensor, above: Tensor) -> Tensor:
+    """Toes that are on the floor, or in it with the rest of the foot. As for `standing` -> (B, T, P, 2) bool"""
+    lowest = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
+    return joints[..., TOES, 1] - lowest < LOW
 
 
 def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> Tensor:

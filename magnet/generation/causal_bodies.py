@@ -10,8 +10,7 @@ from torch import Tensor
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
-from magnet.generation.settling import LEAD as LEAD_ROWS
-from magnet.generation.settling import corrected_in_views
+from magnet.generation.settling import settled_on
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -34,6 +33,8 @@ class World(Protocol):
     placed: Tensor
     T_world_can: Tensor
     finalized: int
+    correction: Tensor | None
+    uncorrected: Scene | None
     there: Tensor
     released: int
     decoder: Carried
@@ -115,15 +116,14 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
 
 def _settled(world: World, made: Scene, stop: int) -> Scene:
     """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before."""
-    lead = min(LEAD_ROWS, world.finalized)
-    whole = slice((world.finalized - lead) * TOKEN_FRAMES, world.finalized * TOKEN_FRAMES)
-    past = world.given.slice(whole.start, whole.stop).replace(valid=None, given=None)
-    scene = cat_time([past, made.replace(valid=None, given=None)]) if lead else made
-    new = world.by_frame(world.placed[world.finalized - lead : stop] & ~world.known[world.finalized - lead : stop])
-    new[: lead * TOKEN_FRAMES] = False
-    unseen = world.known[world.finalized : stop].any(dim=0).to(new.device)
-    scene = corrected_in_views(scene, new, unseen, world.options.settle, lead * TOKEN_FRAMES, True)
-    return scene.slice(lead * TOKEN_FRAMES).replace(valid=made.valid, given=made.given)
+    first = world.finalized * TOKEN_FRAMES
+    rows = slice(world.finalized, stop)
+    new = world.by_frame(world.placed[rows] & ~world.known[rows])
+    before = world.given.slice(first - 1, first) if first else None
+    world.uncorrected = made.slice(made.frames - LEAD)
+    unseen = world.known[rows].any(dim=0).to(new.device)
+    made, world.correction = settled_on(made, before, new, unseen, world.options.settle, world.correction)
+    return made
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
@@ -155,6 +155,8 @@ def decode_bodies(
     shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
     features = decoded_frames(world, latent, deltas, shown, low, near - low)
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
+    if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
+        given = cat_time([world.uncorrected, given.slice(lead)])
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])

@@ -9,17 +9,20 @@ from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.body.repair import repaired, settling
-from magnet.body.settle import Settle, corrected
+from magnet.body.settle import DOFS, Settle, corrected
 from magnet.generation.separation import Decode
 from magnet.motion.frames import posed
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 
 LEAD = 2
 """Token steps of the past that a block is corrected with; they stay."""
 
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
-"""How a block is corrected while sampling: it is short, so its corrections are stiff; the end sees to the rest."""
+"""How a block is corrected before the model goes on from it: stiffly, since it is short; the end sees to the rest."""
+
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
+"""How a causal plan's next frames are corrected: what is held over fades soon where nothing asks for it."""
 
 WORTH = 0.02
 """Metres that some joint must be moved for a person's block to be corrected: encoding it again costs about as much."""
@@ -119,5 +122,37 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) ->
     body = open_body_on(scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
     offset = settling(shaped, body, how, fixed, begun=past is not None, past=past)
+    made = corrected(shaped, offset)
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]
+
+
+def settled_on(
+    scene: Scene, before: Scene | None, new: Tensor, unseen: Tensor, how: str, past: Tensor | None
+) -> tuple[Scene, Tensor]:
+    """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
+
+    Args:
+        scene: (B, T, P) bodies, uncorrected.
+        before: the frame before, as shown; None: there is none, and nobody else is there yet.
+        new: (T, P) bool, who may be moved.
+        unseen: (P,) bool, of whom nobody knows more than `before`.
+        how: `light` or `firm`.
+        past: what the last call returned.
+
+    Returns:
+        The scene, and the corrections of its last two frames.
+    """
+    body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
+    shaped = scene.replace(body=body.id, valid=None, given=None)
+    offset, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
+    for who in [agents == agent for agent in agents[moving]]:
+        hidden = unseen | (moving & ~who)
+        if before is None:
+            seen = shaped.replace(present=shaped.present & ~hidden)
+        else:
+            still = before.replace(body=body.id, valid=None, given=None)
+            seen = frozen(cat_time([still, shaped]), hidden, 0).slice(1)
+        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, slides=0.0)
+        offset[:, :, who] = one[:, :, who]
     made = corrected(shaped, offset)
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]

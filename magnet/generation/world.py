@@ -73,7 +73,8 @@ class WorldState:
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
-        self.correction: Tensor | None = None  # of the last two frames of the last chunk, see `settled_chunk`
+        self.correction: Tensor | None = None  # of the last two frames shown, see `settled_chunk`
+        self.uncorrected: Scene | None = None  # those frames of a causal plan without it
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
         self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
 
@@ -116,7 +117,7 @@ class WorldState:
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
-        if self.options.settle == "firm":
+        if self.options.settle_blocks and self.options.settle != "off":
             latent = self._settle(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
@@ -171,17 +172,16 @@ class WorldState:
         low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
         new, known = new.to(latent.device), self.known[low:stop].to(latent.device)
-        given, T_world_can = self.given.slice(frames.start, frames.stop), self.T_world_can[:, frames]
-        unseen = (self.known[first] & self.causal).to(latent.device)
-        plain, made = settled_block(
-            self.model.tokenizer.decode, latent, self.placed_deltas(low, stop), T_world_can, given, new, known, unseen,
-            self.options.settle, lead, decentralized,
-        )  # fmt: skip
+        T_world_can, unseen = self.T_world_can[:, frames], (self.known[first] & self.causal).to(latent.device)
+        rest = self.given.slice(frames.start, frames.stop), new, known, unseen, self.options.settle, lead, decentralized
+        deltas = self.placed_deltas(low, stop)
+        plain, made = settled_block(self.model.tokenizer.decode, latent, deltas, T_world_can, *rest)
         moved = (made.T_world_root != plain.T_world_root).flatten(3).any(-1)
         moves = new & moved.unflatten(1, (-1, TOKEN_FRAMES)).any(2)
         frame = moves.repeat_interleave(TOKEN_FRAMES, dim=1)[..., None, None]
         self.T_world_can[:, frames] = torch.where(frame, canonical_frame(made.T_world_root), T_world_can)
-        return torch.where(moves[..., None], self.model.encode(made), latent)[:, lead:]
+        changed = self.model.encode(made) - self.model.encode(plain)  # what encoding itself loses stays as it was
+        return torch.where(moves[..., None], latent + changed, latent)[:, lead:]
 
     def placed_deltas(self, first: int, stop: int) -> Tensor:
         """Deltas of some tokens as placed in the world; the identity after unplaced rows. -> (B, n, P, 4, 9)"""

@@ -52,8 +52,9 @@ class SamplerOptions:
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
             (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
         settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
-            themselves, hands held, feet still and on the floor. `light`: of the finished scene, people may lean on each
-            other; `firm`: of each finished block too, so that the model goes on from there, which shakes more.
+            themselves, hands held, feet still and on the floor. `light` lets people lean on each other, `firm` leaves
+            them touch.
+        settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
@@ -82,6 +83,7 @@ class SamplerOptions:
     apart: Separation = "off"
     body_guidance: Separation = "off"
     settle: Separation = "off"
+    settle_blocks: bool = False
     requantize: bool | None = None
     keep_given: bool = True
     blend: int = 10

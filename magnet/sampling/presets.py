@@ -37,6 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "apart": "off",  # the paper moves nobody out of another
         "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose
+        "settle_blocks": False,
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four; `paper`

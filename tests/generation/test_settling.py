@@ -23,7 +23,7 @@ from magnet.testing import random_scene, tiny_denoiser
 from magnet.testing.poses import pose_law
 from tests.cases import some_slow
 
-BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="firm")
+BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="firm", settle_blocks=True)
 GRID = Grid(12, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
 
 
@@ -59,7 +59,7 @@ CAUSAL = [name for name in registry.names() if registry.get(name)().schedule(GRI
 @pytest.mark.parametrize("what", ["body_guidance", "settle"])
 @pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
 def test_no_pose_depends_on_what_is_not_known_when_it_is_shown(name, what) -> None:
-    assert pose_law(registry.get(name)(), GRID, SamplerOptions(**{what: "firm"}))
+    assert pose_law(registry.get(name)(), GRID, SamplerOptions(**{what: "firm"}, settle_blocks=True))
 
 
 @pytest.mark.parametrize("name", some_slow(["partner_inpainting", "joint_future"], "partner_inpainting"))
