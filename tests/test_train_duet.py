@@ -91,7 +91,7 @@ def beginnings(folder: Path, frames: int = 300) -> Path:
 def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    small = ["--", "--data.batch_size=4", "--data.epoch_size=8"]
+    small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "decoder=1", *small])
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "decoder=1", *small])
     said = capfd.readouterr().out

@@ -156,6 +156,7 @@ def test_a_mistake_is_answered_by_what_would_be_right(
     assert message in complaint(capsys, *arguments)
 
 
+@pytest.mark.slow
 def test_show_imports_no_lightning() -> None:
     code = (
         "import sys; from magnet.cli import main; main(['tasks', 'show', 'joint_future']); "

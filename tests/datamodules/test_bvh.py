@@ -157,6 +157,7 @@ def test_an_axis_that_the_user_says_is_held_against_the_motion(tmp_path: Path) -
     assert error and "declared up axis is +y, but people stand along +z" in error
 
 
+@pytest.mark.slow
 def test_proportions_that_are_nobodys_are_refused_unless_they_are_asked_for(tmp_path: Path) -> None:
     root = written(tmp_path / "dl", walk=walk(48))
     for path in root.glob("*.bvh"):  # hands at the end of arms thrice as long
