@@ -18,10 +18,13 @@ from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
+from magnet.generation.crowd import MOST, generate_crowd
+from magnet.generation.crowd_start import SPACING, START, start_crowd
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 
@@ -54,20 +57,9 @@ def load(
     >>> scene.agents, scene.frames, scene.joints().shape[-2:]
     (3, 60, torch.Size([22, 3]))
     """
-    place = _device(device)
+    place = device_of(device)
     options = SamplerOptions.preset(sampler, **({} if steps is None else {"steps": steps}))
     return Model(Denoiser.load(name_or_path).to(place), options)
-
-
-def _device(device: str | torch.device) -> torch.device:
-    try:
-        place = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise ValueError(f"device: got {device!r}, expected cpu, cuda, cuda:0 or mps") from error
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not there.get(place.type, True):
-        raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
-    return place
 
 
 def read(
@@ -234,15 +226,24 @@ class Model:
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
-        """A scene from nothing, of people of average shape.
+        """A scene from nothing, of people of average shape; a crowd, of more than `most_people`, begins as couples.
 
         Raises:
-            ValueError: more people than the model has room for.
+            ValueError: more than 200 people, or too few frames for a crowd.
         """
-        require_whole("people", people, 1, self.most_people)
+        require_whole("people", people, 1, MOST)
+        said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
+        if people > self.most_people:
+            return self.predict(self.start_crowd(people, seed=seed), context=START, frames=frames - START, **said)
         empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
-        return self.predict(scene, "generation", context=0, frames=frames, seed=seed, samples=samples, cond=cond)
+        return self.predict(scene, "generation", context=0, frames=frames, **said)
+
+    def start_crowd(
+        self, people: int, groups: Sequence[Scene] = (), spacing: float = SPACING, *, seed: int | None = None
+    ) -> Motion:
+        """How a crowd begins, see `magnet.generation.crowd_start.start_crowd`: for `predict` to go on from."""
+        return Motion.of(start_crowd(self.denoiser, people, self.sampler, self._generator(seed), groups, spacing))
 
     def continue_(
         self,
@@ -354,8 +355,6 @@ class Model:
         kind = registry.get(task)
         require_rate(scene)
         slots = scene.agents
-        if slots > self.most_people:
-            raise ValueError(f"the scene has {slots} agents, the model takes 1 to {self.most_people}")
         require_whole("context", context, 0)
         require_whole("samples", samples, 1)
         if frames is not None:
@@ -372,7 +371,8 @@ class Model:
         generator = self._generator(seed)
         plain = scene.plain() if isinstance(scene, Motion) else scene
         how = (context, frames, samples, self.sampler, generator)
-        sampled = generate(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
+        sample = generate if slots <= self.most_people else generate_crowd
+        sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
         return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Self
 
+import torch
 from torch import Tensor, nn
 
 
@@ -39,3 +40,19 @@ def require_float32_scenes(precision: str | int | None) -> None:
 def dtype_of(network: nn.Module) -> Any:
     """The type of a network's weights, in which it takes its input."""
     return next(network.parameters()).dtype
+
+
+def device_of(device: str | torch.device) -> torch.device:
+    """A device by its name.
+
+    Raises:
+        ValueError: no such device, or none of that kind here.
+    """
+    try:
+        place = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"device: got {device!r}, expected cpu, cuda, cuda:0 or mps") from error
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not there.get(place.type, True):
+        raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
+    return place

@@ -22,6 +22,18 @@ FARTHEST = 0.6
 HALVINGS = 7
 """Of `FARTHEST`, until the distance is known to half a centimetre."""
 
+FEW = 8
+"""People up to whom pairs are gone through one after the other, each seeing what the ones before have moved."""
+
+CROWD_ROUNDS, PAIRS = 4, 64
+"""How often all pairs of a crowd are moved at once, and how many are looked at together, to bound memory."""
+
+CROWD_SPEED = 1.0
+"""Metres a second at which people of a crowd make way: strangers walk into each other faster than partners do."""
+
+REACH = 2.2
+"""Metres between two pelvises beyond which no trunk, head or leg is in anybody's arm."""
+
 BRIEF = 75
 """Frames of an encounter, its approach and its end included, up to which it is one of people who pass each other."""
 
@@ -162,6 +174,9 @@ def kept_apart(
     free = present[:, None].expand(B, T, P).clone()
     if fixed is not None:
         free &= ~fixed.to(joints.device)
+    if P > FEW:
+        each = [_crowd_apart(*one, keep, begun, fps) for one in zip(joints, present, free, strict=True)]
+        return torch.stack(each)
     for _ in range(keep.rounds if P > 2 else 1):
         moved = joints + lifted(offsets)[..., None, :]
         for i, j in combinations(range(P), 2):
@@ -182,6 +197,46 @@ def kept_apart(
             offsets[:, :, i] += torch.where(free[:, :, i, None], push, 0.0)
             offsets[:, :, j] -= torch.where(free[:, :, j, None], push, 0.0)
     return offsets
+
+
+def _crowd_apart(joints: Tensor, present: Tensor, free: Tensor, keep: Apart, begun: bool, fps: float) -> Tensor:
+    """`kept_apart` of one scene of many people: pairs who are near, all at once, in `CROWD_ROUNDS`.
+
+    joints (T, P, 22, 3), present (P,), free (T, P) bool -> (T, P, 2)
+    """
+    T = len(joints)
+    offsets = joints.new_zeros(*joints.shape[:2], 2)
+    ramp = max(keep.speed, CROWD_SPEED) / fps * torch.arange(1, T + 1, device=joints.device, dtype=joints.dtype)
+    for _ in range(CROWD_ROUNDS):
+        moved = (joints + lifted(offsets)[..., None, :]).transpose(0, 1)  # (P, T, 22, 3)
+        i, j = near_pairs(moved, present)
+        parts = [excess_depth(moved[a], moved[b], keep) for a, b in zip(i.split(PAIRS), j.split(PAIRS), strict=True)]
+        inside = torch.cat(parts) > 0 if parts else joints.new_zeros(0, T, dtype=torch.bool)
+        meet = inside.any(dim=1)
+        i, j, inside = i[meet], j[meet], inside[meet]
+        if not len(i):
+            break
+        one, other = moved[i], moved[j]
+        away = direction(one, other, widened(inside, 2 * keep.ease))
+        needed = distance_needed(one.flatten(0, 1), other.flatten(0, 1), away.flatten(0, 1), keep).view(len(i), T)
+        may = free.T[i], free.T[j]
+        movable = may[0].int() + may[1].int()
+        needed = eased(torch.where(movable > 0, needed, 0.0), keep.ease)
+        push = (needed / movable.clamp_min(1))[..., None] * away
+        for who, way, sign in ((i, may[0], 1.0), (j, may[1], -1.0)):
+            offsets = offsets.index_add(1, who, torch.where(way[..., None], sign * push, 0.0).transpose(0, 1))
+        if begun:
+            length = offsets.norm(dim=-1, keepdim=True)
+            offsets = offsets * (torch.minimum(length, ramp[:, None, None]) / length.clamp_min(1e-9))
+    return offsets
+
+
+def near_pairs(moved: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """People whose bodies could touch in some frame, by their pelvises. moved (P, T, 22, 3) -> (E,) int x 2"""
+    ground = moved[:, :, PELVIS, [0, 2]].transpose(0, 1)  # (T, P, 2)
+    near = (torch.cdist(ground, ground) < REACH).any(dim=0) & present[:, None] & present
+    i, j = near.triu(1).nonzero(as_tuple=True)
+    return i, j
 
 
 def lifted(ground: Tensor) -> Tensor:

@@ -38,6 +38,7 @@ for example:
   magnet predict A.bvh B.bvh --task inbetweening --task.every 16 --out out.bvh
   magnet predict scene.npz --task motion_control --task.target [1] --context 60 --seed 7 --out out.npz out.mp4
   magnet predict --people 2 --frames 300 --out duet.glb                  from nothing
+  magnet predict --people 50 --out crowd.html            a crowd of couples; A.bvh B.bvh --people 50: of these two
 
 tasks and their options: magnet tasks;  --sampler.FIELD: magnet predict --help sampler
 without files, people or this help's name, magnet predict samples a data set: magnet predict --help
@@ -59,7 +60,10 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
     what.add_argument("--task.FIELD", metavar="VALUE", help="an option of the task")
     what.add_argument(
-        "--people", type=int, metavar="P", help="how many in all; those without a file are made from nothing"
+        "--people", type=int, metavar="P", help="how many in all, up to 200; those without a file are made from nothing"
+    )
+    what.add_argument(
+        "--spacing", type=float, default=3.0, metavar="M", help="metres between the groups of a crowd (default: 3)"
     )
     what.add_argument(
         "--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)"
@@ -74,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
     how = options.add_argument_group("how")
     how.add_argument("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
     how.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
-    how.add_argument("--sampler", metavar="PRESET", default="default", help="default, steady or paper")
+    how.add_argument("--sampler", metavar="PRESET", help="default, steady (that of crowds) or paper")
     how.add_argument("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
     films = options.add_argument_group("films")
     films.add_argument("--style", choices=("body", "light", "capsules", "skeleton"), default="body", help="of people")
@@ -102,9 +106,11 @@ def main(arguments: Sequence[str]) -> int:
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     outs = [scene_files.path_to_write(out) for out in options.out]
-    scene, body, added = read_people(options)
+    model = load_model(options, sampler_of(options.sampler or "default", groups["sampler"]))
+    if options.sampler is None and (options.people or 0) > model.most_people:
+        model = dataclasses.replace(model, sampler=sampler_of("steady", groups["sampler"]))
+    scene, body, added = read_people(options, model)
     task = task_of(options, groups["task"], added)
-    model = load_model(options, sampler_of(options.sampler, groups["sampler"]))
     context, frames = lengths(options, task, scene, added, model)
     began = time.perf_counter()
     made = model.predict(
@@ -143,8 +149,10 @@ def split_groups(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[s
     return groups, others
 
 
-def read_people(options: argparse.Namespace) -> tuple[Scene, Any, tuple[int, ...]]:
+def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, tuple[int, ...]]:
     """The scene of all files with room for those who are made from nothing. -> scene, body, slots of these
+
+    A crowd is composed of the files' people, again and again, or of couples that the model makes.
 
     Raises:
         CommandError: no files and no people, or fewer people than files hold.
@@ -167,6 +175,10 @@ def read_people(options: argparse.Namespace) -> tuple[Scene, Any, tuple[int, ...
     people = scene.agents if options.people is None else options.people
     if people < max(scene.agents, 1):
         raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
+    if people > max(model.most_people, scene.agents):
+        options.context = options.context or CONTEXT
+        groups = [scene.slice(0, options.context)] if options.inputs else []
+        return model.start_crowd(people, groups, options.spacing, seed=options.seed), body, ()
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)
     present = scene.present.clone()
@@ -182,7 +194,7 @@ def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...
     """
     from magnet.cli.tasks import parse_task, task_class
 
-    name = options.task or ("joint_future" if options.inputs else "generation")
+    name = options.task or ("joint_future" if options.inputs or options.context else "generation")
     fields = {each.name for each in dataclasses.fields(task_class(name))}
     below = [{"target": list(added)}] if added and "target" in fields else []
     return parse_task(name, flags, below, "predict")
@@ -241,9 +253,10 @@ def lengths(
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
 
-    nothing = bool(added) or not options.inputs
+    crowd = scene.agents > model.most_people
+    nothing = bool(added) or not (options.inputs or crowd)
     context = options.context if options.context is not None else 0 if nothing else CONTEXT
-    recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs else 0
+    recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
     if context > recorded:
         raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
     rest = options.frames or (recorded - context) or FUTURE

@@ -175,7 +175,7 @@ def known_tokens(
         deltas[:, low:stop, agents] = own
     frames = slice(wanted * TOKEN_FRAMES, end * TOKEN_FRAMES)
     T_world_can = T_world_can if related is None else canonical_frame(related.T_world_root)
-    pairs = pairwise_by_token(to_9d(pairwise(T_world_can[:, frames])))
+    pairs = pairwise_by_token(to_9d(pairwise(T_world_can[:, frames], model.layout.partners(like.device))))
     return model.normalizer.normalize(model.layout.pack(latent[:, rows], deltas[:, rows], pairs))
 
 

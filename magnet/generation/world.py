@@ -21,7 +21,6 @@ from magnet.motion.frames import (
     from_9d,
     inverse,
     pairwise,
-    partners,
     posed,
     project_se2,
     to_9d,
@@ -124,14 +123,15 @@ class WorldState:
             earlier = layout.unpack(normalizer.denormalize(tokens[:, begin:first]))[0]
             latent = torch.cat([earlier, latent], dim=1)
         true_deltas = self.placed_deltas(begin, stop)
-        implied = pairwise_by_token(to_9d(pairwise(self.T_world_can[:, begin * TOKEN_FRAMES : stop * TOKEN_FRAMES])))
+        here, partner = self.T_world_can[:, begin * TOKEN_FRAMES : stop * TOKEN_FRAMES], layout.partners(tokens.device)
+        implied = pairwise_by_token(to_9d(pairwise(here, partner)))
         settled = layout.pack(latent, true_deltas, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
         if layout.slots:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
             if decentralized:
                 new = finished[first:stop].to(tokens.device)
-                together &= ~(new[:, :, None] & new[:, partners(layout.agents, tokens.device)])
+                together &= ~(new[:, :, None] & new[:, partner])
             self.stats.add_pairwise_drift(pairs, implied[:, first - begin :], together)
         changed = layout.spread(changed_groups)
         tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
@@ -214,15 +214,14 @@ class WorldState:
         own = self.placed[first:stop, :, None]
         if not self.model.layout.slots:
             return own.clone()
-        partner = partners(own.shape[1])
-        return torch.cat([own, own & self.placed[first:stop][:, partner]], dim=-1)
+        return torch.cat([own, own & self.placed[first:stop][:, self.model.layout.partners()]], dim=-1)
 
     def _touched(self, moved: Tensor) -> Tensor:
         """Groups of tokens that concern an agent that moved. moved (n, P) -> (n, P, 1 + slots) bool"""
         own = moved[..., None]
         if not self.model.layout.slots:
             return own
-        return torch.cat([own, own | moved[:, partners(moved.shape[1])]], dim=-1)
+        return torch.cat([own, own | moved[:, self.model.layout.partners()]], dim=-1)
 
     def _place_all(
         self,
@@ -265,6 +264,7 @@ class WorldState:
             present=there,
             fixed=known,
             anchor=first_of(there),
+            partner=self.model.layout.partners(deltas.device),
         )
         frames = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])

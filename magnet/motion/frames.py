@@ -133,15 +133,18 @@ def _partners(agents: int, device: torch.device | None) -> Tensor:
         return slot + (slot >= torch.arange(agents, device=device)[:, None])
 
 
-def pairwise(T_world_can: Tensor) -> Tensor:
+def pairwise(T_world_can: Tensor, partner: Tensor | None = None) -> Tensor:
     """T_self_partner of every agent and partner slot. (..., P, 4, 4) -> (..., P, P - 1, 4, 4)
+
+    partner (P, K) int: whom each slot points at, by default as `partners` has it.
 
     >>> yaws, ground = torch.tensor([0.0, torch.pi]), torch.tensor([[0.0, 0.0], [0.0, 2.0]])
     >>> T_self_partner = pairwise(from_planar(yaws, ground))  # two people face each other, 2 m apart
     >>> T_self_partner[:, 0, 2, 3]  # so each has the other 2 m in front
     tensor([2., 2.])
     """
-    T_world_partner = T_world_can[..., partners(T_world_can.shape[-3], T_world_can.device), :, :]
+    partner = partners(T_world_can.shape[-3], T_world_can.device) if partner is None else partner
+    T_world_partner = T_world_can[..., partner, :, :]
     return inverse(T_world_can)[..., None, :, :] @ T_world_partner
 
 

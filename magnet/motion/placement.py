@@ -31,7 +31,8 @@ class Predicted:
     Attributes:
         delta_yaw, delta_ground: (B, T, P) radians and (B, T, P, 2) metres, from the frame before.
         start_yaw, start_ground: (B, P), (B, P, 2) where everybody was before the first frame.
-        T_self_partner: (B, T, P, P - 1, 4, 4).
+        T_self_partner: (B, T, P, K, 4, 4), of K partner slots.
+        partner: (P, K) int, whom each slot points at; one's own number: at nobody.
         present: (B, P) bool.
         fixed: (P,) bool, agents whose deltas are known.
         anchor: (B,) int, an agent of each scene whom others may be placed by.
@@ -43,6 +44,7 @@ class Predicted:
     start_yaw: Tensor
     start_ground: Tensor
     T_self_partner: Tensor | None
+    partner: Tensor
     present: Tensor
     fixed: Tensor
     anchor: Tensor
@@ -58,6 +60,7 @@ def place(
     present: Tensor | None = None,
     fixed: Tensor | None = None,
     anchor: Tensor | None = None,
+    partner: Tensor | None = None,
 ) -> Tensor:
     """World canonical frames of a predicted stretch of motion.
 
@@ -73,6 +76,8 @@ def place(
         present: (B, P) bool; pairs with absent agents are not read. None: all are there.
         fixed: (P,) bool, `fuse` only: agents whose deltas are known and must not be compromised. None: nobody.
         anchor: (B,) int, `anchor` only: the agent of each scene that the others are placed by. None: agent 0.
+        partner: (P, K) int, whom the K partner slots of each agent point at (its own number: at nobody), where that is
+            not everybody else: then `T_self_partner` has K slots, and `anchor` is no choice.
 
     Returns:
         T_world_can (B, T, P, 4, 4), in the dtype of `deltas`; computed in float64 so that thousands of
@@ -84,6 +89,7 @@ def place(
         *to_planar(deltas.double()),
         *to_planar(T_world_start.double()),
         None if T_self_partner is None else T_self_partner.double(),
+        partners(P, device) if partner is None else partner,
         torch.ones(B, P, dtype=torch.bool, device=device) if present is None else present,
         torch.zeros(P, dtype=torch.bool, device=device) if fixed is None else fixed.to(device),
         torch.zeros(B, dtype=torch.long, device=device) if anchor is None else anchor.to(device),
@@ -108,7 +114,7 @@ def anchored(predicted: Predicted) -> Tensor:
     scene = torch.arange(len(anchor), device=anchor.device)
     T_anchor_others = project_se2(predicted.T_self_partner[scene, :, anchor])
     T_world_others = T_world_can[scene, :, anchor][:, :, None] @ T_anchor_others  # (B, T, P - 1, 4, 4)
-    others = partners(T_world_can.shape[2], anchor.device)[anchor]
+    others = predicted.partner[anchor]
     T_world_can[scene[:, None], :, others] = T_world_others.transpose(1, 2)
     return T_world_can
 
@@ -124,16 +130,19 @@ def fuse(predicted: Predicted) -> Tensor:
     pair_yaw, pair_ground = to_planar(predicted.T_self_partner)
     present, start_yaw = predicted.present, predicted.start_yaw
     own = torch.where(predicted.fixed, FIXED, torch.ones_like(start_yaw[0]))
-    partner = partners(present.shape[1], present.device)
-    together = predicted.pairwise_weight * (present[:, :, None] & present[:, None]).to(start_yaw)
-    together.diagonal(dim1=1, dim2=2).zero_()
-    laplacian = 2 * (torch.diag_embed(together.sum(-1)) - together)
+    partner = predicted.partner
+    somebody = partner != torch.arange(len(partner), device=partner.device)[:, None]
+    each = predicted.pairwise_weight * (present[:, :, None] & present[:, partner] & somebody).to(start_yaw)
+    together = (
+        torch.zeros_like(each[:, :, :1]).expand(-1, -1, len(partner)).scatter_add(2, partner.expand(each.shape), each)
+    )
+    laplacian = torch.diag_embed(together.sum(-1) + together.sum(-2)) - (together + together.mT)
     solve = torch.linalg.inv(torch.diag(own.to(start_yaw)) + laplacian)[:, None]
     keep = torch.eye(len(own), dtype=solve.dtype, device=solve.device) - solve @ laplacian[:, None]
-    weight = together.gather(2, partner.expand(len(present), -1, -1))[:, None, ..., None]  # (B, 1, P, P - 1, 1)
+    weight = each[:, None, ..., None]  # (B, 1, P, K, 1)
 
     def pulled(pairs: Tensor) -> Tensor:
-        """What pairs (B, T, P, P - 1, C) add to each agent: those that point at it, less its own. -> (B, T, P, C)"""
+        """What pairs (B, T, P, K, C) add to each agent: those that point at it, less its own. -> (B, T, P, C)"""
         weighted = weight * pairs
         return solve @ (-weighted.sum(dim=3)).index_add(2, partner.flatten(), weighted.flatten(2, 3))
 

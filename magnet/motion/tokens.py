@@ -46,7 +46,11 @@ class TokenLayout:
 
     def groups(self, device: torch.device | None = None) -> Tensor:
         """Group of each number of a token. (D,) int"""
-        return _groups(self, device)
+        return _groups(self.latent, self.slots, device)
+
+    def partners(self, device: torch.device | None = None) -> Tensor:
+        """Which agent each partner slot of an agent points at. (P, slots) int; its own number: at nobody"""
+        return partners(self.agents, device)
 
     def group_levels(self, levels: Tensor) -> Tensor:
         """Noise level of each group: pairwise ones are as noisy as their noisier end. (..., P) -> (..., P, 1 + slots)
@@ -59,14 +63,14 @@ class TokenLayout:
             return own
         if self.pairwise_noise == "token":
             return own.expand(*levels.shape, 1 + self.slots)
-        return torch.cat([own, torch.maximum(own, levels[..., partners(self.agents, levels.device)])], dim=-1)
+        return torch.cat([own, torch.maximum(own, levels[..., self.partners(levels.device)])], dim=-1)
 
     def group_present(self, present: Tensor) -> Tensor:
         """Whether each group concerns people who are present. (B, P) -> (B, P, 1 + slots) bool"""
         own = present[..., None]
         if not self.slots:
             return own
-        return torch.cat([own, own & present[..., partners(self.agents, present.device)]], dim=-1)
+        return torch.cat([own, own & present[..., self.partners(present.device)]], dim=-1)
 
     def spread(self, grouped: Tensor) -> Tensor:
         """Expand one value for each group to one for each number of a token. (..., 1 + slots) -> (..., D)"""
@@ -87,9 +91,9 @@ class TokenLayout:
 
 
 @functools.cache
-def _groups(layout: TokenLayout, device: torch.device | None) -> Tensor:
+def _groups(latent: int, slots: int, device: torch.device | None) -> Tensor:
     with torch.inference_mode(False):  # or training, later, could not use it
-        sizes = [layout.latent + 9 * TOKEN_FRAMES] + [9 * TOKEN_FRAMES] * layout.slots
+        sizes = [latent + 9 * TOKEN_FRAMES] + [9 * TOKEN_FRAMES] * slots
         each = [torch.full((size,), group, device=device) for group, size in enumerate(sizes)]
         return torch.cat(each)
 

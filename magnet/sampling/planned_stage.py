@@ -15,7 +15,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, half_log_snr
@@ -247,7 +246,7 @@ def views_to_read(hidden: Tensor, view_of: Tensor, layout: TokenLayout) -> Tenso
     own = view_of.expand(W, P)[..., None]
     if not layout.slots:
         return own
-    partner = partners(P, hidden.device)  # (P, slots)
+    partner = layout.partners(hidden.device)  # (P, slots)
     unseen = hidden.transpose(0, 1)  # (W, P viewer, P viewed)
     agent = torch.arange(P, device=hidden.device)[:, None]
     blind = unseen[:, agent, partner] & ~unseen[:, partner, agent]  # who sees one is not seen

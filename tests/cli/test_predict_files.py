@@ -76,6 +76,14 @@ def test_the_seed_decides_and_several_kinds_are_written(duet, tmp_path, capsys) 
     assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
 
 
+def test_a_crowd_is_composed_of_the_people_of_files(duet, tmp_path, capsys) -> None:
+    words = ("--people", "7", "--context", "16", "--frames", "4", "--out", str(tmp_path / "crowd.npz"), *QUICK)
+    said(capsys, *duet["ours"], *words)
+    made, recorded = Scene.load(tmp_path / "crowd.npz"), Scene.load(duet["ours"][0])
+    assert (made.frames, made.present.tolist()) == (20, [[True] * 7])
+    assert torch.equal(made.body_rot[:, :16, [2, 3]], recorded.body_rot[:, :16])
+
+
 def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
     said(capsys, "--people", "3", "--frames", "8", "--out", str(tmp_path / "trio.npz"), *QUICK)
     assert Scene.load(tmp_path / "trio.npz").present.tolist() == [[True] * 3]

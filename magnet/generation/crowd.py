@@ -1,0 +1,330 @@
+"""Scenes of more people than a model has slots: each is sampled in a view of the nearest partners.
+
+Tokens, noise, places and bodies are everybody's; only the network sees small groups. In each denoising step everybody
+is read from the own view, and one solve places all, so that people who share several views agree on where they are.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from magnet.generation.rollout import CHUNK, Rollout
+from magnet.generation.stats import SamplingStats
+from magnet.motion.frames import from_9d, inverse, project_se2, to_9d, to_planar
+from magnet.motion.neighbours import CrowdLayout, CrowdViews, nearest_partners
+from magnet.motion.placement import place
+from magnet.motion.scene import Scene, cat_time, concatenate
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token
+from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
+from magnet.sampling.options import SamplerOptions
+from magnet.sampling.schedule import Stage, initial_levels
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+    from magnet.tasks.base import Task
+
+BATCH = 32
+"""Views that run through the network at a time, to bound memory."""
+
+BOND = 1.2
+"""Metres between two people, on average over the context, up to which they stay partners wherever they go."""
+
+MOST = 200
+"""People of a crowd: more were not tried."""
+
+MOST_HIDING = 16
+"""People up to whom a task may hide agents from each other: everybody's view of everybody is their square."""
+
+PAIR = 9 * TOKEN_FRAMES
+
+
+def generate_crowd(
+    model: Denoiser,
+    scene: Scene,
+    task: Task,
+    context: int,
+    frames: int,
+    samples: int = 1,
+    options: SamplerOptions | None = None,
+    generator: torch.Generator | None = None,
+    progress: Callable[[int], None] | None = None,
+    stats: SamplingStats | None = None,
+    cond: Tensor | None = None,
+) -> Scene:
+    """Sample a task for any number of people; arguments and result as of `magnet.generation.rollout.generate`.
+
+    Scenes and samples are made one after the other, and people are always kept apart (`firm`, unless `options` say
+    `light`). Of as many people as the model has slots for, or fewer, a single
+    scene is what `generate` makes, bit for bit.
+
+    Raises:
+        ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
+    """
+    made = []
+    for number in range(scene.scenes * samples):
+        which = [number // samples]
+        more = (options, generator, progress, stats, CHUNK, None if cond is None else cond[which])
+        rollout = CrowdRollout(model, scene.select(which), task, context, frames, *more)
+        made.append(cat_time(list(rollout.chunks())))
+    return concatenate(made)
+
+
+class CrowdRollout(Rollout):
+    """A rollout of one scene whose network sees views of it.
+
+    Where a token has no slot for two people of a view, how they stand is worked out from what the view's ego expects
+    of both. `views` are those of now.
+    """
+
+    def __init__(
+        self,
+        model: Denoiser,
+        scene: Scene,
+        task: Task,
+        context: int,
+        frames: int | None,
+        options: SamplerOptions | None = None,
+        generator: torch.Generator | None = None,
+        progress: Callable[[int], None] | None = None,
+        stats: SamplingStats | None = None,
+        chunk: int = CHUNK,
+        cond: Tensor | None = None,
+    ) -> None:
+        self.crowd = scene.agents > model.layout.agents
+        if self.crowd:
+            options = options or SamplerOptions()
+            _refuse(model, scene, context, options)
+            options = replace(options, apart="firm") if options.apart == "off" else options
+        self.viewer, self.model = model, copy.copy(model)  # the same weights with tokens of another layout
+        self.model.denoise = self._denoise_in_views  # type: ignore[method-assign, assignment]
+        self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with
+        people = scene.pad_agents(max(scene.agents, model.layout.agents))
+        self._look_around(people, context)
+        super().__init__(self.model, scene, task, context, frames, 1, options, generator, progress, stats, chunk, cond)
+        if self.crowd and not bool((self.known[context // TOKEN_FRAMES - 1] | ~self.scene.present[0].cpu()).all()):
+            raise ValueError(
+                "in a crowd everybody's start must be known, because partners are chosen by place; partner_inpainting "
+                "knows it with own_past"
+            )
+
+    def _look_around(self, scene: Scene, context: int) -> None:
+        """Choose everybody's first partners."""
+        P, slots = scene.agents, self.viewer.layout.agents
+        person = torch.arange(P, device=self.viewer.device)
+        self._present = scene.present[0].to(self.viewer.device)
+        if self.crowd:
+            stood = scene.slice(0, context).T_world_root[0][..., [0, 2], 3].to(self.viewer.device)  # (T, P, 2)
+            away = (stood[:, :, None] - stood[:, None]).norm(dim=-1).mean(dim=0)
+            both = self._present[:, None] & self._present & (person[:, None] != person)
+            self._bonds = (away < BOND) & both
+            nobody = person[:, None].repeat(1, slots - 1)
+            table = nearest_partners(stood[-1], self._present, nobody, self._bonds)
+        else:
+            table = self.viewer.layout.partners(self.viewer.device)
+        self._point(table)
+
+    def _point(self, table: Tensor) -> None:
+        """Point tokens at these partners."""
+        self.model.layout = CrowdLayout.of(self.viewer.layout, table)
+        self.views = CrowdViews.of(table, self._present, self.viewer.layout.agents)
+
+    # -- partners change ---------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def _run(self, stage: Stage) -> None:
+        if self.crowd:
+            if stage.visibility is not None and len(self._present) > MOST_HIDING:
+                raise ValueError(
+                    f"this task hides people from each other, which takes the square of their number: got "
+                    f"{len(self._present)} people, expected at most {MOST_HIDING}; joint_future and motion_control "
+                    "take hundreds"
+                )
+            with torch.autocast(self._autocast[0], enabled=False):
+                self._bring_in(stage.stop + 1)
+                self._choose_partners(stage)
+        super()._run(stage)
+
+    def _choose_partners(self, stage: Stage) -> None:
+        """Change partners by where everybody stood last, and the slots of tokens that are not final with them."""
+        begins = stage.active[0] - self.first
+        row = torch.arange(begins)[:, None]
+        last = torch.where(self.world.placed[:begins], row, -1).amax(dim=0).clamp_min(0).to(self.viewer.device)
+        person = torch.arange(len(last), device=last.device)
+        T_world_now = self.world.T_world_can[0, last * TOKEN_FRAMES + TOKEN_FRAMES - 1, person]
+        before = self.model.layout.partners(last.device)
+        table = nearest_partners(to_planar(T_world_now)[1], self._present, before, self._bonds)
+        who, slot = (table != before).nonzero(as_tuple=True)
+        if not len(who):
+            return
+        self._point(table)
+        meets = table[who, slot]
+        keep = meets != who
+        if bool(keep.any()):
+            self.meet(stage, T_world_now, who[keep], slot[keep], meets[keep])
+
+    def meet(self, stage: Stage, T_world_now: Tensor, who: Tensor, slot: Tensor, meets: Tensor) -> None:
+        """Write new partners into tokens from the window on: as placed, or as expected with noise of their level.
+
+        T_world_now (P, 4, 4) where everybody was last; who, slot, meets (C,) int: a person, the slot, the new partner.
+        """
+        start, active = stage.start - self.first, stage.active[0] - self.first
+        levels = initial_levels(self._known(stage.start, self.stop))
+        levels[: len(stage.levels[0])] = stage.levels[0]
+        levels = levels.to(who.device)
+        level = torch.maximum(levels[:, who], levels[:, meets])  # (n, C)
+        numbers = self.viewer.layout.latent + PAIR * (1 + slot[:, None]) + torch.arange(PAIR, device=slot.device)
+        T_world_can = self._expected(stage, T_world_now, start, active)
+        T_self_partner = inverse(T_world_can[:, who]) @ T_world_can[:, meets]  # (4 n, C, 4, 4)
+        pairs = by_token(to_9d(T_self_partner)[None])[0].flatten(-2)
+        mean, std = self._pair_statistics()
+        clean = (pairs - mean) / std
+        at = (slice(start, None), who[:, None], numbers)
+        noisy = add_noise(clean, self.mask_noise[0][at], level[..., None])
+        self.tokens[0][at] = torch.where(level[..., None] == 0, clean, noisy)
+        if self.history is not None:
+            self.history.clean[0][at] = clean
+            self.history.levels[at] = -1  # nothing has been predicted of this partner
+        guess = self._guessed(stage.start, len(clean))
+        guess[:, who[:, None], numbers] = clean
+        self._guess, self._guess_at = guess, stage.start
+
+    def _expected(self, stage: Stage, T_world_now: Tensor, start: int, active: int) -> Tensor:
+        """Where people stand from the window on: as placed, else by the deltas predicted last. -> (4 n, P, 4, 4)"""
+        T_world_can = self.world.T_world_can[0, start * TOKEN_FRAMES :].clone()
+        guess = self._guessed(stage.active[0], self.tokens.shape[1] - active)
+        _, deltas, _ = self.viewer.layout.unpack(self.viewer.normalizer.denormalize(guess))
+        placed = self.world.by_frame(self.world.placed[active:])
+        ahead = place(project_se2(from_9d(by_frame(deltas[None]))), None, T_world_now[None])[0]
+        new = slice((active - start) * TOKEN_FRAMES, None)
+        T_world_can[new] = torch.where(placed[..., None, None], T_world_can[new], ahead)
+        return T_world_can
+
+    def _guessed(self, first: int, rows: int) -> Tensor:
+        """What was predicted last of some token steps; 0 where nothing was. -> (n, P, D)"""
+        guess = self.tokens.new_zeros(rows, *self.tokens.shape[2:])
+        low, high = max(first, self._guess_at), min(first + rows, self._guess_at + len(self._guess))
+        if high > low:
+            guess[low - first : high - first] = self._guess[low - self._guess_at : high - self._guess_at]
+        return guess
+
+    def _pair_statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of a pairwise transform's numbers, the same for all slots. (36,) each"""
+        numbers = slice(self.viewer.layout.latent + PAIR, self.viewer.layout.latent + 2 * PAIR)
+        return self.viewer.normalizer.mean[numbers], self.viewer.normalizer.std[numbers]
+
+    # -- the network sees views --------------------------------------------------------------------
+
+    def _ask_for(self, stage: Stage) -> None:
+        super()._ask_for(stage)
+        if self.crowd:  # whoever is asked for may be in any slot
+            self._asked = self._asked.any(dim=1, keepdim=True).repeat(1, self.viewer.layout.agents)
+            self._memory = None
+
+    def _denoise_in_views(
+        self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None, network: Callable[..., Tensor]
+    ) -> Tensor:
+        """As `Denoiser.denoise`, in views. noisy (R, W, P, D) -> (R, W, P, D)"""
+        R, V = len(noisy), len(self.views.people)
+        self.stats.windows += R * (V - 1)
+        shown, each = self._shown(noisy, levels)
+        there = self.views.present.expand(R, -1, -1).flatten(0, 1)
+        cond = None if cond is None else cond.repeat_interleave(V, dim=0)
+        parts = []
+        for rows in torch.arange(R * V, device=noisy.device).split(BATCH):
+            extra = None if cond is None else cond[rows]
+            parts.append(self.viewer.denoise(shown[rows], each[rows], there[rows], extra, network))
+        clean = self._read(torch.cat(parts).float().unflatten(0, (R, V)))
+        if self.crowd:
+            self._guess, self._guess_at = clean[0].detach(), self._begins
+        return clean
+
+    def _shown(self, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+        """What each view shows: tokens (R V, W, M, D) and their levels (R V, W, M)."""
+        views, own = self.views, self.viewer.layout.latent + PAIR
+        pairs = noisy[..., own:].unflatten(-1, (-1, PAIR))
+        about = pairs[:, :, views.people[..., None], views.pair.clamp_min(0)]  # (R, W, V, M, K, 36)
+        free = ~self.views.present
+        if self.crowd:
+            self._work_out(about, noisy, levels)
+            each = torch.where(free, LEVELS, levels[:, :, views.people])
+        else:
+            each = levels[:, :, views.people]
+        shown = torch.cat([noisy[:, :, views.people, :own], about.flatten(-2)], dim=-1)
+        return shown.transpose(1, 2).flatten(0, 1), each.transpose(1, 2).flatten(0, 1)
+
+    def _work_out(self, about: Tensor, noisy: Tensor, levels: Tensor) -> None:
+        """Fill in how two people of a view stand whose tokens do not say it. about (R, W, V, M, K, 36)
+
+        The view's ego holds pairwise transforms to both: from their expected values, with the noise of one of them.
+        """
+        views, device = self.views, noisy.device
+        other = self.viewer.layout.partners(device)  # (M, K)
+        lacking = (views.pair < 0) & views.present[..., None] & views.present[:, other]
+        v, a, s = lacking.nonzero(as_tuple=True)
+        if not len(v):
+            return
+        ego, one, two = views.ego[v], views.people[v, a], views.people[v, other[a, s]]
+        (T_ego_one, *first), (T_ego_two, *second) = (self._seen_by(ego, who, noisy, levels) for who in (one, two))
+        mean, std = self._pair_statistics()
+        clean = (to_9d(inverse(T_ego_one) @ T_ego_two).flatten(-2) - mean) / std  # (R, W, E, 36)
+        noise = torch.where((second[1] >= first[1])[..., None], second[0], first[0])
+        level = torch.maximum(levels[:, :, one], levels[:, :, two])
+        about[:, :, v, a, s] = add_noise(clean, noise, level[..., None])
+
+    def _seen_by(self, ego: Tensor, who: Tensor, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """How people stand as an ego expects it, and the noise and the level of what the ego's token says of that.
+
+        ego, who (E,) int -> T_ego_who (R, W, E, 4, 4), noise (R, W, E, 36), level (R, W, E); -1: of the ego itself
+        """
+        slot = (self.model.layout.partners(ego.device)[ego] == who[:, None]).int().argmax(dim=1)
+        numbers = self.viewer.layout.latent + PAIR * (1 + slot[:, None]) + torch.arange(PAIR, device=ego.device)
+        said, level = noisy[:, :, ego[:, None], numbers], torch.maximum(levels[:, :, ego], levels[:, :, who])
+        guess = self._guessed(self._begins, noisy.shape[1])[:, ego[:, None], numbers]
+        clean = torch.where(level[..., None] == 0, said, guess)
+        share = alpha_bar(level)[..., None]
+        noise = (said - share.sqrt() * clean) / (1 - share).clamp_min(1e-6).sqrt()
+        mean, std = self._pair_statistics()
+        T_ego_who = from_9d((clean * std + mean).unflatten(-1, (TOKEN_FRAMES, 9)))
+        itself = (who == ego)[:, None, None, None]
+        return (
+            torch.where(itself, torch.eye(4, device=ego.device), T_ego_who),
+            noise,
+            torch.where(who == ego, -1, level),
+        )
+
+    def _read(self, clean: Tensor) -> Tensor:
+        """Everybody from the own view. (R, V, W, M, D) -> (R, W, P, D)"""
+        views, own = self.views, self.viewer.layout.latent + PAIR
+        mine = clean[:, views.view, :, views.slot]  # (P, R, W, D)
+        pairs = mine[..., own:].unflatten(-1, (-1, PAIR))
+        person = torch.arange(len(mine), device=clean.device)[:, None]
+        about = pairs[person, :, :, views.partner_slot.clamp_min(0)]  # (P, K, R, W, 36)
+        read = torch.cat([mine[..., :own], about.permute(0, 2, 3, 1, 4).flatten(-2)], dim=-1)
+        return read.permute(1, 2, 0, 3)
+
+
+def _refuse(model: Denoiser, scene: Scene, context: int, options: SamplerOptions) -> None:
+    """Raise ValueError for what is not made for crowds."""
+    if scene.agents > MOST:
+        raise ValueError(f"got {scene.agents} people, expected at most {MOST}")
+    if model.layout.agents < 2 or not model.layout.slots or model.posterior is not None:
+        raise ValueError(
+            "crowds need a model with pairwise transforms of two people or more, and without pairwise_posterior"
+        )
+    if context < TOKEN_FRAMES or context > scene.frames:
+        raise ValueError(
+            f"context: got {context} of {scene.frames} frames; a crowd goes on from where everybody stands: give at "
+            f"least {TOKEN_FRAMES} frames of everybody, for example by magnet.generation.crowd_start.compose"
+        )
+    wrong = {"body_guidance": "off", "settle": "off"}
+    for name, right in wrong.items():
+        if getattr(options, name) != right:
+            raise ValueError(f"{name}: got {getattr(options, name)}, expected {right} in a crowd; apart works there")
+    if options.placement == "anchor":
+        raise ValueError("placement: got anchor, expected fuse or integrate in a crowd: nobody knows everybody")

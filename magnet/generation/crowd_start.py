@@ -1,0 +1,104 @@
+"""Where a crowd begins: small groups put side by side on a floor plan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from magnet.checks import require_number, require_whole
+from magnet.generation.rollout import generate
+from magnet.motion.frames import from_planar
+from magnet.motion.scene import Scene, cat_agents, empty_scene
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks.joint import Generation
+
+if TYPE_CHECKING:
+    from magnet.denoiser.module import Denoiser
+
+SPACING = 3.0
+"""Metres from the middle of a group to that of the next, where nothing is said."""
+
+START = 32
+"""Frames of a start that the model makes: a second."""
+
+SHAPES = 0.7
+"""Standard deviation of the shape numbers of people who are made from nothing."""
+
+
+def start_crowd(
+    model: Denoiser,
+    people: int,
+    options: SamplerOptions | None = None,
+    generator: torch.Generator | None = None,
+    groups: Sequence[Scene] = (),
+    spacing: float = SPACING,
+) -> Scene:
+    """How a crowd begins: given groups again and again, or couples of different shapes that the model makes.
+
+    Args:
+        model: which makes couples where there are no groups.
+        people: how many in all.
+        options: how couples are sampled.
+        generator: source of randomness, on the model's device.
+        groups, spacing: as for `compose`.
+
+    Returns:
+        One scene of `people`; of `START` frames where the model makes it.
+    """
+    require_whole("people", people, 1)
+    turns = torch.Generator()
+    turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
+    if not groups:
+        couples = -(-people // 2)
+        empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros(()))
+        betas = SHAPES * torch.randn(couples, 2, 10, generator=turns)
+        scene = empty.replace(present=torch.ones(couples, 2, dtype=torch.bool), betas=betas.clamp(-2, 2))
+        made = generate(model, scene, Generation(), 0, START, 1, options, generator).to("cpu")
+        groups = [made.select([number]) for number in range(couples)]
+    return compose(groups, people, turns, spacing)
+
+
+def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, spacing: float = SPACING) -> Scene:
+    """Groups on one floor: in the cells of a grid that is as square as possible, turned by chance.
+
+    Args:
+        groups: single scenes of the same length; taken in turns, again and again. What is not present is left out.
+        people: how many in all; of the last group no more than are needed.
+        generator: of the turns, on the CPU.
+        spacing: metres between the middles of neighbouring cells.
+
+    Returns:
+        One scene of `people`, all present, in the middle of the floor.
+
+    Raises:
+        ValueError: there are no groups or nobody in them, or counts that are none.
+    """
+    require_whole("people", people, 1)
+    require_number("spacing", spacing, over=0)
+    if not groups or any(one.scenes != 1 or not bool(one.present.any()) for one in groups):
+        raise ValueError(
+            "groups: got none, several in one, or an empty one; expected single scenes with people in them"
+        )
+    parts: list[Scene] = []
+    count = 0
+    while count < people:
+        one = groups[len(parts) % len(groups)]
+        there = one.present[0].nonzero()[:, 0][: people - count]
+        parts.append(one.permute_agents(there).replace(given=None, valid=None, names=()))
+        count += len(there)
+    columns = math.ceil(math.sqrt(len(parts)))
+    rows = math.ceil(len(parts) / columns)
+    placed = []
+    for number, part in enumerate(parts):
+        row, column = divmod(number, columns)
+        cell = spacing * torch.tensor([column - (columns - 1) / 2, row - (rows - 1) / 2])
+        middle = part.T_world_root[0, :, :, [0, 2], 3].mean(dim=(0, 1)).cpu()
+        turn = 2 * math.pi * torch.rand((), generator=generator)
+        T_cell_middle = from_planar(torch.zeros(()), -middle)
+        T_floor_cell = from_planar(turn, cell)
+        placed.append(part.transformed((T_floor_cell @ T_cell_middle).to(part.T_world_root)))
+    return cat_agents(placed)

@@ -1,0 +1,148 @@
+"""Who is near whom in a crowd: each person's nearest partners, and the small groups that a model looks at."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from magnet.motion.frames import partners
+from magnet.motion.tokens import TokenLayout
+
+ENTER, LEAVE = 2.5, 3.5
+"""Metres over the ground within which somebody becomes a partner, and beyond which a partner is one no longer."""
+
+
+@dataclass(frozen=True)
+class CrowdLayout(TokenLayout):
+    """Tokens of more people than a token has partner slots: each slot points at somebody near.
+
+    Attributes:
+        table: (P, K) whom the slots of each person point at; the person's own number where at nobody.
+    """
+
+    table: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def slots(self) -> int:
+        return len(self.table[0]) if self.pairwise else 0
+
+    def partners(self, device: torch.device | None = None) -> Tensor:
+        return _table(self.table, device)
+
+    def group_present(self, present: Tensor) -> Tensor:
+        there = super().group_present(present)
+        if self.slots:
+            partner = self.partners(present.device)
+            there[..., 1:] &= partner != torch.arange(self.agents, device=present.device)[:, None]
+        return there
+
+    @classmethod
+    def of(cls, layout: TokenLayout, table: Tensor) -> CrowdLayout:
+        """Tokens of a model's layout with their slots pointed at other people. table (P, layout.slots) int"""
+        rows = tuple(tuple(row) for row in table.tolist())
+        return cls(layout.latent, len(table), layout.pairwise, layout.pairwise_noise, rows)
+
+
+@functools.lru_cache(maxsize=8)
+def _table(table: tuple[tuple[int, ...], ...], device: torch.device | None) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(table, device=device)
+
+
+def nearest_partners(
+    ground: Tensor, present: Tensor, before: Tensor, bonds: Tensor, enter: float = ENTER, leave: float = LEAVE
+) -> Tensor:
+    """Each person's nearest partners, and whoever was one before until further away than `leave`.
+
+    Who was a partner before counts as `leave - enter` nearer than he is, so that nobody flickers. Partners who stay
+    keep their slots; slots are free for anybody otherwise.
+
+    Args:
+        ground: (P, 2) metres, where people are.
+        present: (P,) bool.
+        before: (P, K) int, the partners until now; one's own number: nobody.
+        bonds: (P, P) bool, who belong together: partners however far away.
+        enter, leave: metres.
+
+    Returns:
+        (P, K) int.
+
+    >>> ground = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
+    >>> nobody = torch.arange(4)[:, None].repeat(1, 2)
+    >>> everybody, strangers = torch.ones(4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
+    >>> nearest_partners(ground, everybody, nobody, strangers)  # 0 and 2 are 3 m apart, and nobody is near 3
+    tensor([[1, 0],
+            [0, 2],
+            [1, 2],
+            [3, 3]])
+    """
+    P, K = before.shape
+    person = torch.arange(P, device=ground.device)
+    away = (ground[:, None] - ground[None]).norm(dim=-1)
+    away = away - (leave - enter) * torch.zeros_like(away).scatter(1, before, 1.0)
+    away = torch.where(bonds, away - 2 * away.amax().clamp_min(1.0), away)
+    away = torch.where(present[:, None] & present & (person[:, None] != person), away, torch.inf)
+    near, wanted = away.topk(min(K, P), dim=1, largest=False)
+    wanted = torch.where(near <= enter, wanted, person[:, None])
+    if K > P:
+        wanted = torch.cat([wanted, person[:, None].expand(P, K - P)], dim=1)
+    chosen = before.clone()
+    changed = (wanted.sort(dim=1).values != before.sort(dim=1).values).any(dim=1)
+    for p in changed.nonzero()[:, 0].tolist():
+        now = [q for q in wanted[p].tolist() if q != p]
+        row = [q if q in now else p for q in before[p].tolist()]
+        new = iter([q for q in now if q not in row])
+        chosen[p] = torch.tensor([next(new, p) if q == p else q for q in row])
+    return chosen
+
+
+@dataclass(frozen=True)
+class CrowdViews:
+    """The groups that a model looks at: each person with the partners; people with the same group share a view.
+
+    Attributes:
+        people: (V, M) int, who is in each slot of each view, in the order of their numbers; 0 where the slot is free.
+        present: (V, M) bool.
+        pair: (V, M, M - 1) int, which slot of a person's token points at each partner; -1: none does.
+        view, slot: (P,) int, where each person is read from.
+        partner_slot: (P, K) int, which partner slot of that view each of a person's slots is; -1: nobody's.
+        ego: (V,) int, somebody whose partners the others of the view are.
+    """
+
+    people: Tensor
+    present: Tensor
+    pair: Tensor
+    view: Tensor
+    slot: Tensor
+    partner_slot: Tensor
+    ego: Tensor
+
+    @classmethod
+    def of(cls, table: Tensor, present: Tensor, slots: int) -> CrowdViews:
+        """table (P, slots - 1) int as `nearest_partners` has it, present (P,) bool, slots M of the model."""
+        P, device = len(table), table.device
+        if slots >= P:  # a small group is one view, with its slots as they are
+            groups, view = [tuple(range(P))], [0] * P
+        else:
+            sets = [tuple(sorted({p, *row})) for p, row in enumerate(table.tolist())]
+            groups = list(dict.fromkeys(group for group, there in zip(sets, present.tolist(), strict=True) if there))
+            place = {group: number for number, group in enumerate(groups)}
+            view = [place.get(group, 0) for group in sets]
+        people = torch.tensor([[*group, *[0] * (slots - len(group))] for group in groups], device=device)
+        taken = torch.tensor([[slot < len(group) for slot in range(slots)] for group in groups], device=device)
+        in_view = torch.tensor(view, device=device)
+        person = torch.arange(P, device=device)
+        slot = ((people[in_view] == person[:, None]) & taken[in_view]).int().argmax(dim=1)
+        other = partners(slots, device)  # (M, M - 1)
+        points = table[people][:, :, None] == people[:, other][..., None]  # (V, M, M - 1, K)
+        points &= (taken[:, :, None] & taken[:, other])[..., None]
+        pair = torch.where(points.any(dim=-1), points.int().argmax(dim=-1), -1)
+        mine = people[in_view][person[:, None], other[slot]]  # (P, M - 1)
+        meant = (table[:, :, None] == mine[:, None]) & taken[in_view][person[:, None], other[slot]][:, None]
+        meant &= (table != person[:, None])[..., None]
+        partner_slot = torch.where(meant.any(dim=-1), meant.int().argmax(dim=-1), -1)
+        ego = torch.tensor([view.index(number) for number in range(len(groups))], device=device)
+        return cls(people, taken & present[people], pair, in_view, slot, partner_slot, ego)

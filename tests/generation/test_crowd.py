@@ -1,0 +1,142 @@
+"""A crowd is sampled in views of neighbours, at a cost that is linear in people; small groups are as ever."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from magnet.body.apart import APART, excess_depth, kept_apart, lifted
+from magnet.denoiser.module import Denoiser
+from magnet.generation.crowd import CrowdRollout, generate_crowd
+from magnet.generation.crowd_start import compose, start_crowd
+from magnet.generation.rollout import generate
+from magnet.generation.stats import SamplingStats
+from magnet.motion.frames import pairwise, to_9d
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks import registry
+from magnet.testing import random_scene, standing_people, tiny_denoiser
+
+QUICK = SamplerOptions(steps=2, stride=2)
+
+
+@pytest.fixture(scope="module")
+def model() -> Denoiser:
+    return tiny_denoiser(max_agents=4, window=8)
+
+
+def crowd(people: int, frames: int = 16, spacing: float = 2.0) -> Scene:
+    """Couples of smooth random motion, composed."""
+    generator = torch.Generator().manual_seed(people)
+    couples = random_scene(3, frames, 2, generator)
+    return compose([couples.select([number]) for number in range(3)], people, generator, spacing)
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(5)
+
+
+FIELDS: dict[str, dict[str, Any]] = {"inbetweening": {"every": 4}}
+
+
+@pytest.mark.parametrize("task", registry.names())
+def test_small_groups_are_sampled_as_ever_bit_for_bit(model: Denoiser, task: str) -> None:
+    for people in (2, 3, 4):
+        scene = random_scene(1, 24, people, torch.Generator().manual_seed(people))
+        made = registry.get(task)(**FIELDS.get(task, {}))
+        usual = generate(model, scene, made, 8, 16, 1, QUICK, seeded())
+        crowded = generate_crowd(model, scene, made, 8, 16, 1, QUICK, seeded())
+        for name, tensor in usual.tensors().items():
+            assert torch.equal(tensor, crowded.tensors()[name]), (people, name)
+
+
+@pytest.mark.parametrize("task", ["joint_future", "motion_control", "inbetweening"])
+def test_a_crowd_costs_a_view_a_person_and_no_more(model: Denoiser, task: str) -> None:
+    fields = {"motion_control": {"target": (0, 5)}}.get(task, FIELDS.get(task, {}))
+    for people in (6, 24):
+        stats = SamplingStats()
+        scene = crowd(people, 24)
+        made = generate_crowd(model, scene, registry.get(task)(**fields), 8, 16, 1, QUICK, seeded(), stats=stats)
+        assert made.agents == people and made.frames == 24
+        assert bool(made.T_world_root.isfinite().all())
+        assert people / 4 <= stats.windows / stats.calls <= people, "views a step"
+        assert torch.equal(made.T_world_root[:, :8], scene.T_world_root[:, :8])
+
+
+def test_what_tokens_say_of_partners_is_where_these_stand(model: Denoiser) -> None:
+    """All views are placed together, and whoever becomes a partner is in the tokens from then on."""
+    met = []
+
+    class Watched(CrowdRollout):
+        def meet(self, stage: Any, *rest: Any) -> None:
+            super().meet(stage, *rest)
+            met.append(len(rest[1]))
+            start = stage.start - self.first
+            done = stage.active[0] - self.first
+            world = self.world.T_world_can[:, start * TOKEN_FRAMES : done * TOKEN_FRAMES]
+            truth = pairwise_by_token(to_9d(pairwise(world, self.model.layout.partners())))
+            pairs = self.model.layout.unpack(self.model.normalizer.denormalize(self.tokens[:, start:done]))[2]
+            torch.testing.assert_close(pairs, truth, rtol=0, atol=1e-4)
+
+    scene = crowd(9, spacing=2.4)
+    rollout = Watched(model, scene, registry.get("joint_future")(), 16, 64, QUICK, seeded())
+    frames = sum(piece.frames for piece in rollout.chunks())
+    assert frames == 80 and sum(met) > 0, "an untrained model lets people drift past each other"
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_length_of_a_crowd(model: Denoiser) -> None:
+    rollout = CrowdRollout(model, crowd(6), registry.get("joint_future")(), 16, None, QUICK, seeded(), chunk=4)
+    held = []
+    for piece, _ in zip(rollout.chunks(), range(12), strict=False):
+        held.append((rollout.tokens.numel(), rollout.world.T_world_can.numel()))
+        assert piece.agents == 6
+    assert max(held[6:]) <= max(held[:6])
+
+
+def test_whoever_stands_in_somebody_else_is_moved_apart_and_nobody_else() -> None:
+    joints = standing_people(frames=24, agents=12, apart=0.0).clone()
+    joints[..., 2] += torch.tensor([0, 0.15, 5, 5.2, 10, 10.1, 15, 15.05, 20, 20.2, 30, 40])[:, None]
+    present = torch.ones(1, 12, dtype=torch.bool)
+    moved = kept_apart(joints, present)
+    after = joints + lifted(moved)[..., None, :]
+    for i in range(0, 10, 2):
+        assert excess_depth(joints[:, :, i], joints[:, :, i + 1], APART["firm"]).min() > 0.005
+        assert excess_depth(after[:, :, i], after[:, :, i + 1], APART["firm"]).max() < 0.001
+    assert bool((moved[:, :, 10:] == 0).all()), "nobody is near them"
+    still = kept_apart(joints, present, torch.arange(12) == 0)
+    assert bool((still[:, :, 0] == 0).all()) and bool((still[:, :, 1] != 0).any())
+
+
+def test_groups_stand_in_the_cells_of_a_floor_and_keep_their_shape() -> None:
+    scene = crowd(50, spacing=4.0)
+    assert scene.agents == 50 and bool(scene.present.all())
+    middles = scene.T_world_root[0, :, :, [0, 2], 3].mean(dim=0).unflatten(0, (25, 2)).mean(dim=1)
+    away = torch.cdist(middles, middles) + 99 * torch.eye(25)
+    torch.testing.assert_close(away.amin(dim=1), torch.full((25,), 4.0), rtol=0, atol=1e-3)
+    couple = random_scene(3, 16, 2, torch.Generator().manual_seed(50)).select([0])
+    torch.testing.assert_close(pairwise(scene.T_world_root[:, :, :2]), pairwise(couple.T_world_root), rtol=0, atol=1e-4)
+
+
+def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -> None:
+    scene = start_crowd(model, 7, QUICK, seeded())
+    assert (scene.scenes, scene.frames, scene.agents) == (1, 32, 7)
+    assert len(scene.betas[0].unique(dim=0)) == 7
+    assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
+
+
+def test_what_is_not_made_for_crowds_is_refused(model: Denoiser) -> None:
+    def refused(task: str, match: str, people: int = 6, context: int = 8, fields: Any = None, **options: Any) -> None:
+        kind, how = registry.get(task)(**(fields or {})), SamplerOptions(steps=2, **options)
+        with pytest.raises(ValueError, match=match):
+            generate_crowd(model, crowd(people), kind, context, 8, 1, how, seeded())
+
+    refused("generation", "context", context=0)
+    refused("partner_inpainting", "own_past", fields={"target": (1,)})
+    refused("agentic_sync", "square", people=18)
+    refused("joint_future", "placement", placement="anchor")
+    refused("joint_future", "settle", settle="light")
+    refused("joint_future", "at most", people=201)
