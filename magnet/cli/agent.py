@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import signal
 import string
 from collections.abc import Sequence
 from pathlib import Path
@@ -158,6 +159,8 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         given.meet,
         kept=told.append if given.out else lambda _: None,
     )
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
+        signal.signal(number, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))
     report = process.report.told(member, gate, process.pace)

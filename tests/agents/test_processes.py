@@ -122,7 +122,7 @@ def test_three_go_on_when_one_is_killed_and_it_comes_back(folder):
     watch(lambda: seen["D"] > at["D"] + 40)
     assert group["D"].wait(120) == 0
     for name in "ABC":
-        group[name].send_signal(signal.SIGINT)
+        group[name].send_signal(signal.SIGTERM)
     assert [group[name].wait(120) for name in "ABC"] == [0, 0, 0]
     link.close()
     back = json.loads((folder / "D.json").read_text())
