@@ -41,8 +41,9 @@ if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
     from magnet.tasks.base import Task
 
-CHUNK = 64
-"""Token steps that are decoded at a time: scenes of up to 8.5 seconds are one chunk."""
+CHUNK, FEW = 64, 8
+"""Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk; and that are encoded at a
+time where what is final is handed out at once."""
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
@@ -104,20 +105,19 @@ def stream(
 ) -> Iterator[Scene]:
     """Sample a task in consecutive chunks of frames, which together are what `generate` returns.
 
-    A chunk comes when its bodies are final: so many tokens after its own as the decoder looks ahead, and a seam before
-    what is given later. Memory does not grow with the scene's length, unless a keyframe far ahead decides where
-    everything before it is placed. Arguments as for `generate`, and:
+    A chunk comes when it is final: as late as the decoder looks ahead. Memory does not grow with the scene's length,
+    unless a keyframe far ahead decides where everything before it is placed. Arguments as for `generate`, and:
 
     Args:
         frames: None: endless, for tasks that are given nothing after the context.
         chunk: token steps decoded and handed out at a time. Smaller chunks come sooner. With the precision `reference`
-            they cost more, and poses differ by rounding. None: 1, or 64 where poses are settled, chunk by chunk.
+            they cost more, and poses differ by rounding. None: all that are final, or 64 where poses are settled.
 
     Raises:
         ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
     """
-    chunk = (1 if options is None or options.settle == "off" else CHUNK) if chunk is None else chunk
-    if chunk < 1:
+    chunk = CHUNK if chunk is None and options is not None and options.settle != "off" else chunk
+    if chunk is not None and chunk < 1:
         raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
     more = (options, generator, progress, stats, chunk, cond)
     return Rollout(model, scene, task, context, frames, samples, *more).chunks()
@@ -144,7 +144,7 @@ class Rollout:
         generator: Generators,
         progress: Callable[[int], None] | None,
         stats: SamplingStats | None,
-        chunk: int,
+        chunk: int | None,
         cond: Tensor | None = None,
     ) -> None:
         check_request(model, scene, context, frames, samples)
@@ -210,8 +210,8 @@ class Rollout:
             if stage is not None:
                 self._run(stage)
             for ready in self._ready(final):
-                while start < self.length and ready >= min(start + self.chunk, self.length):
-                    stop = int(min(start + self.chunk, self.length))
+                while start < self.length and ready >= min(start + (self.chunk or 1), self.length):
+                    stop = int(min(start + (self.chunk or CHUNK), self.length if self.chunk else ready))
                     made = self._decoded(start, stop, before, needed)
                     yield made if self.frames is None else made.slice(0, self.frames - start * TOKEN_FRAMES)
                     start, before = stop, made.slice(made.frames - 1)
@@ -354,7 +354,7 @@ class Rollout:
         """Add rows, whole chunks at a time, until those before `stop` are held."""
         behind, ahead = receptive_field(self.model)
         while self.stop < min(stop, self.there):
-            last = int(min(self.stop + self.chunk, self.there))
+            last = int(min(self.stop + (self.chunk or FEW), self.there))
             # What is known is encoded with all the neighbours that its codes can depend on.
             low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
             known = self._known(low, high)

@@ -59,7 +59,7 @@ class StagePlan:
             noise before; factors of old and new noise; the square root of the signal after.
         stays, ends: (S, rows, P, 1 + slots) bool, whose level stays, and who becomes clean.
         draws: for each step the (row, level) pairs that new noise is drawn for, and where several levels share a row.
-        last: (rows, P, 1 + slots) int, levels at which each group was predicted last, -1 where it never was.
+        last: (rows, P, 1 + slots) int, levels at which each group was predicted last, -1 where it never was; on CPU.
     """
 
     rows: slice
@@ -133,7 +133,7 @@ def run_planned_stage(
         if progress is not None:
             progress(1)
     if history is not None:
-        history.levels[rows] = plan.last[..., groups]
+        history.levels[rows] = plan.last[..., layout.groups()]
     return tokens
 
 
@@ -144,8 +144,8 @@ def plan_of(stage: Stage, layout: TokenLayout, eta: float, history: History | No
     hidden = None if stage.visibility is None else (~stage.visibility).cpu().contiguous()
     before = None
     if history is not None:
-        firsts = torch.searchsorted(layout.groups(device), torch.arange(1 + layout.slots, device=device))
-        before = history.levels[begins:ends][..., firsts].cpu().contiguous()
+        firsts = torch.searchsorted(layout.groups(), torch.arange(1 + layout.slots))
+        before = history.levels[begins:ends][..., firsts].contiguous()
     return _plan(
         (levels.numpy().tobytes(), tuple(levels.shape)),
         None if hidden is None else hidden.numpy().tobytes(),
@@ -203,7 +203,7 @@ def _plan(
             stays.to(device),
             ends.to(device),
             tuple(draws),
-            past.to(device),
+            past,
         )
 
 

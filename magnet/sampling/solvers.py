@@ -21,7 +21,7 @@ class History:
 
     Attributes:
         clean: (B, N, P, D); means nothing where nothing has been predicted yet.
-        levels: (N, P, D) int; -1 where nothing has been predicted yet.
+        levels: (N, P, D) int; -1 where nothing has been predicted yet. On the CPU, where stages are planned.
     """
 
     clean: Tensor
@@ -30,7 +30,7 @@ class History:
     @classmethod
     def empty(cls, tokens: Tensor) -> History:
         """A history without predictions. tokens (B, N, P, D)"""
-        return cls(torch.zeros_like(tokens), torch.full(tokens.shape[1:], -1, device=tokens.device))
+        return cls(torch.zeros_like(tokens), torch.full(tokens.shape[1:], -1))
 
     def copy(self) -> History:
         """A copy that can be updated independently."""
@@ -52,7 +52,7 @@ class History:
     def keep(self, clean: Tensor, now: Tensor, moves: Tensor) -> None:
         """Store the predictions of a step where it changes something. clean (B, N, P, D), now, moves (N, P, D)"""
         self.clean.copy_(torch.where(moves, clean, self.clean))
-        self.levels.copy_(torch.where(moves, now, self.levels))
+        self.levels.copy_(torch.where(moves, now, self.levels.to(now.device)))
 
 
 def solver_step(
@@ -92,6 +92,7 @@ def carried_on(clean: Tensor, now: Tensor, after: Tensor, history: History) -> T
     change, so that noise does not grow where levels of a token lie close together.
     """
     length = half_log_snr(after) - half_log_snr(now)
-    since = torch.where(history.levels == LEVELS, length, half_log_snr(now) - half_log_snr(history.levels.clamp_min(0)))
+    past = history.levels.to(now.device)
+    since = torch.where(past == LEVELS, length, half_log_snr(now) - half_log_snr(past.clamp_min(0)))
     share = (length / (2 * since)).clamp(max=1.0)
-    return torch.where(history.levels < 0, clean, clean + share * (clean - history.clean))
+    return torch.where(past < 0, clean, clean + share * (clean - history.clean))

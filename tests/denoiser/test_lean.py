@@ -12,6 +12,11 @@ from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.planned_stage import run_planned_stage
+from magnet.sampling.schedule import Grid
+from magnet.sampling.solvers import History
+from magnet.tasks import registry
 
 SMALL = {"width": 32, "layers": 3, "heads": 2, "dropout": 0.0}
 
@@ -145,3 +150,35 @@ def test_a_memory_spares_what_it_holds_and_needs_causal_attention(monkeypatch: p
         made(noisy, levels, present, None, wanted, Memory(3))
     with pytest.raises(ValueError, match="whole blocks"):
         LeanTransformer(network())(noisy, levels, present, None, wanted, Memory(4))
+
+
+@pytest.mark.parametrize("task", ["joint_future", "motion_control", "agentic_async"])
+@pytest.mark.parametrize("solver", ["ddim", "dpmpp_2m"])
+@torch.no_grad()
+def test_inside_a_stage_nothing_waits_for_the_device(task: str, solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The device is one whose numbers cannot be read: an item, nonzero, unique or copy back would be an error.
+
+    Who is there is read once a stage, so it is told here. Of step noise, whose generators this device has not, nothing
+    is tested.
+    """
+    monkeypatch.setattr("magnet.denoiser.lean.seats", lambda present: [(None, slice(0, 2))])
+    net = network(rope="heads").to("meta")
+    made, layout = LeanTransformer(net), net.layout
+    plan = registry.get(task)().schedule(Grid(12, 3, 4, steps=3, window=8))
+    tokens = torch.empty(2, plan.tokens, 3, layout.width, device="meta")
+    history = None if solver == "ddim" else History.empty(tokens)
+    there, runs = torch.empty(2, 3, dtype=torch.bool, device="meta"), []
+    for stage in plan.stages:
+        rows = slice(stage.start, stage.stop)
+        wanted = (stage.levels[0] != stage.levels[-1]).contiguous()
+
+        def ask(noisy: Tensor, levels: Tensor, present: Tensor, wanted: Tensor = wanted) -> Tensor:
+            runs.append(noisy.device.type)
+            return made(noisy, levels, present, None, wanted)
+
+        kept = None if history is None else history.window(rows)
+        part = tokens[:, rows]
+        run_planned_stage(ask, stage, part, part.clone(), there, layout, None, Guidance(), history=kept)
+    assert runs == ["meta"] * plan.evaluations
+    with pytest.raises((NotImplementedError, RuntimeError)):  # the network as it is trained does wait
+        net(part, torch.zeros(part.shape[:3], dtype=torch.long, device="meta"), there)
