@@ -34,6 +34,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     )
     parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
     parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")
+    parser.add_argument(
+        "--without_posterior", action="store_true", help="the network alone, of a model with network.pairwise_posterior"
+    )
     options = parser.parse_args(list(arguments))
     from magnet.cli.errors import CommandError
 
@@ -45,6 +48,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.denoiser.portable import OPSET, save_onnx
 
     path = checkpoints.resolve(options.ckpt_path)
-    for file, off in save_onnx(Denoiser.load(path), out, path.stem).items():
+    model = Denoiser.load(path)
+    if options.without_posterior:
+        model.posterior = None
+    for file, off in save_onnx(model, out, path.stem).items():
         print(f"written: {file} ({file.stat().st_size / 1e6:.1f} MB, opset {OPSET}, off by {off:.1g} from torch)")
     return 0

@@ -78,8 +78,8 @@ class PortableDenoiser(nn.Module):
         super().__init__()
         if denoiser.posterior is not None:
             raise ValueError(
-                "network.pairwise_posterior: it solves linear systems, which ONNX has no operator for; export a model "
-                "that was trained without it"
+                "network.pairwise_posterior: it solves linear systems, which ONNX has no operator for; "
+                "--without_posterior exports the network alone, whose deltas and pairwise transforms are less exact"
             )
         self.denoiser = [denoiser]  # in a list: only the transformer's weights belong to the file
         self.transformer = copy.copy(denoiser.transformer)
