@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import difflib
 import errno
+import os
 import re
 from collections.abc import Sequence
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
+LOST = r"(?i)gloo|nccl|connection (reset|closed|refused)|remote process"
+"""What torch says where a process of a training no longer answers."""
 UNION = "Does not validate against any of the Union subtypes"
 """How jsonargparse begins to tell that a class refused its options."""
 
@@ -30,6 +33,11 @@ def explain(error: Exception) -> str | None:
         return text
     if isinstance(error, RuntimeError) and "loading state_dict" in text:
         return misfit(text)
+    if isinstance(error, RuntimeError) and int(os.environ.get("WORLD_SIZE", 1)) > 1 and re.search(LOST, text):
+        return (
+            "another process of this training has ended, and so does this one; its own log says why. To go on from "
+            "the last checkpoint, run the same command with --ckpt_path last (--debug shows where)"
+        )
     if isinstance(error, ImportError) and "pip install" in text:
         return text
     if isinstance(error, OSError) and error.errno in FULL and error.args[:1] == (error.errno,):

@@ -301,7 +301,7 @@ class Denoiser(L.LightningModule):
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
         losses = self.losses(scene, generator, made)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
-        self.log("loss", losses["loss"], prog_bar=True)
+        self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
         return losses["loss"]
 
     def validation_step(self, batch: Scene, batch_idx: int) -> None:
