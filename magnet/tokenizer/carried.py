@@ -155,10 +155,10 @@ class Carried:
                 continue
             if number + 1 == len(network.layers):
                 low = stop - self.keep
-            elif after is None:
-                low = steps.first
-            else:
-                reads = after.stop - starts[number + 2]
+            else:  # where nothing after it is final, later calls read no earlier steps than this one
+                computed = made[number + 2]
+                reads = after.stop if after is not None else steps.first if computed is None else computed.first
+                reads -= starts[number + 2]
                 low = network.layers[number + 1].needs((reads, reads + 1), reads + 10**6)[0] + starts[number + 1]
             low = min(max(low, steps.first), stop)
             self.held[number] = after = Steps(low, steps.between(low, stop).clone())
