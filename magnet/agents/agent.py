@@ -137,9 +137,10 @@ class Notebook:
             yield from (self.told(of, index) for index in known[-PAST - 2 :])
 
     def forget(self) -> None:
-        """Let go of what is not looked at again."""
-        for pieces in self.pieces:
-            for index in [index for index in pieces if index < self.next - KEPT]:
+        """Let go of what is not looked at again; where somebody was last is kept."""
+        for slot, pieces in enumerate(self.pieces):
+            last = max((index for index in pieces if self.come(slot, index)), default=None)
+            for index in [index for index in pieces if index < self.next - KEPT and index != last]:
                 del pieces[index]
 
 

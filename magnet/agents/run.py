@@ -25,7 +25,7 @@ PULL = 0.1
 MOST = 0.005
 """Seconds that are taken up with each token, at most."""
 LOST = 1.0
-"""Seconds behind after which one's own clock is set anew."""
+"""Seconds behind after which one's own clock is set anew, and after which one goes on where the others are."""
 
 
 class Channel(Protocol):
@@ -81,11 +81,13 @@ class Report:
         tokens: how many were made.
         late: how many of them after they were due.
         joined: the first token, where others had begun before.
+        jumps: how often it went on where the others were, having fallen behind.
     """
 
     tokens: int = 0
     late: int = 0
     joined: int = 0
+    jumps: int = 0
     took: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
 
@@ -94,7 +96,7 @@ class Report:
         took, late = sorted(self.took), sorted(self.lateness)
         middle = 1000 * statistics.median(took) if took else None
         return {
-            "tokens": self.tokens, "joined": self.joined, "next": member.next, "late": self.late,
+            "tokens": self.tokens, "joined": self.joined, "next": member.next, "late": self.late, "jumps": self.jumps,
             "late_ms_p99": 1000 * late[int(0.99 * len(late))] if late else None,
             "late_ms_most": 1000 * late[-1] if late else None, "made_in_ms": middle,
             "gaps": member.gaps, "filled": member.filled,
@@ -178,10 +180,9 @@ class Process:
         """Meet the others, and begin with them; or join them where they are."""
         end = self.clock() + self.meet
         while self.clock() < end and not self._running:
-            self._hello()
+            self._greet()
             if self.others <= self._heard_by and self.others <= self._heard:
                 break
-            self.listen(HELLO)
         self._hello()
         member = self.member
         if self._running:
@@ -199,13 +200,23 @@ class Process:
     def _gather(self, seconds: float) -> None:
         end = self.clock() + seconds
         while self.clock() < end:
-            self._hello()
-            self.listen(min(HELLO, max(end - self.clock(), 0.0)))
+            self._greet()
+
+    def _greet(self) -> None:
+        """Say hello, and listen until it is time to say it again: an answer to each would be answered by all."""
+        again = self.clock() + HELLO
+        self._hello()
+        while (left := again - self.clock()) > 0:
+            self.listen(left)
 
     def turn(self) -> bool:
         """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
         member, pace, cost = self.member, self.pace, statistics.median(self.report.took or [0.0])
         assert pace is not None
+        if self.real_time and (member.newest() - member.next) * PERIOD > LOST:
+            member.join()  # too slow for them all the time, or stopped for a while
+            pace = self.pace = Pace(self.clock() + PERIOD, member.next)
+            self.report.jumps += 1
         index = member.next
         self.gate.now = index * TOKEN
         given_up = self.clock() + self.patience

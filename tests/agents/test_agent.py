@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 import torch
 
@@ -155,6 +156,11 @@ def test_memory_does_not_grow(denoiser, start):
     for _ in range(200):
         agents[0].step()
     assert agents[0].rollout.tokens.shape[1] <= 160 and max(map(len, agents[0].pieces)) <= 100
+    for _ in range(220):
+        told = agents[1].step()
+    agents[0].hear(told)
+    agents[0].join()  # where the others are now, though of C nothing has come for long
+    assert agents[0].next == 226 and np.isfinite(agents[0].step().poses).all()
 
 
 def test_what_cannot_be_is_named(denoiser, start):

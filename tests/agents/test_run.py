@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-from magnet.agents.run import LOST, PERIOD, Pace
+from magnet.agents.agent import Player
+from magnet.agents.gate import Gate
+from magnet.agents.message import Message, pack, unpack
+from magnet.agents.run import LOST, PERIOD, Pace, Process
+from magnet.testing import random_scene
 
 
 def drifting(rates: list[float], tokens: int, pull: bool = True) -> list[list[float]]:
@@ -39,3 +44,51 @@ def test_who_is_far_behind_sets_its_clock_anew():
     assert pace.resets == 1 and pace.due(1) == pytest.approx(2 * LOST + PERIOD)
     pace.heard("B", 1, pace.due(1) + 5 * LOST)  # somebody else who is far behind is not waited for
     assert not pace.lateness
+
+
+class Line:
+    """A link whose time passes while it is listened to; `coming` is heard at once."""
+
+    def __init__(self, coming: list[tuple[str, list[bytes]]]) -> None:
+        self.now, self.coming, self.sent = 0.0, coming, []
+
+    def send(self, parts: list[bytes]) -> None:
+        self.sent.append((self.now, unpack(parts)))
+
+    def receive(self, seconds: float) -> list[tuple[str, list[bytes]]]:
+        self.now += 0.001 if self.coming else seconds
+        return [self.coming.pop(0)] if self.coming else []
+
+
+def played(line: Line, coming: int) -> tuple[Process, Player]:
+    """B, who plays a recording, and messages of A, who plays the same and is so many tokens on."""
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 2), (400, 1)))
+    other, member = (Player(recording, start, "AB", name) for name in "AB")
+    told = [other.step() for _ in range(coming)]
+    line.coming += [("A", pack(message)) for message in told if message is not None]
+    return Process(member, line, Gate("AB", "B", "", 0), {"A"}, clock=lambda: line.now, session=1), member
+
+
+def test_hellos_are_not_answered_by_hellos():
+    line = Line([])
+    process, _ = played(line, 0)
+    hello = Message("hello", "A", "A", 1, -1, 0.0)
+    line.coming += [("A", pack(hello))] * 200
+    process.meet = 1.0
+    process.begin()
+    assert 10 <= len(line.sent) <= 12  # one each tenth of a second, whatever comes
+
+
+def test_who_has_fallen_behind_goes_on_where_the_others_are():
+    line = Line([])
+    process, member = played(line, 0)
+    process.meet = 0.0
+    process.begin()
+    assert process.turn() and member.next == 1
+    later, _ = played(line, 60)
+    assert later.member is not member
+    while line.coming:
+        process.listen(0.0)
+    assert process.turn()
+    assert member.next == 61 and process.report.jumps == 1
+    assert process.turn() and process.report.jumps == 1
