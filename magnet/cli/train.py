@@ -121,9 +121,10 @@ def quiet() -> None:
     """Silence warnings that a user can do nothing about."""
     for text in SILENCED:
         warnings.filterwarnings("ignore", text)
-    log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    if not log.filters:
-        log.addFilter(lambda record: not any(text in record.getMessage() for text in UNSAID))
+    for part in ("utilities.rank_zero", "trainer.connectors.checkpoint_connector"):
+        log = logging.getLogger(f"lightning.pytorch.{part}")
+        if not log.filters:
+            log.addFilter(lambda record: not any(text in record.getMessage() for text in UNSAID))
 
 
 class MagnetCLI(LightningCLI):
