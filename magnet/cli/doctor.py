@@ -41,6 +41,7 @@ EXTRAS = {
     "plot": Extra(("matplotlib",), "metric.plot(), as torchmetrics has it"),
     "onnx": Extra(("onnx", "onnxruntime", "onnxscript"), "magnet export-model: networks for programs without torch"),
     "usd": Extra(("usd-core",), "magnet export scene.usdc: Omniverse, Houdini, Maya"),
+    "agents": Extra(("pyzmq",), "magnet agent: agents in processes of their own"),
     "docs": Extra(("mkdocs-material", "mkdocstrings"), "make docs: the documentation as a site"),
     "bake": Extra(("anny",), "making the open body anew; it lies in the package already"),
 }
