@@ -254,8 +254,8 @@ class Tokenizer(L.LightningModule):
     def on_train_batch_start(self, batch: Scene, batch_idx: int) -> None:
         if not self.quantizer.waits:
             return
-        wished, half = self.hparams["quantizer"]["continuous_steps"], self.trainer.estimated_stepping_batches / 2
-        if self.global_step >= min(wished, half):  # a training of few steps ends with codes as well
+        wished, last = self.hparams["quantizer"]["continuous_steps"], self.trainer.estimated_stepping_batches - 1
+        if self.global_step >= min(wished, last / 2):  # a training of a single step ends with codes as well
             self.quantizer.waits = False
             batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
             self.init_codebook([batch] if batches is None else batches())

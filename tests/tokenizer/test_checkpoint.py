@@ -54,9 +54,10 @@ def test_codes_start_after_the_steps_without_them_also_where_training_was_stoppe
     assert not stopped.quantizer.initialized and not stopped.quantizer.codes.any()
     torch.testing.assert_close(stopped.encode_scene(scene), stopped.encode_scene(scene, quantize=False))
     assert begun.quantizer.initialized and not torch.equal(begun.encode_scene(scene), begun.encode_scene(scene, False))
-    short = tiny(quantizer={"continuous_steps": 100})
-    trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(short, datamodule=Scenes())
-    assert short.quantizer.initialized, "no training ends without codes"
+    for steps in (1, 2, 5):
+        short = tiny(quantizer={"continuous_steps": 100})
+        trainer(tmp_path, max_steps=steps, enable_checkpointing=False).fit(short, datamodule=Scenes())
+        assert short.quantizer.initialized, "no training ends without codes"
     again = tiny(**waiting)
     resume = {"ckpt_path": tmp_path / "epoch=0.ckpt", "weights_only": True}
     trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
