@@ -59,8 +59,8 @@ def sampled(model: magnet.Model, people: int, frames: int, spacing: float) -> tu
 
 def depths(scene: Scene) -> str:
     """Shares of generated frames with two bodies over 10 cm in each other, counted in three ways."""
-    joints = magnet.api.Motion.of(scene.slice(START)).joints()[0].detach()
-    ground, people = joints[:, :, 0, [0, 2]], scene.agents
+    joints = magnet.api.Motion.of(scene.slice(START)).joints()[0].detach()[:, scene.present[0]]
+    ground, people = joints[:, :, 0, [0, 2]], joints.shape[1]
     near = (torch.cdist(ground, ground) < 2.2).any(dim=0).triu(1)
     over = torch.zeros(len(joints), people, dtype=torch.bool)
     count = 0

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnet.cli.flags import PlainParser
+
 if TYPE_CHECKING:
     from magnet.agents.agent import Member
     from magnet.agents.zeromq import Link
@@ -29,13 +31,7 @@ for example, in two terminals:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser(
-        "magnet agent",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    options = PlainParser("agent", __doc__, EPILOG)
     add = options.add_argument
     add("--name", required=True, help="which agent this process is")
     add("--scene", metavar="START", help="scene that it begins with, of everybody")

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magnet.cli.flags import PlainParser
+
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
 
@@ -37,13 +39,7 @@ WHOLE: dict[str, Any] = {"people": [1, 2, 3, 4], "batch": [1, 10], "live": 60.0}
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser(
-        "magnet bench",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    options = PlainParser("bench", __doc__, EPILOG)
     add = options.add_argument
     add("--model", default=None, metavar="NAME", help="shipped model, checkpoint, or `paper`: untrained, at its sizes")
     add("--task", action="append", default=[], metavar="NAME", help="only this task; may be repeated (default: all)")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from magnet.cli.flags import PlainParser
 from magnet.sampling.presets import PRESETS, preset_name
 
 
@@ -18,7 +19,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser("magnet demo", description=__doc__, allow_abbrev=False)
+    options = PlainParser("demo", __doc__)
     options.add_argument("--out", default="demo", help="folder for table and pictures (default: %(default)s)")
     options.add_argument("--ckpt_path", default=None, help="another model; default: the one that comes along")
     options.add_argument("--scenes", type=int, default=9, help="test scenes that are scored (default: %(default)s)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import os
 import platform
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from magnet.cli.flags import PlainParser
 from magnet.version import __version__
 
 State = Literal["ok", "missing", "wrong"]
@@ -60,7 +60,7 @@ class Finding:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns 0, or 1 where something is wrong; what is only missing is no fault."""
-    parser = argparse.ArgumentParser("magnet doctor", description=__doc__, allow_abbrev=False)
+    parser = PlainParser("doctor", __doc__)
     parser.parse_args(list(arguments))
     found = [*packages(), *devices(), *extras(), *files()]
     wide = max(len(finding.what) for finding in found)

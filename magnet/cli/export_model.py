@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
+
+from magnet.cli.flags import PlainParser
 
 EPILOG = """\
 OUT.onnx is the denoiser; OUT_decoder.onnx makes poses of its tokens, OUT_encoder.onnx tokens of poses. Each is run by
@@ -25,13 +26,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         ImportError: a package is missing; says which.
         ValueError: a model that cannot be exported.
     """
-    parser = argparse.ArgumentParser(
-        "magnet export-model",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = PlainParser("export-model", __doc__, EPILOG)
     parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
     parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")
     parser.add_argument(

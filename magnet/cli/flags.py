@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import difflib
+import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
@@ -46,6 +49,29 @@ def refused(command: str, said: str) -> str:
     """A mistake in a command line, as it is printed."""
     stop = "" if said.endswith("?") else "."
     return f"magnet {command}: error: {said}{stop} See magnet {command} --help"
+
+
+class PlainParser(argparse.ArgumentParser):
+    """The parser of a command without a Trainer: nothing abbreviated, and a mistake in one line with what may be meant.
+
+    Args:
+        command: its name behind `magnet`.
+        description: what it does, printed as it is written.
+        epilog: examples, printed as they are written.
+    """
+
+    def __init__(self, command: str, description: str | None, epilog: str | None = None) -> None:
+        how = argparse.RawDescriptionHelpFormatter
+        super().__init__(
+            f"magnet {command}", description=description, epilog=epilog, formatter_class=how, allow_abbrev=False
+        )
+        self.command = command
+
+    def error(self, message: str) -> NoReturn:
+        unknown = re.search(r"unrecognized arguments: (-\S+)", message)
+        hint = closest(unknown[1].partition("=")[0], list(self._option_string_actions)) if unknown else ""
+        print(refused(self.command, message + hint), file=sys.stderr)
+        sys.exit(2)
 
 
 def closest(name: str, known: Sequence[str]) -> str:

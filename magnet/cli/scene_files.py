@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magnet.cli.flags import PlainParser
+
 if TYPE_CHECKING:
     from magnet.export.formats import Read, Reading
 
@@ -15,13 +17,7 @@ Options = argparse.ArgumentParser | argparse._ArgumentGroup
 
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> argparse.ArgumentParser:
     """A parser that knows IN."""
-    options = argparse.ArgumentParser(
-        f"magnet {command}",
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    options = PlainParser(command, description, epilog)
     options.add_argument("inputs", nargs=inputs, metavar="IN", help="a .npz or .bvh file; several are several people")
     return options
 

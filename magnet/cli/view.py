@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from magnet.cli.flags import PlainParser
 from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
@@ -35,13 +36,7 @@ over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:loc
 
 def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(
-        prog="magnet view",
-        description="Watch scenes in the browser, or let a model play while you interfere.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
     parser.add_argument(
         "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
     )

@@ -70,6 +70,21 @@ def test_options_are_written_out(words: tuple[str, ...], capsys: pytest.CaptureF
     assert f"unrecognized arguments: {words[-2]}" in complaint(capsys, *words)
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("demo --mintes 3", "--minute"),
+        ("export a.npz b.glb --scnes 0", "--scene"),
+        ("refine a.npz b.npz --tirm", "--trim"),
+    ],
+)
+def test_a_flag_that_is_not_there_is_answered_with_what_may_be_meant(
+    words: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, *words.split())
+    assert f"did you mean {meant}" in said and said.count("\n") <= 1
+
+
 def test_importing_magnet_imports_nothing_heavy() -> None:
     code = "import sys, magnet; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
