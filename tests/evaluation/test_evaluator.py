@@ -175,7 +175,7 @@ def test_no_past_is_no_past_that_baselines_could_continue(name: str):
 def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     datamodule = data(context_frames=0)
     seen = run(datamodule, task=registry.get("generation")())
-    assert (seen.now, seen.past_is_given) == (0, False)
+    assert (seen.scoring.now, seen.scoring.past_is_given) == (0, False)
     batch = next(iter(datamodule.test_dataloader()))
     made = seen.sample(batch, 3, seen.generators_of(batch.scenes))
     yaw, ground = to_planar(canonical_frame(made.T_world_root)[:, 0])
@@ -186,7 +186,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
 
 
 def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
-    monkeypatch.setattr("magnet.evaluation.evaluator.BASELINE_COMPOSED", 30)
+    monkeypatch.setattr("magnet.evaluation.scoring.BASELINE_COMPOSED", 30)
     clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]
     results = run(data(clips, composed=2)).results
     assert math.isfinite(results.rows["NN"]["mpjpe"])

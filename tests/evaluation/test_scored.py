@@ -68,22 +68,22 @@ def sampled(task: object) -> tuple[Evaluator, Scene, Scene]:
 
 def mean_error(evaluation: Evaluator, made: Scene, batch: Scene, scored: Tensor) -> float:
     """Distance of 21 joints over what is scored, as MPJPE has it. made (9 * S scenes, horizon)"""
-    truth = evaluation.body.joints(batch.slice(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
-    error = (evaluation.body.joints(made) - truth)[..., 1:, :].norm(dim=-1).mean(dim=-1)  # (9 S, T, P)
+    truth = evaluation.scoring.body.joints(batch.slice(CONTEXT)).repeat_interleave(made.scenes // batch.scenes, dim=0)
+    error = (evaluation.scoring.body.joints(made) - truth)[..., 1:, :].norm(dim=-1).mean(dim=-1)  # (9 S, T, P)
     return float(error[:, scored].mean())
 
 
 @EACH
 def test_what_is_scored_is_what_was_generated(task: object, scored: Tensor) -> None:
     evaluation, batch, _ = sampled(task)
-    assert torch.equal(evaluation.generated(batch), scored)
+    assert torch.equal(evaluation.scoring.generated(batch), scored)
 
 
 @EACH
 def test_none_of_the_copied_truth_counts(task: object, scored: Tensor) -> None:
     evaluation, batch, whole = sampled(task)
     evaluation.step(batch)
-    row = evaluation.metrics[MODEL].compute()
+    row = evaluation.scoring.metrics[MODEL].compute()
     made = whole.slice(CONTEXT)
     assert float(row["mpjpe"]) == pytest.approx(mean_error(evaluation, made, batch, scored), rel=1e-4)
     people = torch.tensor([True, True, False]).expand(HORIZON, 3)
@@ -122,7 +122,7 @@ def test_the_plan_is_that_of_the_slots_somebody_is_in() -> None:
     scores = [run(data(max_agents=slots), task=HalfGiven(), baselines=False).results.rows[MODEL] for slots in (2, 3)]
     assert scores[0]["mpjpe"] > 0
     evaluation, batch, whole = sampled(HalfGiven())
-    scored = evaluation.generated(batch)
+    scored = evaluation.scoring.generated(batch)
     assert scored.any(dim=0).tolist() == [False, True, False]
     changed = (whole.T_world_root != batch.repeat(2).T_world_root).flatten(3).any(dim=-1).any(dim=0)
     assert torch.equal(changed[CONTEXT:], scored)
@@ -170,7 +170,7 @@ def test_training_windows_that_are_the_test_scenes_are_at_no_distance_from_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames = CONTEXT + HORIZON
-    monkeypatch.setattr("magnet.evaluation.evaluator.WINDOW_STRIDE", frames)
+    monkeypatch.setattr("magnet.evaluation.scoring.WINDOW_STRIDE", frames)
     clips = [random_clip("same", 4 * frames, 2, split=split) for split in ("train", "test")]
     ran = run(data(clips), task=JointFuture(), baseline_stride=frames)
     row = ran.results.rows[TRAINING]
@@ -186,15 +186,15 @@ def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
         datamodule = data(stride=stride)
         evaluation = Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, baselines=False, interval=interval)
         evaluation.start(datamodule)
-        assert len(set(evaluation.unit_of.values())) == units
-        assert len(evaluation.unit_of) == len(datamodule.test_windows())
+        assert len(set(evaluation.scoring.unit_of.values())) == units
+        assert len(evaluation.scoring.unit_of) == len(datamodule.test_windows())
 
 
 def test_intervals_go_by_recordings_where_there_are_enough() -> None:
     clips = [random_clip(f"{split}{k}", 120, 2, split=split) for split in ("train", "test") for k in range(5)]
     evaluation = Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, baselines=False)
     evaluation.start(data(clips))
-    assert len(set(evaluation.unit_of.values())) == 5
+    assert len(set(evaluation.scoring.unit_of.values())) == 5
     with pytest.raises(ValueError, match="interval: got 'clip', expected auto, take, scene"):
         Evaluator(tiny_denoiser(max_agents=3), sampler=FAST, interval="clip").start(data(clips))
 
