@@ -1,11 +1,13 @@
 """Answers that need no model, kept from one call to the next: importing Torch and Lightning takes seconds.
 
 What is kept belongs to the code that it was made from: this package, Lightning, the parser and all plug-ins. Where any
-of it has changed, everything is made anew. `make setup` makes all there are (`python -m magnet.cli.all_answers`).
+of it has changed, everything is made anew; of the package outside the commands and the registries, what functions do
+inside says nothing here and may change. `make setup` makes all there are (`python -m magnet.cli.all_answers`).
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import hashlib
@@ -28,6 +30,8 @@ WIDTHS = (80, 100, 120)
 """Columns that answers are written for: the most that fit into the terminal."""
 KEPT = 4
 """Files of answers: of as many versions or copies of the code."""
+OUTLINES = "outlines.json"
+"""Digests of files' outlines by those of their code: to read 47,000 lines takes a second."""
 FRESH = "torch" not in sys.modules
 """Whether this process began with the command; in others what takes long is imported, and registries may be changed."""
 
@@ -40,7 +44,7 @@ def width() -> int:
 
 def recall(name: str) -> Any:
     """What was kept under a name; None where nothing was, or where the code has changed since."""
-    return _read().get(name) if FRESH else None
+    return _read(place()).get(name) if FRESH else None
 
 
 def keep(answers: dict[str, Any]) -> None:
@@ -49,10 +53,7 @@ def keep(answers: dict[str, Any]) -> None:
     if path is None or not FRESH:
         return
     with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}.part")
-        part.write_text(json.dumps(_read() | answers), encoding="utf-8")
-        part.replace(path)
+        _write(path, _read(path) | answers)
         for old in sorted(path.parent.glob("answers-*.json"), key=lambda file: file.stat().st_mtime)[:-KEPT]:
             old.unlink()
 
@@ -102,8 +103,12 @@ def place() -> Path | None:
     """The file of all answers of this code; None where the code cannot be told, as with tasks out of a variable."""
     if os.environ.get(VARIABLE):
         return None
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
-    return folder / f"answers-{code_digest()}.json"
+    return folder() / f"answers-{code_digest()}.json"
+
+
+def folder() -> Path:
+    """Where everything is kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
 
 
 @functools.cache
@@ -112,16 +117,35 @@ def code_digest() -> str:
     digest = hashlib.blake2b(digest_size=12)
     for package in ("lightning", "jsonargparse"):
         digest.update(f"{package} {version(package)}\n".encode())
-    folders = {Path(__file__).parents[1]}
+    ours = Path(__file__).parents[1]
+    folders = {ours}
     for group in PLUGINS:
         for point in entry_points(group=group):
             digest.update(f"{point.group} {point.name} {point.value}\n".encode())
             folders |= _home(point)
-    for folder in sorted(folders):
-        for file in sorted(folder.rglob("*.py")) if folder.is_dir() else [folder]:
-            digest.update(f"{file.relative_to(folder)}\n".encode())
-            digest.update(file.read_bytes())
+    before, now = _read(folder() / OUTLINES), {}
+    for home in sorted(folders):
+        for file in sorted(home.rglob("*.py")) if home.is_dir() else [home]:
+            code = file.read_bytes()
+            if home == ours and file.parent.name != "cli" and file.name != "registry.py":
+                key = hashlib.blake2b(code, digest_size=12).hexdigest()
+                now[key] = before.get(key) or hashlib.blake2b(outline(code).encode(), digest_size=12).hexdigest()
+                code = now[key].encode()
+            digest.update(f"{file.relative_to(home)}\n".encode())
+            digest.update(code)
+    if now.keys() != before.keys():
+        with contextlib.suppress(OSError):
+            _write(folder() / OUTLINES, now)
     return digest.hexdigest()
+
+
+def outline(code: bytes) -> str:
+    """A module's code less what its functions do: their bodies but for docstrings."""
+    module = ast.parse(code)
+    for node in ast.walk(module):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = node.body[:1] if ast.get_docstring(node, clean=False) is not None else []
+    return ast.dump(module)
 
 
 def _home(point: EntryPoint) -> set[Path]:
@@ -134,10 +158,16 @@ def _home(point: EntryPoint) -> set[Path]:
     return {Path(spec.origin)} if spec.origin else set()
 
 
-def _read() -> dict[str, Any]:
-    path = place()
+def _read(path: Path | None) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8")) if path is not None else {}
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def _write(path: Path, values: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(f".{os.getpid()}.part")
+    part.write_text(json.dumps(values), encoding="utf-8")
+    part.replace(path)

@@ -68,8 +68,13 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     named_classes()
     request = read_request(command, arguments, MODELS)
     goes_on = "; then go on with --ckpt_path last, if there is one" if command == "fit" else ""
-    with writing(request.folder, f"choose another --out{goes_on}"):
-        MagnetCLI(request)
+    try:
+        with writing(request.folder, f"choose another --out{goes_on}"):
+            MagnetCLI(request)
+    except SystemExit:
+        if answers.recall(f"{command} flags") is None:  # the next mistyped flag is answered at once
+            answers.keep(flag_answers(help_parser(command)))
+        raise
     return 0
 
 

@@ -22,6 +22,7 @@ ASKED = [[command, "--help"] for command in {**TRAINER_COMMANDS, **LIGHT_COMMAND
     ["test", "--tsak", "joint_future"],
     ["fit", "--model", "Denoiser", "--model.widht", "3"],
     ["predict", "--data.max_agent", "2"],
+    ["fit", "--data.pth", "x"],
 ]
 COMPARED = [["test", "--help"], ["tasks"], ["data", "list"], ["test", "--tsak", "joint_future"]]
 """Those that are also asked with nothing kept, which takes seconds each."""
@@ -57,9 +58,16 @@ def test_answers_are_forgotten_with_the_code_that_they_were_made_from(
     for number in range(2 * answers.KEPT):
         monkeypatch.setattr(answers, "code_digest", lambda number=number: f"changed{number}")
         assert answers.kept("a", lambda number=number: f"three {number}") == f"three {number}"
-    assert len(list(tmp_path.glob("magnet/*"))) == answers.KEPT
+    assert len(list(tmp_path.glob("magnet/answers-*"))) == answers.KEPT
     monkeypatch.setenv(answers.VARIABLE, "my_tasks")  # which may change from call to call
     assert answers.kept("a", lambda: "four") == "four"
+
+
+def test_what_functions_do_inside_is_no_part_of_an_outline_and_all_else_is() -> None:
+    code = b'class Walk:\n    far: int = 3\n    def go(self, on=1):\n        """Go."""\n        return on\n'
+    assert answers.outline(code) == answers.outline(code.replace(b"return on", b"return far(on)"))
+    for old, new in ((b"far: int = 3", b"far: int = 4"), (b"on=1", b"on=2"), (b"Go.", b"Run."), (b"go(", b"run(")):
+        assert answers.outline(code) != answers.outline(code.replace(old, new))
 
 
 def test_a_place_that_cannot_be_written_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
