@@ -92,12 +92,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: files that cannot be read or written; says what to do.
-    """
+    """Run the command; returns the exit code. Raises CommandError or ValueError: options or files do not fit."""
     options = parser().parse_args(list(arguments))
     from magnet.body import on_floor
     from magnet.cli.errors import CommandError
@@ -147,11 +142,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:
-    """The scene with these people alone, who keep their slots and so their colours.
-
-    Raises:
-        CommandError: nobody of that number is there.
-    """
+    """The scene with these people alone, in their slots, so colours. Raises CommandError: one is not there."""
     import torch
 
     from magnet.cli.errors import CommandError

@@ -58,12 +58,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: files that cannot be read or written; says what to do.
-    """
+    """Run the command; returns the exit code. Raises CommandError or ValueError: options or files do not fit."""
     options = parser().parse_args(list(arguments))
     from pathlib import Path
 

@@ -36,11 +36,7 @@ class TaskChoice:
 
     @property
     def task(self) -> Task:
-        """The task itself.
-
-        Raises:
-            ValueError: its fields contradict each other.
-        """
+        """The task itself. Raises ValueError: its fields contradict each other."""
         return registry.get(self.name)(**self.fields)
 
     @property
@@ -66,11 +62,7 @@ def listed(value: Any) -> Any:
 
 
 def task_class(name: str) -> type:
-    """A task's class by its name.
-
-    Raises:
-        CommandError: no such task; names the closest one.
-    """
+    """A task's class by its name. Raises CommandError: no such task; names the closest one."""
     try:
         return registry.get(name)
     except ValueError as error:
@@ -98,14 +90,8 @@ def parse_task(
 ) -> TaskChoice:
     """A task from its flags, over the options that configuration files give it; the only way there is to read one.
 
-    Args:
-        name: the task's.
-        flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`.
-        below: options from files, later ones win.
-        command: whose help is named in errors.
-
-    Raises:
-        CommandError: no such task or option, or a value that does not fit.
+    flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`; below: options from files, later ones win; command: whose help
+    errors name. Raises CommandError: no such task or option, or a value that does not fit.
     """
     kind = task_class(name)
     parser = task_parser(kind)
@@ -123,11 +109,7 @@ def task_parser(kind: type | None, **settings: Any) -> ArgumentParser:
 def read_fields(
     parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
 ) -> dict[str, Any]:
-    """Options from files, overridden by flags.
-
-    Raises:
-        CommandError: an option that there is not, or a value that does not fit.
-    """
+    """Options from files, overridden by flags. Raises CommandError: no such option, or a value that does not fit."""
     try:
         cfg = parser.get_defaults(skip_validation=True)
         for options in below:
@@ -236,11 +218,7 @@ class Shown:
 
 
 def show_task(arguments: list[str]) -> int:
-    """Draw the noise levels of a task's schedule, to a PNG or the terminal.
-
-    Raises:
-        CommandError: no such task or option, or a task that makes no sense at these sizes.
-    """
+    """Draw the noise levels of a task's schedule, to a PNG or the terminal. Raises CommandError."""
     from rich.console import Console
     from rich.text import Text
 
@@ -276,11 +254,7 @@ def show_parser(task: type | None) -> ArgumentParser:
 
 
 def parse_shown(name: str, arguments: list[str]) -> tuple[Task, Shown]:
-    """The task and the sizes that a command line asks for.
-
-    Raises:
-        CommandError: no such task, an option that neither has, or a value that does not fit.
-    """
+    """The task and the sizes that a command line asks for. Raises CommandError: no such task, option or value."""
     kind = task_class(name)
     fields = read_fields(show_parser(kind), arguments, (), f"magnet tasks show {name} --help")
     return kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})

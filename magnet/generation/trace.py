@@ -37,11 +37,8 @@ def record(
 ) -> DenoisingTrace:
     """Sample a task once (B = 1), as `generate` does, and keep what was expected after each step.
 
-    Args:
-        every: so many denoising steps lie between two that are kept; the last one of each window always is.
-
-    Raises:
-        ValueError: several scenes, another frame rate than the model's, or whatever `generate` refuses.
+    every: so many denoising steps lie between two that are kept; the last one of each window always is. Raises
+    ValueError: several scenes, another frame rate than the model's, or whatever `generate` refuses.
     """
     require_one(scene)
     require_rate(scene)

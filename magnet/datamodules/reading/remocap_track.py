@@ -42,14 +42,9 @@ def file_like(folder: Path, pattern: str, usual: str) -> Path:
 
 
 def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
-    """Positions of the mapped joints in metres (T, M, 3), frame rate, and what was found.
+    """Positions of the mapped joints in metres (T, M, 3), frame rate, and what was found. `scale`: metres a unit
 
-    Args:
-        folder: one person's, with motion.bvh, csv files of positions and rotations and motion_offsets.pkl.
-        scale: metres a unit.
-
-    Raises:
-        DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.
+    Raises DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder: a partner's files are missing; {AGAIN}")
@@ -146,11 +141,7 @@ def _misfit(header: BvhSkeleton, table: _Table) -> float:
 
 
 def _proof(folder: Path, header: BvhSkeleton, table: _Table, scale: float) -> str:
-    """Find the Euler order with which rotations and offsets give the positions.
-
-    Raises:
-        DataError: none leads there within 1 cm.
-    """
+    """The Euler order with which rotations and offsets give the positions within 1 cm. Raises DataError: none does."""
     paths = sorted(folder.glob("*rotation*.csv"))
     if not paths:
         return "no csv of rotations: joints and units are not proven"
@@ -185,14 +176,10 @@ def _order(
     positions: dict[int, Doubles],
     close: float,
 ) -> tuple[str, float]:
-    """The Euler order that leads closest, and how far off in the files' unit.
+    """The Euler order that leads closest, and how far off in the files' unit; `close`: near enough for the BVH's order.
 
-    Args:
-        header: the joints.
-        offsets: (K, 3) in the parent's frame.
-        namings: angles (T, 3) by joint, for each way of naming the columns.
-        positions: (T, 3) by joint.
-        close: how far off is near enough for the order of the BVH.
+    offsets (K, 3) in the parent's frame; namings: angles (T, 3) by joint, for each way of naming the columns; positions
+    (T, 3) by joint.
     """
     best, error = "", np.inf
     for turns in namings:
