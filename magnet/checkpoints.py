@@ -42,7 +42,11 @@ def names() -> list[str]:
 
 
 def named(name_or_path: str | Path) -> Path:
-    """The folder of a shipped model of that name, or of one fetched from a hub (`from_hub`), else the path as it is."""
+    """The folder of a shipped model where there is one of that name, one fetched from a hub, else the path as it is.
+
+    Raises:
+        ValueError, ImportError: as `from_hub`.
+    """
     if str(name_or_path).startswith(HUB):
         return from_hub(str(name_or_path))
     shipped = FOLDER / str(name_or_path)
@@ -50,10 +54,16 @@ def named(name_or_path: str | Path) -> Path:
 
 
 def from_hub(name: str) -> Path:
-    """The folder of a model on Hugging Face's hub, hub:owner/name[@revision]; fetched once and kept in a cache.
+    """The folder of a released model that is fetched from Hugging Face's hub once and then kept in its cache.
 
-    Only weights, the configuration and the card are fetched: no code, and nothing pickled. Raises ValueError: another
-    form of name, or nothing that can be fetched; ImportError: huggingface_hub is not installed.
+    Only weights, the configuration and the card are fetched: no code, and nothing pickled.
+
+    Args:
+        name: hub:owner/name, or hub:owner/name@revision with a branch, a tag or a commit.
+
+    Raises:
+        ValueError: another form of name, or nothing that can be fetched.
+        ImportError: huggingface_hub is not installed.
     """
     match = re.fullmatch(rf"{HUB}(\w[\w.-]*/\w[\w.-]*)(?:@([\w./-]+))?", name)
     if match is None:
@@ -76,7 +86,11 @@ def from_hub(name: str) -> Path:
 
 
 def resolve(name_or_path: str | Path | None = None) -> Path:
-    """The checkpoint that a name or path means; None: the package's own. Raises ValueError: there is none."""
+    """The checkpoint that a name or path means; None is the model that comes with the package.
+
+    Raises:
+        ValueError: neither a model of the package nor a file, or as `from_hub`.
+    """
     path = named(DEFAULT if name_or_path is None else name_or_path)
     if path.exists():
         return path
@@ -85,9 +99,10 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """A checkpoint as Lightning wants it, of any version: a released folder, or a file of Lightning's own.
+    """A checkpoint as Lightning wants it, from a released folder or a file of Lightning's own, of any version.
 
-    Raises ValueError: not a checkpoint, damaged, or of a later format.
+    Raises:
+        ValueError: not a checkpoint, damaged, or of a later format.
     """
     path = Path(path)
     verify(path)
@@ -95,7 +110,11 @@ def read(path: str | Path) -> dict[str, Any]:
 
 
 def load(path: Path, mmap: bool = False) -> dict[str, Any]:
-    """As `read`, of a file that is known to be whole; `mmap`: only what is looked at is read from the disk."""
+    """As `read`, of a file that is known to be whole; with `mmap` only what is looked at is read from the disk.
+
+    Raises:
+        ValueError: not a checkpoint, or of a later format.
+    """
     if path.is_dir():
         return renamed_checkpoint(_read_folder(path))
     try:
@@ -116,9 +135,13 @@ def checksum_file(path: Path) -> Path:
 
 
 def verify(path: Path) -> None:
-    """Compare a checkpoint's bytes with the checksum beside it, or else with the CRC-32 of its archive's records.
+    """A checkpoint's bytes are those that were written, as far as can be known.
 
-    Raises ValueError: they differ; says what to do.
+    By the checksum beside it; a checkpoint without one, as older versions and others wrote it, by the CRC-32 that its
+    archive keeps of each record.
+
+    Raises:
+        ValueError: they are not; says what to do.
     """
     beside = checksum_file(path)
     if path.is_file() and beside.is_file():
@@ -141,7 +164,11 @@ def verify(path: Path) -> None:
 
 
 def save(checkpoint: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint and its SHA-256, whole or not at all: after CannotWrite the old one is still whole."""
+    """Write a checkpoint whole or not at all, and its SHA-256 beside it.
+
+    Raises:
+        CannotWrite: the disk is full; the checkpoint that was there before is whole.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     beside, advice = checksum_file(path), "choose another --out; then go on with --ckpt_path last"
     # Between the two files' renames a checkpoint has no checksum, never another one's.
@@ -199,7 +226,8 @@ def _widen(value: Tensor) -> Tensor:
 def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
     """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
 
-    Raises ValueError: the tokenizer has other codes, statistics or another encoder, so its latents mean something else.
+    Raises:
+        ValueError: the tokenizer's codes mean something else: it has other codes, statistics or another encoder.
     """
     state = dict(checkpoint["state_dict"])
     for name, value in tokenizer["state_dict"].items():
@@ -212,9 +240,13 @@ def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[
 
 
 def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None = None, half: bool = True) -> Path:
-    """Release a checkpoint as a folder, in place of older parts; `about` goes into config.json.
+    """Release a checkpoint as a folder.
 
-    half: keep matrices and larger weights in float16; statistics stay as they are.
+    Args:
+        checkpoint: as Lightning saved it.
+        folder: made if missing; older parts in it are removed.
+        about: for config.json: what the model was trained on, and how.
+        half: keep two-dimensional and larger weights in float16; statistics stay as they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.safetensors"):

@@ -11,27 +11,47 @@ from typing import get_args
 def require_number(
     name: str, value: object, least: float | None = None, most: float | None = None, over: float | None = None
 ) -> None:
-    """Refuse what is no finite number, or lies outside [least, most], or not above `over`; `name` is for the message.
+    """Refuse what is not a finite number in a range.
 
-    Raises ValueError: names the number, what was got and what was expected.
+    Args:
+        name: what the number is called where it is given.
+        value: what was given; an int will do.
+        least: the smallest number allowed.
+        most: the largest.
+        over: a number that it must lie above.
+
+    Raises:
+        ValueError: names the number, what was got and what was expected.
     """
     _require(name, value, "a number", least, most, over)
 
 
 def require_whole(name: str, value: object, least: int | None = None, most: int | None = None) -> None:
-    """Refuse what is no whole number in a range; arguments and error as of `require_number`."""
+    """Refuse what is not a whole number in a range; arguments as for `require_number`.
+
+    Raises:
+        ValueError: names the number, what was got and what was expected.
+    """
     _require(name, value, "a whole number", least, most)
 
 
 def require_wholes(name: str, values: object, like: str = "(0, 1)") -> None:
-    """Refuse, by a ValueError that shows one `like` it, what is not a tuple or list of whole numbers."""
+    """Refuse what is not a tuple or list of whole numbers, such as `like`.
+
+    Raises:
+        ValueError: names the field, what was got and how it is written.
+    """
     several = isinstance(values, Sequence) and not isinstance(values, str)
     if not several or not all(_fits(value, whole=True) for value in values):  # type: ignore[attr-defined]
         raise ValueError(f"{name}: got {values!r}, expected whole numbers in brackets, such as {like}")
 
 
 def require_choice(name: str, value: object, choices: object) -> None:
-    """Refuse, by a ValueError that lists them, what is not among the values of a `Literal`."""
+    """Refuse what is not among the values of a `Literal`.
+
+    Raises:
+        ValueError: names the field, what was got and what there is.
+    """
     if value not in get_args(choices):
         raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(choices))}")
 

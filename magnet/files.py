@@ -36,7 +36,12 @@ class Refused(ValueError):
 def writing(path: str | Path, advice: str) -> Iterator[None]:
     """Say which path it was, and what to do next, when the disk is full or does not take a file.
 
-    advice: such as "choose another --out". Raises CannotWrite in place of the system's error, whose `errno` it keeps.
+    Args:
+        path: file or folder that the block writes.
+        advice: what to do next, such as "choose another --out".
+
+    Raises:
+        CannotWrite: in place of the system's error, whose `errno` it keeps.
     """
     try:
         yield
@@ -99,9 +104,15 @@ def write_whole(
 ) -> tuple[str, str]:
     """All of a file or none: written aside, synced, renamed. Returns its name and sha256.
 
-    name: sha256 to the file's name; write: is given something to call `write(bytes)` of; ready: is called with the
-    sha256 once the file is whole, before it takes its place; advice: what to do where the disk is full. Raises
-    CannotWrite: the disk is full, or the folder does not take files; nothing is left behind.
+    Args:
+        folder: where; it exists.
+        name: sha256 to the file's name.
+        write: is given something to call `write(bytes)` of.
+        ready: is called with the sha256 once the file is whole, before it takes its place.
+        advice: what to do where the disk is full.
+
+    Raises:
+        CannotWrite: the disk is full, or the folder does not take files; nothing is left behind.
     """
     with writing(folder, advice):
         handle, aside = tempfile.mkstemp(prefix=".new-", dir=folder)
@@ -148,7 +159,9 @@ def file_hash(path: Path) -> str:
 def regular(path: Path) -> Path:
     """The path, when a plain file or a link to one is there: a pipe or a device would never end.
 
-    Raises FileNotFoundError: nothing is there, or a link leads nowhere; Refused: something else is.
+    Raises:
+        FileNotFoundError: nothing is there, or a link leads nowhere.
+        Refused: something else is.
     """
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
@@ -159,17 +172,27 @@ def regular(path: Path) -> Path:
 
 
 def inside(folder: Path, name: Any) -> Path:
-    """The file of a folder that an index names by a plain name: no index leads out of its folder. Raises Refused."""
+    """The file of a folder that an index names, which is a plain name: no index leads out of its folder.
+
+    Raises:
+        Refused: it is a path, or no name at all.
+    """
     if not isinstance(name, str) or name in ("", ".", "..") or set("/\\\0") & set(name):
         raise Refused(f"{folder}: its index names {name!r:.80}, expected the name of a file in it; make it anew")
     return folder / name
 
 
 def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:
-    """An npz without pickles, opened, when what it unpacks to is in proportion to what it holds. names: of arrays
+    """An npz without pickles, opened, when what it unpacks to is in proportion to what it holds.
 
-    Raises FileNotFoundError; Refused: not a file, or an array that would unpack to more than 64 MiB and 100 times its
-    packed size; zipfile.BadZipFile: not an npz.
+    Args:
+        path: the file.
+        names: arrays that will be read; None: any.
+
+    Raises:
+        FileNotFoundError: no such file.
+        Refused: not a file, or an array that would unpack to more than 64 MiB and 100 times its packed size.
+        zipfile.BadZipFile: not an npz.
     """
     with zipfile.ZipFile(regular(Path(path))) as archive:
         for member in archive.infolist():

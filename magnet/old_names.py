@@ -189,9 +189,11 @@ def renamed_config(config: Options) -> tuple[Options, dict[str, str | None]]:
 
 
 def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str | None]]:
-    """Options of one class, a key of `OPTIONS`, under their new names, and which ones changed: old to new.
+    """Options of one class under their new names, and which ones changed: old to new.
 
-    Groups are dictionaries. What is said under a new name beats what is said under its old one.
+    Args:
+        kind: a key of `OPTIONS`.
+        options: by name, groups as dictionaries. What is said under a new name beats what is said under its old one.
     """
     new, changed = copy.deepcopy(options), {}
     for old, now in OPTIONS.get(kind, {}).items():

@@ -40,7 +40,12 @@ class Registry:
         self.discovered = False
 
     def add(self, name: str, kind: type, origin: str) -> None:
-        """Make a class known. Raises TypeError: it is not of the sort; ValueError: another class has the name."""
+        """Make a class known.
+
+        Raises:
+            TypeError: it is not of the sort.
+            ValueError: the name is taken by another class.
+        """
         self.check(name, kind)
         known = self.known.get(name)
         if known is not None and known.kind is not kind:
@@ -71,6 +76,10 @@ class Registry:
             self.failed[name] = error
 
     def require_loaded(self, name: str) -> None:
-        """Say why a plug-in is not there. Raises ValueError: a plug-in of that name failed to load."""
+        """Say why a plug-in is not there.
+
+        Raises:
+            ValueError: a plug-in of that name failed to load.
+        """
         if name in self.failed:
             raise ValueError(f"{self.what} {name} failed to load: {self.failed[name]!r}") from self.failed[name]

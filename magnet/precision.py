@@ -25,7 +25,11 @@ class Float32(nn.Module):
 
 
 def require_float32_scenes(precision: str | int | None) -> None:
-    """Refuse by a ValueError, says what to take, Lightning's `-true` precisions, which convert scenes, too."""
+    """Refuse a Trainer's precision that would convert scenes as well as networks.
+
+    Raises:
+        ValueError: one of Lightning's `-true` precisions but float32's; says what to take.
+    """
     if str(precision).endswith("-true") and precision != "32-true":
         raise ValueError(
             f"trainer.precision {precision} would convert scenes too, whose positions would be rounded to centimetres "
@@ -39,7 +43,11 @@ def dtype_of(network: nn.Module) -> Any:
 
 
 def device_of(device: str | torch.device) -> torch.device:
-    """A device by its name. Raises ValueError: no such device, or none of that kind here."""
+    """A device by its name.
+
+    Raises:
+        ValueError: no such device, or none of that kind here.
+    """
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError) as error:

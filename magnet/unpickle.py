@@ -31,7 +31,11 @@ Also = Callable[[str, str], Any]
 
 
 def contents(path: str | Path) -> bytes:
-    """All bytes of a file. Raises DataError: it is not there or cannot be read."""
+    """All bytes of a file.
+
+    Raises:
+        DataError: it is not there or cannot be read.
+    """
     try:
         return regular(Path(path)).read_bytes()
     except FileNotFoundError as error:
@@ -45,13 +49,18 @@ def contents(path: str | Path) -> bytes:
 def load_pickle(path: str | Path) -> Any:
     """What a pickle holds, of any protocol; text of Python 2 is read as latin-1 and bytes keys become str.
 
-    Raises DataError: the file is damaged, or names a class or function that is not admitted: names it.
+    Raises:
+        DataError: the file is damaged, or names a class or function that is not admitted: names it.
     """
     return unpickled(contents(path), str(path))
 
 
 def load_object_npy(path: str | Path) -> Any:
-    """What an npy file with a pickled object holds, `array.item()` of one without dimensions. Raises DataError."""
+    """What an npy file with a pickled object holds, `array.item()` where the array has no dimensions.
+
+    Raises:
+        DataError: as `load_pickle`.
+    """
     found = npy(contents(path), str(path))
     if isinstance(found, np.ndarray) and found.dtype.char == "O" and found.ndim == 0:
         return found.item()
@@ -62,7 +71,11 @@ def load_object_npy(path: str | Path) -> Any:
 
 
 def npy(data: bytes, where: str) -> NDArray:
-    """The array in an npy file's bytes, in errors `where`; objects go through the restricted unpickler."""
+    """The array in the bytes of an npy file; one of objects goes through the restricted unpickler.
+
+    Raises:
+        DataError: damaged or refused; begins with `where`.
+    """
     file = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)
@@ -98,9 +111,15 @@ def _array(data: bytes, dtype: np.dtype, shape: tuple[int, ...], fortran: bool, 
 
 
 def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
-    """What the bytes of a pickle hold; a DataError, which begins with `where`: damaged or refused.
+    """What the bytes of a pickle hold.
 
-    also: gives what stands in for a further class that it may name, by module and name; None: refused.
+    Args:
+        data: the pickle.
+        where: what an error begins with.
+        also: gives what stands in for a further class that it may name, by module and name; None: refused.
+
+    Raises:
+        DataError: damaged or refused; begins with `where`.
     """
     try:
         with warnings.catch_warnings():
@@ -129,7 +148,14 @@ class StandIn:
         self.state = state if isinstance(state, Mapping) else {}
 
     def real(self, inner: Callable[[Any], Any]) -> Any:
-        """What it is, in plain data, `inner` being what makes plain data of something in `state`. Raises DataError."""
+        """What it is, in plain data.
+
+        Args:
+            inner: gives plain data of something in `state`.
+
+        Raises:
+            DataError: its state makes no sense.
+        """
         raise NotImplementedError
 
 

@@ -53,7 +53,13 @@ class Gate:
         self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
 
     def take(self, parts: Sequence[bytes], at: float, peer: str | None = None) -> Message | None:
-        """A message if it is right, else None and a count more; `at`: seconds, `peer`: who is at the other end."""
+        """A message, if it is right; None, and a count more, if not.
+
+        Args:
+            parts: as they came.
+            at: now, in seconds of any clock that does not go back.
+            peer: who is known to be at the other end; None: not known.
+        """
         try:
             message = unpack(parts)
             self._sent_by(message, at, peer)

@@ -86,7 +86,11 @@ def sealed(parts: Sequence[bytes]) -> list[bytes]:
 
 
 def unpack(parts: Sequence[bytes]) -> Message:
-    """A message of the right form, its numbers not looked at yet (`magnet.agents.gate`). Raises RefusedMessage."""
+    """A message of the right form; what its numbers say is not looked at (`magnet.agents.gate`).
+
+    Raises:
+        RefusedMessage: anything else.
+    """
     if len(parts) != 5 or sum(map(len, parts)) > LARGEST or len(parts[1]) > HEADER:
         raise RefusedMessage("size")
     if sealed(parts[:4])[4] != parts[4]:

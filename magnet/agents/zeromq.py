@@ -16,7 +16,11 @@ HERE = re.compile(r"ipc://.+|inproc://.+|tcp://(127\.\d+\.\d+\.\d+|localhost|\[:
 
 
 def engine() -> ModuleType:
-    """ZeroMQ for Python. Raises ModuleNotFoundError: it is not installed."""
+    """ZeroMQ for Python.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
     try:
         import zmq
     except ModuleNotFoundError as error:

@@ -21,9 +21,15 @@ class Predictor(Protocol):
     """
 
     def __call__(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
-        """Future joints of S samples of whole scenes (B, T, P), in the recording's world. -> (S, B, horizon, P, 22, 3)
+        """Future joints in the world of the recording.
 
-        generators: that of sample s of scene b is at b * samples + s. Where an agent is absent joints may be anything.
+        Args:
+            scene: (B, T, P) whole test scenes.
+            samples: futures S wanted of each.
+            generators: sources of randomness, that of sample s of scene b at b * samples + s.
+
+        Returns:
+            (S, B, horizon, P, 22, 3) metres; anything where an agent is absent.
         """
         ...
 

@@ -42,7 +42,11 @@ class Retrieval:
         self.stretches = {n: (people == n).nonzero()[:, 0] for n in sorted(set(people.tolist()) - {0})}
 
     def candidates(self, people: int) -> Tensor:
-        """Stretches with that many people. (M_n,) int. Raises ValueError: there is none."""
+        """Stretches with that many people. (M_n,) int
+
+        Raises:
+            ValueError: there is none.
+        """
         if people not in self.stretches:
             raise ValueError(
                 f"the context has {people} people, training stretches have {list(self.stretches)}; "
@@ -64,9 +68,16 @@ class Retrieval:
             )
 
     def answer(self, context: Scene, horizon: int, chosen: Tensor, slots: Tensor | None = None) -> Scene:
-        """Continuations of contexts (B, T, P) out of the `chosen` stretches (B,) int. -> Scene (B, horizon, P)
+        """Continuations of a context out of chosen stretches.
 
-        slots (B, P) int, which slot of the stretch each person plays; None: as alignment fits best, else in order.
+        Args:
+            context: (B, T, P).
+            chosen: (B,) int, a stretch for each scene.
+            slots: (B, P) int, which slot of the stretch plays each of the context's; None: as alignment
+                fits best, or in order where nothing is aligned. Read only where an agent is present.
+
+        Returns:
+            (B, horizon, P) with the context's betas, presence and names.
         """
         chosen = chosen.to(self.train.device)
         now = canonical_frame(context.T_world_root)[:, -1].to(self.train.device)

@@ -69,7 +69,8 @@ class RidgeRegression:
     def __call__(self, context: Scene, horizon: int) -> Tensor:
         """Joints in the context's world, 0 where nobody is. -> (B, horizon, P, 22, 3)
 
-        Raises ValueError: no training window has as many people, or the context does not fit the training windows.
+        Raises:
+            ValueError: no training window has as many people, or the context does not fit the training windows.
         """
         train = self.train
         for field, got, expected in (
@@ -97,7 +98,11 @@ class RidgeRegression:
         return answer
 
     def fit(self, people: int) -> RidgeFit:
-        """The regression for so many people. Raises ValueError: no training window has that many."""
+        """The regression for so many people.
+
+        Raises:
+            ValueError: no training window has that many.
+        """
         if people not in self._fits:
             self._fits[people] = self._fitted(people)
         return self._fits[people]

@@ -30,10 +30,18 @@ class Windows:
 
     @staticmethod
     def of(scenes: Iterable[Scene], body: Body, context: int, mirror: bool = False) -> Windows:
-        """Windows of scenes that are alike in frames, slots, fps and body; `context`: frames of each before its future.
+        """Windows of batches of scenes, alike in frames, slots, fps and body.
 
         Windows with a masked frame are left out. A scene without a name is a recording of its own; see `recording`.
-        `mirror` adds each scene's mirror image. Raises ValueError: no scenes.
+
+        Args:
+            scenes: batches.
+            body: the body model of them all.
+            context: frames of each window that come before its future.
+            mirror: each scene's mirror image as well.
+
+        Raises:
+            ValueError: no scenes.
         """
         parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         recordings: list[str] = []
@@ -60,7 +68,12 @@ class Windows:
         return self.joints.shape[1] - self.context
 
     def of_people(self, people: int, mirrored: bool = True) -> Tensor:
-        """Windows with so many people, mirror images too if `mirrored`; none where there are none. (m,) int"""
+        """Windows with so many people; none where there are none. (m,) int
+
+        Args:
+            people: how many.
+            mirrored: mirror images too.
+        """
         found = self.present.sum(dim=1) == people
         return (found if mirrored else found & ~self.mirrored).nonzero()[:, 0]
 

@@ -110,9 +110,19 @@ def measure(
     seed: int = 0,
     clock: Clock = time.perf_counter,
 ) -> Speed:
-    """Sample a case `rounds` times, after once that does not count; after each, its matrix products alone.
+    """Sample a case some times, and after each the matrix products of one of its evaluations.
 
-    frames: sampled after the context; seed: of the noise. Raises ValueError: the task cannot be sampled so; says why.
+    Args:
+        model: a denoiser that can sample.
+        case: what is sampled.
+        options: how.
+        frames: sampled after the context.
+        rounds: times that it is done, after one that does not count.
+        seed: of the noise.
+        clock: see `Clock`.
+
+    Raises:
+        ValueError: the task cannot be sampled so; says why.
     """
     task = registry.get(case.task)()
     context = 0 if case.task in FROM_NOTHING else CONTEXT
@@ -217,9 +227,12 @@ ALONE = ("joint_future", "generation", "inbetweening", "agentic_sync", "agentic_
 def live_latency(model: Denoiser, options: SamplerOptions, seconds: float, people: int = 2) -> dict[str, Any]:
     """Latency of a partner who answers each token as it happens, against the clock of the motion.
 
-    The frames of a token are there when the last of them has happened; an answer is late where the next token is there
-    before it. -> `median_ms`, `p99_ms`, `jitter_ms` (standard deviation) and `most_ms` of the answers, how many there
-    were and were `late`, and the process's memory at the beginning and the end.
+    The frames of a token are there when the last of them has happened. An answer is late where the next token is there
+    before it.
+
+    Returns:
+        `median_ms`, `p99_ms`, `jitter_ms` (the standard deviation) and `most_ms` of the answers, how many there were
+        and were `late`, and the process's memory at the beginning and the end.
     """
     from magnet.generation.partner import Partner
 

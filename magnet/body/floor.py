@@ -72,7 +72,10 @@ def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> T
 
 
 def on_floor(scene: Scene, body: Body | None = None) -> Scene:
-    """The same motion with whoever stands lowest on y = 0, in each of the B scenes by itself. body: as for `lowest`."""
+    """The same motion with whoever stands lowest on y = 0, in each of the B scenes by itself.
+
+    body: as for `lowest`.
+    """
     if not scene.present.any() or not scene.frames:
         return scene
     counts = scene.present[:, None].expand(scene.T_world_root.shape[:3])

@@ -94,7 +94,10 @@ def all_rows(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor)
 def touching(
     seen: Seen, capsules: FittedCapsules, pairs: tuple[Tensor, Tensor, Tensor, Tensor], allowed: Tensor, kind: str
 ) -> Rows:
-    """Rows of capsules that are deeper than allowed. pairs: (M,) b, t and the two people; allowed (K, K) metres."""
+    """Rows of capsules that are deeper than allowed.
+
+    pairs: (M,) b, t and the two people; allowed (K, K) metres.
+    """
     b, t, p, q = pairs
     i, j = allowed.isfinite().nonzero(as_tuple=True)
     bones = torch.tensor(capsules.bones, device=b.device)

@@ -128,9 +128,14 @@ class RollOuts(Callback):
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:
-    """A recorded continuation (B, T', P) that begins as the made past (B, T, P) ends, and comes back to itself.
+    """A recorded continuation that begins where and as a made past ends, and comes back to itself.
 
-    Places come back over so many `frames`, poses over `BLEND`.
+    Places come back over some frames, poses over `BLEND`.
+
+    Args:
+        made: (B, T, P) the past.
+        behind: (B, T', P) the continuation, at about the right place.
+        frames: over so many frames people come back.
     """
     T_world_last = canonical_frame(made.T_world_root[:, -1:])
     T_world_can = canonical_frame(behind.T_world_root)

@@ -58,7 +58,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command; returns the exit code. Raises CommandError or ValueError: options make no sense."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: scenes, addresses or keys that cannot be used; says what to do.
+    """
     given = parser().parse_args(list(arguments))
     from magnet.agents import zeromq
     from magnet.cli.errors import CommandError
@@ -90,7 +95,11 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def peers(connect: Sequence[str], names: Sequence[str], me: str) -> dict[str, str]:
-    """Addresses by name. Raises CommandError: not of the form NAME=ADDRESS, or nobody of the scene."""
+    """Addresses by name.
+
+    Raises:
+        CommandError: not of the form NAME=ADDRESS, or nobody of the scene.
+    """
     from magnet.cli.errors import CommandError
 
     found = {}

@@ -61,7 +61,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command; returns the exit code. Raises CommandError or ValueError: options make no sense."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: no such model, task or preset; says what there is.
+    """
     given = parser().parse_args(list(arguments))
     from magnet.cli.errors import CommandError
 
@@ -84,7 +89,11 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What another run has written. Raises CommandError: no such file, or not of this command."""
+    """What another run has written.
+
+    Raises:
+        CommandError: no such file, or not of this command.
+    """
     from magnet.cli.errors import CommandError
 
     try:

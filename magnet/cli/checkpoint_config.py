@@ -40,7 +40,11 @@ class Arguments:
 
     @classmethod
     def split(cls, arguments: Iterable[str]) -> Arguments:
-        """Take configuration files out (`read_layers`), so that they go first and any flag beats any file."""
+        """Take the configuration files out, so that they can go first and any flag beats any file.
+
+        Raises:
+            CommandError: as `read_layers`.
+        """
         found = cls([])
         rest = iter(arguments)
         for argument in rest:
@@ -61,7 +65,11 @@ class Arguments:
         return [layer.options for layer in self.layers]
 
     def flag(self, key: str) -> str | None:
-        """The last value that a flag gives. Raises CommandError: the flag stands at the end, without one."""
+        """The last value that a flag gives.
+
+        Raises:
+            CommandError: the flag stands at the end, without one.
+        """
         value = None
         for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):
             name, equals, text = argument.partition("=")
@@ -116,7 +124,8 @@ class Arguments:
 def import_named(given: Arguments) -> None:
     """Import the classes that a user names by a dotted path, also out of the working directory.
 
-    Raises CommandError: such a module is there and cannot be imported.
+    Raises:
+        CommandError: such a module is there and cannot be imported.
     """
     from magnet.datamodules.registry import import_local
 
@@ -135,7 +144,8 @@ def import_named(given: Arguments) -> None:
 def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:
     """What `--ckpt_path` means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
 
-    Raises CommandError: there is none.
+    Raises:
+        CommandError: there is none.
     """
     if name in ("last", "best"):
         folders = list(folders)
@@ -162,7 +172,11 @@ class Stored:
 
     @classmethod
     def read(cls, path: Path) -> Stored:
-        """Read them. Raises CommandError: no checkpoint, a damaged one, or of a class that nobody here has named."""
+        """Read them.
+
+        Raises:
+            CommandError: no checkpoint, a damaged one, or one of a class that nobody here has named.
+        """
         try:
             checkpoint = checkpoints.read(path)
         except (OSError, ValueError) as error:
@@ -187,10 +201,14 @@ def _from_hyper_parameters(checkpoint: dict[str, Any]) -> Spec | None:
 
 
 def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, keep_data: bool) -> dict[str, Any]:
-    """Stored options as the lowest layer of configuration; `data_default`: the data's class where nobody names one.
+    """Stored options as the lowest layer of configuration.
 
-    fit: training goes on, and linked options follow from the data's by themselves. keep_data: without data named by the
-    user, those of the checkpoint are used.
+    Args:
+        stored: what the checkpoint kept.
+        given: what the user says.
+        fit: training goes on; linked options then follow from the data's by themselves.
+        data_default: class of the data where nobody names one.
+        keep_data: use the checkpoint's data where the user names none.
     """
     layer: dict[str, Any] = {}
     model_args: dict[str, Any] = {}
@@ -223,8 +241,16 @@ OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "s
 def started(name: str, given: Arguments, models: dict[str, str], data_default: str) -> dict[str, Any]:
     """Options of the checkpoint that training starts from (`--model.start_from`), as the lowest layer.
 
-    Sizes, losses and noise are those of the checkpoint, and the data have its number of people and frames. `models`:
-    modules of our models by the class's short name. Raises CommandError: there is no such checkpoint.
+    Sizes, losses and noise are those of the checkpoint, and the data have its number of people and frames.
+
+    Args:
+        name: a shipped model's, or a path.
+        given: what the user says.
+        models: modules of our models, by the class's short name.
+        data_default: class of the data where nobody names one.
+
+    Raises:
+        CommandError: there is no such checkpoint.
     """
     try:
         checkpoint = checkpoints.read(checkpoints.resolve(name))
@@ -264,7 +290,11 @@ def tokens(window_frames: int) -> int:
 
 
 def refuse_linked(given: Arguments) -> None:
-    """Refuse a linked option that is not set where it comes from. Raises CommandError: it is set at the model."""
+    """Refuse a linked option that is not set where it comes from.
+
+    Raises:
+        CommandError: it is set at the model.
+    """
     for source, target in LINKS.items():
         said = [given.flag(f"model.{target}"), given.flag(f"model.init_args.{target}")]
         for config in given.configs:
@@ -298,7 +328,11 @@ def options_of(kind: type | None) -> set[str]:
 
 
 def trusted(spec: Spec, path: Path) -> Spec:
-    """Refuse by a CommandError classes outside magnet that are not imported yet: an import could run any code."""
+    """Refuse classes whose import could run code that nobody here has chosen.
+
+    Raises:
+        CommandError: the checkpoint names a class outside magnet that is not imported yet.
+    """
     for name in class_paths(spec):
         module = name.rpartition(".")[0]
         if not (module == "magnet" or module.startswith("magnet.") or module in sys.modules):

@@ -33,8 +33,9 @@ class Settled:
 def settle(layers: Sequence[Layer], flags: Sequence[str]) -> Settled:
     """Find the classes that win, and remove the options of other classes from each layer.
 
-    layers: lowest first, those without a path are not the user's own; flags: of the command line, which beat all
-    layers.
+    Args:
+        layers: lowest first; those without a path are not the user's own.
+        flags: the command line after the command, which beats all layers.
     """
     layers = [replace(layer, options=copy.deepcopy(layer.options)) for layer in layers]
     classes, notes = {}, []

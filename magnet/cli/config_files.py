@@ -36,7 +36,8 @@ class Layer:
 def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
     """A configuration file behind those that it extends, in the order in which later ones win.
 
-    Raises CommandError: a file that is not there, is no YAML, holds no mapping, or extends itself.
+    Raises:
+        CommandError: a file that is not there, is no YAML, holds no mapping, or extends itself.
     """
     options = dict(read_yaml(file))
     here = Path(file).resolve()
@@ -54,7 +55,11 @@ def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
 
 
 def read_yaml(file: str) -> dict[str, Any]:
-    """The options in a file. Raises CommandError: it is not there, is no YAML, or holds no mapping."""
+    """The options in a file.
+
+    Raises:
+        CommandError: it is not there, is no YAML, or holds no mapping.
+    """
     path = Path(file)
     if not path.is_file():
         near = sorted(str(p) for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
@@ -72,7 +77,8 @@ def read_yaml(file: str) -> dict[str, Any]:
 def with_presets(options: dict[str, Any]) -> dict[str, Any]:
     """Options in which `sampler: NAME`, or `preset: NAME` among the sampler's, is what the preset stands for.
 
-    Raises CommandError: no such preset.
+    Raises:
+        CommandError: no such preset.
     """
     sampler = options.get("sampler")
     if isinstance(sampler, str) and is_preset(sampler):
@@ -89,7 +95,11 @@ def is_preset(word: str) -> bool:
 
 
 def sampler_preset(name: str) -> dict[str, Any]:
-    """Every sampler option as a preset has it. Raises CommandError: no such preset; names the closest."""
+    """Every sampler option as a preset has it.
+
+    Raises:
+        CommandError: no such preset; names the closest.
+    """
     from magnet.sampling.options import SamplerOptions
 
     try:

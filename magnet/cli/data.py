@@ -44,7 +44,13 @@ FAILED = 1
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`magnet data ...`; returns the exit code. Raises CommandError, ValueError or OSError: it cannot be done."""
+    """`magnet data ...`. Returns the exit code.
+
+    Raises:
+        CommandError: no such command.
+        ValueError: a data set, option or folder that does not fit; says what does.
+        OSError: a folder or disk that cannot be used.
+    """
     command, *words = arguments or ["--help"]
     if command in ("-h", "--help"):
         parser().print_help()
@@ -161,7 +167,11 @@ def add_download(one: argparse.ArgumentParser) -> None:
 
 
 def needed(given: argparse.Namespace, *names: str) -> list[str]:
-    """Values that must be there. Raises ValueError: one is not."""
+    """Values that must be there.
+
+    Raises:
+        ValueError: one is not.
+    """
     for action in given.parser._actions:
         if action.dest in names and getattr(given, action.dest) is None:
             name, prog = "".join(action.option_strings[:1]) or action.dest, given.parser.prog
@@ -266,7 +276,11 @@ def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[
 
 
 def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
-    """Options that would change nothing. Raises ValueError: one was given."""
+    """Options that would change nothing.
+
+    Raises:
+        ValueError: one was given.
+    """
     used = ("path", "picture", "body", "workers", "reader_options", *used)
     set_ones = {name for name, value in vars(given).items() if value != given.parser.get_default(name)}
     if words := [*(f"--{name}" for name in sorted(set_ones.difference(used))), *given.reader_options]:

@@ -32,7 +32,11 @@ def reader_parser(kind: type[Reader]) -> Any:
 
 
 def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
-    """What was given of them. Raises ValueError: an option that the reader has not, or a value that does not fit."""
+    """What was given of them.
+
+    Raises:
+        ValueError: an option that the reader has not, or a value that does not fit.
+    """
     from jsonargparse import ArgumentError
 
     from magnet.cli.errors import wrong_value

@@ -80,9 +80,11 @@ KINDS = {
 
 
 def wrong_value(message: str, flag: str | None = None) -> str | None:
-    """jsonargparse's lines about a value that does not fit its field, as one; None: they say something else.
+    """The parser's lines about a value that does not fit its field, as one; None where it says something else.
 
-    flag: the field as the user wrote it; None: its key.
+    Args:
+        message: jsonargparse's.
+        flag: the field as the user wrote it; by default its key.
     """
     key = re.search(r'Parser key "([\w.]+)"', message)
     got = re.search(r"(?:Got|Given) value: (.*)", message)

@@ -92,7 +92,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command; returns the exit code. Raises CommandError or ValueError: options or files do not fit."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: files that cannot be read or written; says what to do.
+    """
     options = parser().parse_args(list(arguments))
     from magnet.body import on_floor
     from magnet.cli.errors import CommandError
@@ -142,7 +147,11 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:
-    """The scene with these people alone, in their slots, so colours. Raises CommandError: one is not there."""
+    """The scene with these people alone, who keep their slots and so their colours.
+
+    Raises:
+        CommandError: nobody of that number is there.
+    """
     import torch
 
     from magnet.cli.errors import CommandError

@@ -19,7 +19,13 @@ for example:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command; returns the exit code. Raises CommandError, ImportError, ValueError: no export is possible."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: another suffix, or no such checkpoint.
+        ImportError: a package is missing; says which.
+        ValueError: a model that cannot be exported.
+    """
     parser = PlainParser("export-model", __doc__, EPILOG)
     parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
     parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")

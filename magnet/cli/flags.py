@@ -108,9 +108,12 @@ def help_topic(arguments: Sequence[str]) -> str | None:
 def chosen_flags(
     actions: Sequence[str], classes: Mapping[str, Mapping[str, Sequence[str]]], chosen: Mapping[str, str]
 ) -> list[str]:
-    """All options that may be meant: the command's `actions`, and those of the `classes` that are chosen, or may be.
+    """All options that may be meant: the command's, and those of the classes that are chosen, or may be.
 
-    classes: by key and short name, without dashes; chosen: the class under a key, short or dotted, where one is.
+    Args:
+        actions: the command's own.
+        classes: options of each class, without dashes, by key and short name.
+        chosen: the class under a key, short or dotted, where one is.
     """
     flags = list(actions)
     for key, kinds in classes.items():
@@ -122,10 +125,12 @@ def chosen_flags(
 
 
 def unknown_flag(arguments: Sequence[str], known: Mapping[str, Any]) -> str | None:
-    """What is wrong with the first option that nothing here has; None: all are known, or only the parser can tell.
+    """What is wrong with the first option that nothing here has; None where there is none, or where only the parser
+    can tell: with files, checkpoints and classes of the user's own, and for tasks.
 
-    known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, and `old` names by key. Only the parser
-    can tell with files, checkpoints and classes of the user's own, and for tasks.
+    Args:
+        arguments: after the command.
+        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, and `old` names by key.
     """
     if any(argument.partition("=")[0] in ("-c", "--config", "--ckpt_path") for argument in arguments):
         return None

@@ -87,7 +87,11 @@ def underscored(argument: str) -> str:
 
 
 def run(command: str, arguments: list[str]) -> int:
-    """Run one command. Raises CommandError: no such command."""
+    """Run one command.
+
+    Raises:
+        CommandError: no such command.
+    """
     if command == "predict" and predict_files.meant(arguments):
         return predict_files.main(arguments)
     if command in TRAINER_COMMANDS:

@@ -28,9 +28,13 @@ WIDE = 100
 
 
 def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
-    """Print the table, and write all of it to `folder` as JSON and CSV, with `facts` of how it came about.
+    """Print the table; write all of it as JSON and CSV, with how it came about.
 
-    full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
+    Args:
+        results: of a run that is finished.
+        folder: to write to.
+        facts: more of how it came about.
+        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
     """
     results.meta.update(run_folder.provenance() | {"machine": machine()} | facts)
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"

@@ -92,7 +92,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command; returns the exit code. Raises CommandError or ValueError: options or files do not fit."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: files that cannot be read or written, or on which the task makes no sense; says what to do.
+    """
     if meant(arguments) and arguments[0].startswith("--help"):
         parser().print_help()
         return 0
@@ -147,8 +152,11 @@ def split_groups(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[s
 def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, tuple[int, ...]]:
     """The scene of all files with room for those who are made from nothing. -> scene, body, slots of these
 
-    A crowd is composed of the files' people, again and again, or of couples that the model makes. Raises CommandError:
-    no files and no people, or fewer people than files hold.
+    A crowd is composed of the files' people, again and again, or of couples that the model makes.
+
+    Raises:
+        CommandError: no files and no people, or fewer people than files hold.
+        ValueError: as `formats.read`.
     """
     import torch
 
@@ -179,7 +187,11 @@ def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, 
 
 
 def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:
-    """The task; where people are `added` and it is for some of the people, it is for these. Raises CommandError."""
+    """The task; where people are added and it is for some of the people, it is for these.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
+    """
     from magnet.cli.tasks import parse_task, task_class
 
     name = options.task or ("joint_future" if options.inputs or options.context else "generation")
@@ -189,7 +201,11 @@ def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...
 
 
 def sampler_of(preset: str, flags: list[str]) -> SamplerOptions:
-    """How to sample. Raises CommandError: no such preset or option, or a value that does not fit."""
+    """How to sample.
+
+    Raises:
+        CommandError: no such preset or option, or a value that does not fit.
+    """
     from jsonargparse import ArgumentParser
 
     from magnet.cli.config_files import sampler_preset
@@ -213,7 +229,11 @@ def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
 
 
 def load_model(options: argparse.Namespace, sampler: SamplerOptions) -> Model:
-    """The model that samples. Raises CommandError: there is none of that name."""
+    """The model that samples.
+
+    Raises:
+        CommandError: there is none of that name.
+    """
     from magnet.api import Model
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.module import Denoiser
@@ -224,7 +244,12 @@ def load_model(options: argparse.Namespace, sampler: SamplerOptions) -> Model:
 def lengths(
     options: argparse.Namespace, choice: TaskChoice, scene: Scene, added: tuple[int, ...], model: Model
 ) -> tuple[int, int]:
-    """Frames given of everybody, and frames after them. Raises CommandError: the task reads more than was recorded."""
+    """Frames that are given of everybody, and frames after them.
+
+    Raises:
+        CommandError: the task reads motion that was not recorded.
+        ValueError: the task makes no sense at these sizes.
+    """
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
 

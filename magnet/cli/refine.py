@@ -58,7 +58,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command; returns the exit code. Raises CommandError or ValueError: options or files do not fit."""
+    """Run the command. Returns the exit code.
+
+    Raises:
+        CommandError: an option that makes no sense.
+        ValueError: files that cannot be read or written; says what to do.
+    """
     options = parser().parse_args(list(arguments))
     from pathlib import Path
 

@@ -46,7 +46,13 @@ class Request:
 def read_request(command: str, arguments: list[str], models: dict[str, str]) -> Request:
     """Read the files and the checkpoint that a command line names, and settle who beats whom.
 
-    models: modules of our models, by the class's short name. Raises CommandError: something the user can put right.
+    Args:
+        command: one of the Trainer's.
+        arguments: what follows it.
+        models: modules of our models, by the class's short name.
+
+    Raises:
+        CommandError: something the user can put right.
     """
     given = Arguments.split(arguments)
     checkpoint_config.import_named(given)
@@ -83,9 +89,10 @@ def run_name(command: str, files: list[str]) -> str:
 
 
 def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
-    """The checkpoint to start from, None: from nothing. A fit goes on with its own, others take any run's.
+    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
 
-    Raises CommandError: it is not there.
+    Raises:
+        CommandError: it is not there.
     """
     name, out = given.value("ckpt_path"), given.value("out")
     if name is None and (command == "fit" or given.only_shown):
@@ -95,14 +102,22 @@ def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
 
 
 def chosen_task(command: str, flags: list[str], settled: class_options.Settled) -> TaskChoice:
-    """The task that is sampled, by its options from files and, above them, from flags. Raises CommandError."""
+    """What is sampled: the task that wins, its options from files and above them from flags.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
+    """
     name = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
     below = [class_options.spec_of(layer.options.pop("task", None)).get("init_args") or {} for layer in settled.layers]
     return parse_task(name, flags, below, command)
 
 
 def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags. Raises CommandError."""
+    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
+
+    Raises:
+        CommandError: no such preset.
+    """
     name = Arguments(flags).flag("sampler")
     if command not in SAMPLING or name is None or not config_files.is_preset(name):
         return {}, flags

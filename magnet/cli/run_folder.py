@@ -30,7 +30,8 @@ LATEST = "latest"
 def run_folder(root: Path, out: str | None) -> Path:
     """Folder of this run: `out`, else a new one under `root` named by the time. `Record` tells it to other processes.
 
-    Raises CommandError: `out` is a file.
+    Raises:
+        CommandError: `out` is a file.
     """
     folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     if folder.is_file():
@@ -45,7 +46,8 @@ def run_folder(root: Path, out: str | None) -> Path:
 def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
     """CSV always, TensorBoard where it is installed, wandb on request; only training is logged by default.
 
-    Raises CommandError: wandb is asked for and not installed.
+    Raises:
+        CommandError: wandb is asked for and not installed.
     """
     root, name = str(folder.parent), folder.name
     chosen: list[Logger] = []

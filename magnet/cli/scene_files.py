@@ -39,7 +39,11 @@ OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says
 
 
 def path_to_write(out: str) -> Path:
-    """OUT, whose suffix is one that can be written. Raises CommandError: it is not."""
+    """OUT, whose suffix is one that can be written.
+
+    Raises:
+        CommandError: it is not.
+    """
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 
@@ -51,7 +55,12 @@ def path_to_write(out: str) -> Path:
 
 
 def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
-    """The scenes of all IN; notes about them are printed. Raises CommandError or ValueError: they cannot be read."""
+    """The scenes of all IN; what was noted on the way is printed.
+
+    Raises:
+        CommandError: there are no scenes.
+        ValueError: files that cannot be read; says what to do.
+    """
     from magnet.cli.errors import CommandError
     from magnet.export import formats
 

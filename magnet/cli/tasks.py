@@ -36,7 +36,11 @@ class TaskChoice:
 
     @property
     def task(self) -> Task:
-        """The task itself. Raises ValueError: its fields contradict each other."""
+        """The task itself.
+
+        Raises:
+            ValueError: its fields contradict each other.
+        """
         return registry.get(self.name)(**self.fields)
 
     @property
@@ -62,7 +66,11 @@ def listed(value: Any) -> Any:
 
 
 def task_class(name: str) -> type:
-    """A task's class by its name. Raises CommandError: no such task; names the closest one."""
+    """A task's class by its name.
+
+    Raises:
+        CommandError: no such task; names the closest one.
+    """
     try:
         return registry.get(name)
     except ValueError as error:
@@ -90,8 +98,14 @@ def parse_task(
 ) -> TaskChoice:
     """A task from its flags, over the options that configuration files give it; the only way there is to read one.
 
-    flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`; below: options from files, later ones win; command: whose help
-    errors name. Raises CommandError: no such task or option, or a value that does not fit.
+    Args:
+        name: the task's.
+        flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`.
+        below: options from files, later ones win.
+        command: whose help is named in errors.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
     """
     kind = task_class(name)
     parser = task_parser(kind)
@@ -109,7 +123,11 @@ def task_parser(kind: type | None, **settings: Any) -> ArgumentParser:
 def read_fields(
     parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
 ) -> dict[str, Any]:
-    """Options from files, overridden by flags. Raises CommandError: no such option, or a value that does not fit."""
+    """Options from files, overridden by flags.
+
+    Raises:
+        CommandError: an option that there is not, or a value that does not fit.
+    """
     try:
         cfg = parser.get_defaults(skip_validation=True)
         for options in below:
@@ -218,7 +236,11 @@ class Shown:
 
 
 def show_task(arguments: list[str]) -> int:
-    """Draw the noise levels of a task's schedule, to a PNG or the terminal. Raises CommandError."""
+    """Draw the noise levels of a task's schedule, to a PNG or the terminal.
+
+    Raises:
+        CommandError: no such task or option, or a task that makes no sense at these sizes.
+    """
     from rich.console import Console
     from rich.text import Text
 
@@ -254,7 +276,11 @@ def show_parser(task: type | None) -> ArgumentParser:
 
 
 def parse_shown(name: str, arguments: list[str]) -> tuple[Task, Shown]:
-    """The task and the sizes that a command line asks for. Raises CommandError: no such task, option or value."""
+    """The task and the sizes that a command line asks for.
+
+    Raises:
+        CommandError: no such task, an option that neither has, or a value that does not fit.
+    """
     kind = task_class(name)
     fields = read_fields(show_parser(kind), arguments, (), f"magnet tasks show {name} --help")
     return kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})

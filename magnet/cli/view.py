@@ -84,7 +84,11 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run `magnet view`; returns the exit code. Raises ValueError, OSError or ImportError: it cannot be shown."""
+    """Run `magnet view`. Returns the exit code.
+
+    Raises:
+        ValueError, OSError, ImportError: something the user can put right; the message says what.
+    """
     options = arguments_of(arguments)
     _check(options)
     if options.html is not None:

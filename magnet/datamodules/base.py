@@ -109,7 +109,11 @@ class MotionDataModule(LightningDataModule):
     # -- clips in memory -----------------------------------------------------------------------
 
     def store(self, split: Split, device: torch.device | str = "cpu") -> MemoryStore:
-        """All clips of a split as flat tensors; read once, kept on each device asked for. Raises EmptySplitError."""
+        """All clips of a split as flat tensors; read once, kept on each device asked for.
+
+        Raises:
+            ValueError: the split has no clips.
+        """
         device = torch.device(device)
         if (split, device) not in self._stores:
             if device.type == "cpu":
@@ -119,7 +123,11 @@ class MotionDataModule(LightningDataModule):
         return self._stores[split, device]
 
     def open_store(self, split: Split) -> MemoryStore:
-        """The clips of a split as a store on the CPU, in memory unless overridden. Raises EmptySplitError."""
+        """The clips of a split as a store on the CPU; in memory unless a data set overrides this.
+
+        Raises:
+            EmptySplitError: the split has no clips.
+        """
         clips = self.clips(split)
         if not clips:
             raise EmptySplitError(
@@ -231,16 +239,21 @@ class MotionDataModule(LightningDataModule):
         return windows
 
     def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
-        """Clean training stretches of `frames` frames, `stride` apart, as recorded, and so many composed ones.
+        """Clean training stretches of `frames` frames, `stride` apart, as recorded, and so many composed ones. -> Scene
 
-        Raises ValueError: no clip is long enough.
+        Raises:
+            ValueError: no clip is long enough.
         """
         return self.store("train").gather(
             self._train_index(frames, stride, composed), frames, self.augment.compose_clearance
         )
 
     def train_windows(self, frames: int, stride: int = 30, composed: int = 0, chunk: int = 64) -> Iterator[Scene]:
-        """The same as `train_scenes`, in batches of at most `chunk` scenes."""
+        """The same as `train_scenes`, in batches of at most `chunk` scenes.
+
+        Raises:
+            ValueError: no clip is long enough.
+        """
         store, windows = self.store("train"), self._train_index(frames, stride, composed)
         for first in range(0, len(windows), chunk):
             yield store.gather(windows[first : first + chunk], frames, self.augment.compose_clearance)

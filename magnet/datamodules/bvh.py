@@ -65,7 +65,11 @@ class BvhTrack:
         return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
 
     def skeleton(self, up: str | None = None) -> Skeleton:
-        """Which joint is which, in what unit; y up as `up` or the motion says. Raises DataError: it is not told."""
+        """Which joint is which, in what unit; y up as `up` or the motion says.
+
+        Raises:
+            DataError: names, legs or the rest pose do not tell.
+        """
         try:
             return understood(self.file, self.unit, up, self.joints)
         except ValueError as error:
@@ -178,7 +182,11 @@ def _said(track: BvhTrack, skeleton: Skeleton) -> str:
 
 
 def read_joints(path: Path) -> dict[str, str]:
-    """Lines `OUR_NAME THEIR_NAME`; theirs may hold spaces, a # begins a comment. ValueError: names the wrong line."""
+    """Lines `OUR_NAME THEIR_NAME`; theirs may hold spaces. A # begins a comment.
+
+    Raises:
+        ValueError: no such file, or a line that is no pair, or not of our joints; names it.
+    """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:

@@ -86,7 +86,11 @@ class CHI3DReader(Reader):
 
 
 def axis_angle(where: object, matrices: Doubles) -> Doubles:
-    """Rotation vectors of rotation matrices. (..., 3, 3) -> (..., 3). Raises DataError: some are no rotations."""
+    """Rotation vectors of rotation matrices. (..., 3, 3) -> (..., 3)
+
+    Raises:
+        DataError: some are no rotations.
+    """
     off = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     wrong = (off > 1e-2) | (np.linalg.det(matrices) < 0)
     if wrong.any():

@@ -62,7 +62,11 @@ class Clip:
 
 
 def at_least(least: int, **numbers: int | None) -> None:
-    """Every number that is given is so large. Raises ValueError: names the one that is not."""
+    """Every number that is given is so large.
+
+    Raises:
+        ValueError: names the one that is not.
+    """
     for name, number in numbers.items():
         if number is not None and number < least:
             raise ValueError(f"{name}: got {number}, expected at least {least}")

@@ -130,7 +130,11 @@ class CMUReader(Reader):
         return self.measured(take)[0]
 
     def measured(self, take: Take) -> tuple[Recording, tuple[Glitches, ...]]:
-        """The recording, and what was mended in it. Raises DataError: files lack, are damaged or do not go together."""
+        """The recording, and what was mended in it.
+
+        Raises:
+            DataError: a file is missing or damaged, lengths differ, or the frame rate is implausible.
+        """
         recordings = []
         for asf, amc, rate in zip(take.files, amc_files(take), self.rates(take), strict=False):
             if not amc.is_file() and is_couple(take):
@@ -223,7 +227,11 @@ class CMU(Prepared):
 
     @cached_property
     def recordings(self) -> CMUReader:
-        """The reader of the folder. Raises DataError: no folder or no recordings; says where to get them."""
+        """The reader of the folder.
+
+        Raises:
+            DataError: no folder was given or it holds no recordings; says where to get them.
+        """
         root = self.root or os.environ.get("MAGNET_CMU")
         if not root:
             raise DataError(f"no folder of recordings was given. {WHERE}")
@@ -246,7 +254,8 @@ class CMU(Prepared):
     def prepare_data(self) -> None:
         """Fit what the cache lacks; of a store, look whether it is there and is of this body.
 
-        Raises DataError: there are no recordings, or no take at all could be used.
+        Raises:
+            DataError: no folder was given or it holds no recordings, or no take at all could be used.
         """
         if self.path:
             super().prepare_data()

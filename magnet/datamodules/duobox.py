@@ -152,7 +152,11 @@ class DuoBoxReader(Reader):
         return Recording(fps=RATE, up="+z", positions=positions, joints=joints, persons=names)
 
     def frames(self, where: object, total: int, part: str) -> slice:
-        """Frames of a file that a part such as "tr2" shows. Raises DataError: there is no such part, or no room."""
+        """Frames of a file that a part such as "tr2" shows.
+
+        Raises:
+            DataError: no such part, or the take is too short to have it.
+        """
         kind, phase = part[:2], int(part[2:]) if part[2:].isdigit() else -1
         if kind not in PARTS or not 0 <= phase < THINNING:
             raise DataError(f"{where}: no part {part!r}, expected tr0 to tr3, va0 or te0: give one of them")

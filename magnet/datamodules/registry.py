@@ -65,7 +65,9 @@ _combining: set[type] = set()  # that train on other data sets
 def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D], D]:
     """Class decorator that makes a LightningDataModule known by its name, and the `reader` that it may have.
 
-    Raises TypeError: no LightningDataModule; ValueError: the name is taken by another class.
+    Raises:
+        TypeError: no LightningDataModule.
+        ValueError: the name is taken by another class.
     """
 
     def register(data: D) -> D:
@@ -78,7 +80,12 @@ def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D
 
 
 def register_reader(kind: R) -> R:
-    """Class decorator that makes a reader of downloads known by its `name`. Raises as `register_data`."""
+    """Class decorator that makes a reader of downloads known to `magnet data` by its `name`.
+
+    Raises:
+        TypeError: no Reader.
+        ValueError: the name is taken by another class.
+    """
     _check_reader(kind)
     _readers.append(kind)
     return kind
@@ -144,7 +151,11 @@ def readers() -> dict[str, type[Reader]]:
 
 
 def reader(name: str) -> type[Reader]:
-    """The reader of a name. Raises ValueError: no such data set, or one that needs no preparing; says what to do."""
+    """The reader of a name.
+
+    Raises:
+        ValueError: no such data set, with the closest one; or one that needs no preparing, with what to do instead.
+    """
     known = readers()
     if name in known:
         return known[name]
@@ -170,7 +181,8 @@ def fit_command(data: str) -> str:
 def import_local(path: str) -> None:
     """Make `module.Class` known where the module lies in the working directory and Python finds it nowhere else.
 
-    Raises ValueError: there is no such module, or it cannot be imported, or has no such class; says what there is.
+    Raises:
+        ValueError: there is no such module, or it cannot be imported, or has no such class; says what there is.
     """
     module, _, name = path.rpartition(".")
     top = module.partition(".")[0]

@@ -281,7 +281,11 @@ def _posed(held: Mapping[str, Any]) -> bool:
 
 
 def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise: Any) -> Any:
-    """What the first of several keys holds. Raises DataError: none is there, and there is nothing to take otherwise."""
+    """What the first of several keys holds.
+
+    Raises:
+        DataError: none is there, and there is nothing to take otherwise.
+    """
     for key in keys:
         if held.get(key) is not None:
             return held[key]
@@ -310,8 +314,14 @@ def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
 def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doubles:
     """Rotations as axis-angle numbers: (..., J, 3, 3) matrices, (..., J, 3) vectors or flat already -> (..., 3 J)
 
-    least: numbers a frame; joints: J, where (people, frames, 3) would look like it. Raises DataError: no numbers,
-    another shape, no frames, NaN, or matrices that are no rotations.
+    Args:
+        where: for messages.
+        value: as the file has it.
+        least: numbers a frame.
+        joints: J, where (people, frames, 3) would look like it.
+
+    Raises:
+        DataError: no numbers, another shape, no frames, NaN, or matrices that are no rotations.
     """
     array = np.asarray(value)
     if array.dtype.kind not in "iuf" or array.ndim < 2:

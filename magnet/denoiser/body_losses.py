@@ -41,10 +41,19 @@ def decoded_losses(
     there: Tensor,
     share: float,
 ) -> dict[str, Tensor]:
-    """`body_losses` on the least noisy `share` of a batch's scenes, at least one.
+    """`body_losses` on the least noisy scenes of a batch.
 
-    tokenizer: frozen, decodes; body: on the tokens' device; clean: (B, N, P, D) predicted tokens, normalized; tokens:
-    the true ones in real units; levels (B, N, P) int; there (B, N, P, 1 + slots) bool, as in `token_losses`
+    Args:
+        tokenizer: decodes; frozen.
+        normalizer: of the tokens.
+        layout: of the tokens.
+        body: whose joints are compared, on the tokens' device.
+        clean: (B, N, P, D) predicted tokens, normalized.
+        tokens: (B, N, P, D) the true ones in real units.
+        levels: (B, N, P) int.
+        scene: the batch, of P agents.
+        there: (B, N, P, 1 + slots) bool, as in `token_losses`.
+        share: of the scenes, how many are decoded; at least one is.
     """
     signal = alpha_bar(levels)
     chosen = least_noisy(signal, there, max(1, round(share * len(clean))))
@@ -96,9 +105,16 @@ def body_losses(
 ) -> dict[str, Tensor]:
     """Errors of decoded bodies, each weighted by how little noise the tokens had.
 
-    tokens, truth (B, N, P, D) predicted and recorded, in real units, latents of the latter are not read; true_pose (B,
-    T, P, 135); betas (B, P, 10); signal (B, N, P) share of signal of the noisy tokens; there (B, N, P, 1 + slots) bool,
-    as in `token_losses`; decode: the frozen tokenizer's.
+    Args:
+        tokens: (B, N, P, D) predicted, in real units.
+        truth: (B, N, P, D) the same of the recording; its latents are not read.
+        true_pose: (B, T, P, 135) of the recording.
+        betas: (B, P, 10).
+        signal: (B, N, P) share of signal of the noisy tokens.
+        there: (B, N, P, 1 + slots) bool, as in `token_losses`.
+        layout: of the tokens.
+        decode: the frozen tokenizer's.
+        joints: of the body.
 
     Returns:
         joint: distance of joints in one's own canonical frame, metres. velocity: error of the joints' velocities over

@@ -57,10 +57,17 @@ class LeanBlock:
         rows: Tensor | None = None,
         before: tuple[Tensor, Tensor] | None = None,
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """One block, and the keys and values of its tokens. x (B, L, d) -> (B, L or r, d), and two (B, M + L, heads, D)
+        """One block, and the keys and values of its tokens.
 
-        turn (L, D / 2) complex, or None; sees (L, M + L) bool, or None; rows (r,) int, which tokens are wanted, None:
-        all; before: keys and values (B, M, heads, D) of tokens in front of these
+        Args:
+            x: (B, L, d).
+            turn: (L, D / 2) complex, or None.
+            sees: (L, M + L) bool, or None.
+            rows: (r,) int, which tokens are wanted; None: all.
+            before: keys and values (B, M, heads, D) of tokens in front of these.
+
+        Returns:
+            (B, L or r, d), and keys and values (B, M + L, heads, D).
         """
         if rows is None:
             made = self.qkv(x).unflatten(-1, (3, self.heads, self.each))

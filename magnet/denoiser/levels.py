@@ -36,7 +36,13 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
     `per_sequence`: one a scene. `mixture` (ours) draws for each scene one of these or a *roll-out*: a clean past, a
     block being denoised and an unknown future. The sampler uses such levels, which independent levels almost never
-    are. A `shift` over 1 draws high levels more often, see `shifted`.
+    are.
+
+    Args:
+        kind: see above.
+        B, N, P: scenes, token steps, agents.
+        generator: source of all randomness.
+        shift: over 1 draws high levels more often, see `shifted`.
     """
     device = generator.device
 

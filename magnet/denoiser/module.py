@@ -158,7 +158,11 @@ class Denoiser(L.LightningModule):
 
     @classmethod
     def load(cls, name_or_path: str | Path | None = None) -> Denoiser:
-        """A trained model ready for use, by a shipped model's name or a checkpoint's path. Raises ValueError."""
+        """A trained model ready for use: one that comes with the package by name, or a checkpoint's path.
+
+        Raises:
+            ValueError: no such checkpoint, or not a denoiser's.
+        """
         path = checkpoints.resolve(name_or_path)
         checkpoint = checkpoints.read(path)
         if "tokenizer_hyper_parameters" not in checkpoint:

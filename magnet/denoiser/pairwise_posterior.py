@@ -55,10 +55,17 @@ class PairwisePosterior(nn.Module):
         self.log_bend_ground, self.log_bend_yaw = deviation(0.001), deviation(0.005)
 
     def forward(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Tensor:
-        """The same prediction with better deltas and pairwise transforms. clean, noisy (B, N, P, D) normalized -> same
+        """The same prediction with better deltas and pairwise transforms.
 
-        levels (B, N, P) int; present (B, P) bool: nothing changes for who is absent or alone. Latents, and the first
-        frame's deltas, stay `clean`'s; deltas shown clean are `noisy`'s.
+        Args:
+            clean: (B, N, P, D) what the network predicts, normalized.
+            noisy: (B, N, P, D) what it was shown.
+            levels: (B, N, P) int.
+            present: (B, P) bool; nothing changes for who is absent or alone.
+            normalizer: how tokens are normalized.
+
+        Returns:
+            (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s; deltas shown clean are `noisy`'s.
         """
         known = self._setting(levels, present, normalizer)
         where = known.people.where(*clean.shape[:2])
@@ -224,11 +231,17 @@ SETTINGS: Kept[dict[tuple[object, ...], Setting]] = Kept(lambda posterior: {})
 
 
 def frames_fused(told: Tensor, shown: Tensor, known: Setting) -> Tensor:
-    """Posterior means: one motion, by what a network told and what it was shown. (B, N, P, P, 4, 9) twice -> same
+    """Posterior means: one motion, by what a network told and what it was shown.
 
-    The first of an agent's P transforms are its deltas, the others lead to its partners. `known`: how much they count.
     Yaws are complex numbers exp(-i yaw) here, which turn ground positions x + i z, and numbers 0 and 2 of a transform.
-    The first frame's deltas are those told.
+
+    Args:
+        told: (B, N, P, P, 4, 9); the first of an agent's P transforms are its deltas, the others lead to its partners.
+        shown: (B, N, P, P, 4, 9).
+        known: how much they count.
+
+    Returns:
+        (B, N, P, P, 4, 9). The first frame's deltas are those told.
     """
     frames = torch.stack([told, shown]).permute(0, 1, 2, 5, 3, 4, 6).flatten(2, 3).double()  # (2, B, T, P, P, 9)
     turn, move = torch.complex(frames[..., 0], frames[..., 2]), frames[..., 6::2]
@@ -260,10 +273,13 @@ def deviation(value: float) -> nn.Parameter:
 
 
 def shown_precisions(layout: TokenLayout, normalizer: Normalizer) -> tuple[Tensor, Tensor]:
-    """Precisions (2, K + 1) by level of shown pairwise transforms, and of deltas: 1 / rad^2, 1 / m^2; float64.
+    """Precisions by level of what is shown of pairwise transforms, and of deltas: 1 / rad^2, 1 / m^2.
 
     A heading is read off two of the nine numbers, cosine and sine. Of an arbitrary one, both tell, with the mean of
     their variances; of a delta, whose heading is near 0, the sine alone.
+
+    Returns:
+        (2, K + 1), (2, K + 1) float64.
     """
     alpha = alpha_bar(torch.arange(LEVELS + 1, device=normalizer.std.device)).double()
     noise = (1 - alpha) / alpha.clamp_min(1e-6)

@@ -128,12 +128,19 @@ class PortableEncoder(nn.Module):
 
 
 def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path, float]:
-    """Write a denoiser on the CPU and its tokenizer as three ONNX files; see this module for what they take and give.
+    """Write a denoiser and its tokenizer as three ONNX files; see this module for what they take and give.
 
-    path: of the denoiser, beside which the others lie; name: for the files' metadata. Returns the paths (denoiser,
-    decoder, encoder), and by how much onnxruntime's numbers differ from the model's. Raises ImportError: onnx,
-    onnxruntime or onnxscript is missing; ValueError: a model that cannot be exported, or whose file computes something
-    else.
+    Args:
+        denoiser: trained, on the CPU.
+        path: of the denoiser; the others lie beside it.
+        name: of the model, for the files' metadata.
+
+    Returns:
+        The paths written (denoiser, decoder, encoder), and by how much onnxruntime's numbers differ from the model's.
+
+    Raises:
+        ImportError: onnx, onnxruntime or onnxscript is missing.
+        ValueError: a model that cannot be exported, or whose file computes something else.
     """
     path = Path(path).with_suffix(".onnx")
     layout, N, P = denoiser.layout, denoiser.window, denoiser.layout.agents

@@ -64,10 +64,15 @@ def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Gener
 
 @torch.no_grad()
 def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -> Scene:
-    """A share of the scenes with everybody moved and turned a little up to a random frame, and eased back from there.
+    """Some scenes with everybody moved and turned a little up to a random frame, and eased back from there.
 
     What a model has made drifts: people stand where no recording has them, and the way back is in none. Poses stay as
     they are, so that where people are does not follow from them.
+
+    Args:
+        scene: (B, T) of P agents.
+        share: of the scenes that are changed.
+        generator: of all randomness.
     """
     if not share:
         return scene
@@ -101,15 +106,26 @@ def with_self_forcing(
     shift: float = 1.0,
     cond: Tensor | None = None,
 ) -> Tensor:
-    """Normalized tokens (B, N, P, D): clean pasts of some scenes are the model's own work, the rest is the truth.
+    """Normalized tokens in which the clean pasts of some scenes are the model's own work; the rest is the truth.
 
     Noise is added to a past, the model restores it in one step, and it is rounded to codes and placed in the world, as
     finished tokens are in sampling. It is then a little blurred and calm. Recorded pairwise transforms keep people
     where they stood to each other, so that what follows, which is still the truth, does not begin with a jump.
 
-    requantize: latents to their nearest codes, None: they stay; truth (B, N, P, D) normalized; levels (B, N, P) int,
-    the past of an agent is what is clean before something that is not; options: the share of scenes, and how a past is
-    placed; shift: of the added noise, see `magnet.sampling.noise.shifted`; cond: condition of the scenes
+    Args:
+        denoise: the model.
+        requantize: latents to their nearest codes; None: they stay as they are.
+        normalizer, layout: of the tokens.
+        truth: (B, N, P, D) normalized.
+        levels: (B, N, P) int; the past of an agent is what is clean before something that is not.
+        scene: the same scenes, of P agents.
+        options: the share of scenes, and how a past is placed.
+        generator: of all randomness.
+        shift: of the added noise, see `magnet.sampling.noise.shifted`.
+        cond: condition of the scenes.
+
+    Returns:
+        (B, N, P, D).
     """
     clean = levels == 0
     past = clean & (levels.flip(1).cummax(dim=1).values.flip(1) > 0)

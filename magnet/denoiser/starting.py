@@ -18,7 +18,11 @@ from magnet.tokenizer.normalizer import Normalizer
 
 
 def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
-    """The tokenizer in a denoiser's checkpoint, or in a shipped model by name. Raises ValueError: there is none."""
+    """The tokenizer inside a denoiser's checkpoint, or inside a shipped model by name.
+
+    Raises:
+        ValueError: no denoiser's checkpoint.
+    """
     checkpoint = denoiser_of(path)
     if checkpoint["tokenizer_hyper_parameters"] is not None:
         return Tokenizer.load(path)
@@ -28,7 +32,11 @@ def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
 
 
 def denoiser_of(path: str | Path) -> dict[str, Any]:
-    """A denoiser's checkpoint. Raises ValueError: no such checkpoint, or another model's."""
+    """A denoiser's checkpoint.
+
+    Raises:
+        ValueError: no such checkpoint, or another model's.
+    """
     checkpoint = checkpoints.read(checkpoints.resolve(path))
     if "tokenizer_hyper_parameters" not in checkpoint:
         raise ValueError(
@@ -47,9 +55,17 @@ def start_from(
 ) -> None:
     """Take over another denoiser's transformer, and how tokens are normalized where both tokenizers are the same.
 
-    With another tokenizer latents mean something else, and the normalizer is left to be fitted anew. `path` may be a
-    shipped model's name. With another scale `pairwise_metres` the weights are changed so that they make the same of it.
-    Raises ValueError: the checkpoint is of a model of other sizes.
+    With another tokenizer latents mean something else, and the normalizer is left to be fitted anew.
+
+    Args:
+        path: checkpoint of a denoiser, or the name of a shipped model.
+        transformer: filled.
+        tokenizer: the new model's; compared.
+        normalizer: filled, where it can be.
+        pairwise_metres: another scale of pairwise transforms; the weights are changed so that they make the same of it.
+
+    Raises:
+        ValueError: the checkpoint is of a model of other sizes.
     """
     state = denoiser_of(path)["state_dict"]
     unconditional = {

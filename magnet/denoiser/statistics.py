@@ -13,12 +13,17 @@ from magnet.tokenizer.normalizer import FLOOR
 def token_statistics(
     layout: TokenLayout, tokens: Tensor, there: Tensor, pairwise_metres: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (D,) of each number of tokens (B, N, P, D) in real units.
+    """Mean and standard deviation (D,) of each number of a token.
 
     Latents share one scale and have mean 0, so that a distance between codes stays a distance. The nine numbers of a
     delta or of a pairwise transform are standardized one by one. They are pooled over the frames of a token and over
-    partner slots, so that slots stay exchangeable. there (B, N, P, 1 + slots) bool: which groups count;
-    pairwise_metres: metres over the ground that count as one in pairwise transforms, 0: their standard deviation
+    partner slots, so that slots stay exchangeable.
+
+    Args:
+        layout: of the tokens.
+        tokens: (B, N, P, D) in real units.
+        there: (B, N, P, 1 + slots) bool, which groups count.
+        pairwise_metres: metres that count as one over the ground in pairwise transforms; 0: their standard deviation.
     """
     latent, deltas, pairs = layout.unpack(tokens.double())
     own = there[..., 0]

@@ -123,11 +123,22 @@ class Transformer(nn.Module):
     groups: Tensor
 
     def forward(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: Tensor | None = None) -> Tensor:
-        """Clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) bool -> (B, N, P, D)
+        """Predict clean tokens.
 
-        Absent agents are not looked at, so they change nothing; their own output is meaningless. cond (B, C) for whole
-        scenes or (B, N, C) for each token step; where it is NaN, or None, there is no condition. Raises ValueError: a
-        condition for a model without one, or of another size.
+        Absent agents are not looked at, so they change nothing; their own output is meaningless.
+
+        Args:
+            noisy: (B, N, P, D) normalized.
+            levels: (B, N, P) int in 0..K.
+            present: (B, P) bool.
+            cond: (B, C) for whole scenes or (B, N, C) for each token step. Where it is NaN, and everywhere where it is
+                None, there is no condition.
+
+        Returns:
+            (B, N, P, D).
+
+        Raises:
+            ValueError: a condition for a model without one, or of another size.
         """
         B, N, P, _ = noisy.shape
         there = self.layout.group_present(present)[:, None]  # (B, 1, P, 1 + slots)

@@ -111,7 +111,8 @@ class Evaluator(L.LightningModule):
     def start(self, datamodule: MotionDataModule) -> None:
         """Set up what is measured.
 
-        Raises ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
+        Raises:
+            ValueError: the context is not a whole number of tokens, or `interval` is none of its choices.
         """
         self.context, self.horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
         self.stats, self.scenes = SamplingStats(), 0

@@ -102,7 +102,11 @@ class Results:
 
     @staticmethod
     def load_json(path: str | Path) -> Results:
-        """Read what `save_json` wrote. Raises ValueError: the file holds something else, or a later format."""
+        """Read what `save_json` wrote.
+
+        Raises:
+            ValueError: the file holds something else, or a later format.
+        """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
             version, meta, rows = content["format"], content["meta"], content["rows"]
@@ -192,9 +196,13 @@ def print_table(
     title: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Print methods as rows and `metrics` as columns (None: the main ones), the best bold, and what columns mean.
+    """Print methods as rows and metrics as columns, the best in bold, and what the columns mean.
 
-    A table wider than the screen is cut into several, never its numbers. `intervals`: print those that there are, too.
+    A table wider than the screen is cut into several, never its numbers.
+
+    Args:
+        metrics: which, in this order; None: the main ones.
+        intervals: also the interval of each value that has one.
     """
     console = console or Console()
     chosen = results.chosen(metrics)

@@ -53,10 +53,14 @@ class Bvh:
 
 
 def read_bvh(path: str | Path) -> Bvh:
-    """Read one BVH file. Raises FileNotFoundError; ValueError: names the line that makes no sense.
+    """Read one BVH file.
 
     Position channels of a joint replace its OFFSET, as most programs write them. If they are nearer to zero than to
     the OFFSET, they are added to it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: no BVH, truncated, or a line makes no sense; names file and line.
     """
     path = Path(path)
     try:

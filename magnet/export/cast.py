@@ -60,7 +60,11 @@ class Cast:
         return self.body.vertices(self.scene.slice(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
 
     def few(self) -> Light:
-        """The body's light mesh. Raises ValueError: the body is none of ours, which have a rest shape and weights."""
+        """The body's light mesh.
+
+        Raises:
+            ValueError: the body is none of ours, which have a rest shape and weights.
+        """
         if not isinstance(self.body, Body):
             raise ValueError(f"style light: expected a magnet.body.Body, got {type(self.body).__name__}; use body")
         return light(self.body, LIGHT)
@@ -82,7 +86,8 @@ class Cast:
 def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None) -> Cast:
     """One scene (B = 1) made ready for drawing. known: (T, P) bool, what is drawn pink.
 
-    Raises ValueError: no such style, nobody present, or joints that are not finite.
+    Raises:
+        ValueError: no such style, nobody present, or joints that are not finite.
     """
     if style not in STYLES:
         raise ValueError(f"style {style!r}: expected one of {', '.join(STYLES)}")
@@ -107,7 +112,11 @@ def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None)
 
 
 def default_body(scene: Scene) -> Posable:
-    """The packaged open body, for scenes that belong to it. Raises ValueError: the scene belongs to another body."""
+    """The packaged open body, for scenes that belong to it.
+
+    Raises:
+        ValueError: the scene belongs to another body, which must be given.
+    """
     from magnet.body import load_body  # late: drawing with a given body needs no packaged one
 
     body = load_body("open")
@@ -119,7 +128,11 @@ def default_body(scene: Scene) -> Posable:
 
 
 def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
-    """Labelled scenes with B = 1 each. Raises ValueError: no scene, or scenes of different length."""
+    """Labelled scenes with B = 1 each.
+
+    Raises:
+        ValueError: no scene, or scenes of different length.
+    """
     if isinstance(scenes, Scene):
         names = scenes.names or ("",) * scenes.scenes
         labels = [f"{name} · {b + 1}" if name and names.count(name) > 1 else name for b, name in enumerate(names)]
@@ -140,7 +153,8 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
 def known_frames(scene: Scene, context_frames: int) -> Tensor:
     """(T, P) bool: which frames a model was given, as a scene (B = 1) says, else the first ones of everybody.
 
-    Raises ValueError: more context than frames.
+    Raises:
+        ValueError: more context than frames.
     """
     if not 0 <= context_frames <= scene.frames:
         raise ValueError(f"context_frames: got {context_frames}, expected 0 to {scene.frames}, the scene's frames")

@@ -25,7 +25,8 @@ NEEDS = (
 def blender() -> list[str]:
     """The command that runs a script in Blender: `MAGNET_BLENDER`, this Python where it has bpy, or the program.
 
-    Raises ImportError: none of them is there.
+    Raises:
+        ImportError: none of them is there.
     """
     if python := os.environ.get(VARIABLE):
         return [python]
@@ -37,9 +38,14 @@ def blender() -> list[str]:
 
 
 def save_fbx(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions = BoneOptions()) -> Path:
-    """Write one scene (B = 1) as FBX, everybody skinned and animated, a keyframe for every frame. Returns the path.
+    """Write one scene (B = 1) as FBX, everybody skinned and animated, with a keyframe for every frame.
 
-    Raises ImportError: Blender is not here; ValueError: what `save_glb` refuses, or Blender's own words where it fails.
+    Returns:
+        The path written.
+
+    Raises:
+        ImportError: Blender is not here; says how to get it.
+        ValueError: what `save_glb` refuses, or Blender's own words where it fails.
     """
     command = blender()
     path = Path(path).with_suffix(".fbx")

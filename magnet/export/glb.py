@@ -185,7 +185,11 @@ class _Gltf:
     def person(
         self, number: int, slot: int, rest: Tensor, mesh: dict[str, int], bones: BoneOptions
     ) -> tuple[int, int | None]:
-        """Nodes, colour, mesh and skin of a person at rest (22, 3). -> nodes of the pelvis and of the floor bone"""
+        """Nodes, colour, mesh and skin of one person at rest. rest (22, 3), standing
+
+        Returns:
+            The pelvis's node, after which joints follow in order, and that of the bone on the floor.
+        """
         label = f"person_{number}"
         group = self.add("nodes", {"name": label, "children": []})
         floor = self.add("nodes", {"name": "root", "children": []}) if bones.root == "floor" else None

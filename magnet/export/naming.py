@@ -73,9 +73,13 @@ class Naming:
 
 
 def recognised(names: Sequence[str], given: Mapping[str, str] | None = None) -> Naming:
-    """The scheme that explains most of a skeleton's names; `given` goes before any scheme: our joint's name: theirs.
+    """The scheme that explains most of a skeleton's names.
 
-    Raises ValueError: `given` names a joint that does not exist.
+    Args:
+        given: our joint's name: their joint's name, where names alone do not tell; goes before any scheme.
+
+    Raises:
+        ValueError: `given` names a joint that does not exist.
     """
     words = [split_side(name) for name in plain(names)]
     best = Naming("none", {})

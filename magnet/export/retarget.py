@@ -137,10 +137,14 @@ def load_bvh(
 def onto(
     skeleton: Skeleton, body: Body, refuse_above: float = REFUSED_FIT, most_shape: float | None = None
 ) -> tuple[Scene, Source]:
-    """One person on a body, and how the file was interpreted. Raises ValueError: no fit.
+    """One person on a body, and how the file was interpreted.
 
-    refuse_above: mean distance of limb joints in metres that is no fit; most_shape: bound of fitted shape numbers,
-    None: whatever lies nearest to the bones' lengths.
+    Args:
+        refuse_above: mean distance of limb joints in metres that is no fit.
+        most_shape: bound of fitted shape numbers; None: whatever lies nearest to the bones' lengths.
+
+    Raises:
+        ValueError: no fit.
     """
     return _exact(skeleton, body) or _fitted(skeleton, body, refuse_above, most_shape)
 

@@ -11,9 +11,15 @@ from magnet.motion.scene import Scene, cat_agents
 
 
 def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | None = None, trim: bool = False) -> Scene:
-    """Several people, each a scene with B = 1, as one scene in one world; `labels`, such as files, name them in errors.
+    """Several people, each a scene with B = 1, as one scene in one world.
 
-    fps: bring all to this rate; trim: cut all to the shortest; else they must agree. Raises ValueError: they do not.
+    Args:
+        labels: what to call each in errors, such as its file.
+        fps: bring all to this rate; None: they must agree.
+        trim: cut all to the shortest; else lengths must agree.
+
+    Raises:
+        ValueError: rates, lengths or bodies differ.
     """
     if fps is not None:
         people = [resampled(person, fps) for person in people]

@@ -48,9 +48,13 @@ class Skeleton:
 
 
 def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
-    """A file's skeleton in metres, y up, with our joints; what is None is found out. `given`: our joint's name: theirs.
+    """A file's skeleton in metres, y up, with our joints; what is None is found out.
 
-    Raises ValueError: unknown names, a length of legs that fits no unit, or a rest pose without a front.
+    Args:
+        given: our joint's name: theirs, for names that no scheme knows.
+
+    Raises:
+        ValueError: unknown names, a length of legs that fits no unit, or a rest pose without a front.
     """
     naming = recognised(file.names, given)
     if naming.missing:

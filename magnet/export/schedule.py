@@ -44,10 +44,13 @@ class Moment:
 
 
 def moments(schedule: MaskSchedule, count: int = 16) -> list[Moment]:
-    """At most `count` moments, at least four, the first and the last among them.
+    """At most `count` moments, the first and the last among them.
 
-    All steps where they are few; else the first stage more closely, and later ones halfway, which show the window
-    moving on.
+    All steps where they are few; else the first stage more closely, and later ones halfway, which
+    show the window moving on.
+
+    Raises:
+        ValueError: fewer than four moments.
     """
     if count < 4:
         raise ValueError(f"moments: got {count}, expected 4 or more")

@@ -22,8 +22,10 @@ PLAIN = {
 def schedule_text(schedule: MaskSchedule, width: int = 80, colour: bool = True, count: int = 16) -> Text:
     """A schedule for the terminal, in coloured half blocks, or in plain characters, with its legend.
 
-    width: letters of a line, for which token steps are left out; colour: two agents share a line, one in its upper and
-    one in its lower half, else a line each; count: moments of the denoising at most.
+    Args:
+        width: letters of a line; token steps are left out where they are more.
+        colour: two agents share a line, one in its upper and one in its lower half; else a line each.
+        count: how many moments of the denoising at most.
     """
     rows = moments(schedule, count)
     names = [agent_name(agent) for agent in range(schedule.agents)]

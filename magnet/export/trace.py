@@ -67,7 +67,11 @@ class DenoisingTrace:
 
     @staticmethod
     def load(path: str | Path) -> DenoisingTrace:
-        """Read what `save` wrote. Raises ValueError: not such a file, or of a later format."""
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: not such a file, or of a later format.
+        """
         try:
             with load_npz(path) as file:
                 meta = json.loads(str(file["meta"]))

@@ -29,9 +29,13 @@ def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:
 def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_delta: Tensor) -> Tensor:
     """Bend a path so that it leads to a known frame: headings first, then positions, with deltas of the same length.
 
-    T_world_can (B, F, 4, 4) up to the frame before the known one, the first stays; T_world_key (B, 4, 4) the known
-    frame, key_delta (B, 4, 4) the delta from there -> (B, F, 4, 4). What is added grows as a smoothstep, so that it
-    adds no speed at either end.
+    Args:
+        T_world_can: (B, F, 4, 4) canonical frames up to the one before the known one; the first stays.
+        T_world_key: (B, 4, 4) the known frame.
+        key_delta: (B, 4, 4) the delta from there.
+
+    Returns:
+        (B, F, 4, 4). What is added grows as a smoothstep, so that it adds no speed at either end.
     """
     path, T_world_key = T_world_can.double(), T_world_key.double()
     yaw, ground = to_planar(path)
@@ -78,10 +82,14 @@ def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tens
 
 
 def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
-    """Restore given frames; the difference at each seam fades out over `blend` generated frames beside it.
+    """Restore given frames; the difference at each seam fades out over the generated frames beside it.
 
-    decoded (B, T, P) the lossy reconstruction, given (B, T, P) what is known, T_world_can (B, T, P, 4, 4) where
-    everybody stands, keep (T, P) bool, known frames
+    Args:
+        decoded: (B, T, P) the lossy reconstruction.
+        given: (B, T, P) what is known.
+        T_world_can: (B, T, P, 4, 4) where everybody stands.
+        keep: (T, P) bool, known frames.
+        blend: frames over which a seam fades out.
     """
     body_rot, T_world_root = decoded.body_rot, decoded.T_world_root
     decoded_can_root = inverse(T_world_can) @ T_world_root
@@ -125,8 +133,14 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
 def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Restore given frames and continue from them with their velocity; frames before a seam do not change.
 
-    `crossfade_given`, whose arguments these are, keeps no velocity, which would show at the seams of a causal plan:
-    each block has one.
+    `crossfade_given` keeps no velocity, which would show at the seams of a causal plan: each block has one.
+
+    Args:
+        decoded: (B, T, P) bodies.
+        given: (B, T, P) what is known or has been shown.
+        T_world_can: (B, T, P, 4, 4) where everybody stands.
+        keep: (T, P) bool, known frames.
+        blend: frames over which a seam fades out.
     """
     T_can_world = inverse(T_world_can)
     decoded_can_root, given_can_root = T_can_world @ decoded.T_world_root, T_can_world @ given.T_world_root

@@ -70,10 +70,13 @@ class BodyGuidance:
         return cls(world, world.options.body_guidance, low, last)
 
     def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor:
-        """The estimate (B V, W, P, D), normalized, of each view, with its bodies out of each other.
+        """The estimate with its bodies out of each other.
 
-        now (V, W, P) int, levels that it was made at; hidden (V, W, P) bool, what each view hides, None: nothing;
-        first: token step, of all, that the window begins with
+        Args:
+            clean: (B V, W, P, D) normalized, of each view.
+            now: (V, W, P) int, levels that it was made at.
+            hidden: (V, W, P) bool, what each view hides; None: nothing.
+            first: token step, of all, that the window begins with.
         """
         first -= self.world.released
         low = (now > 0) & (now <= self.low)
@@ -216,8 +219,11 @@ def moved_along(
 ) -> tuple[Tensor, Tensor]:
     """Deltas and pairwise transforms of people who are moved over the ground.
 
-    deltas, pairs (B, W, P, 4, 9), (B, W, P, P - 1, 4, 9) of a window, T_world_can (B, 4 n, P, 4, 4) of its rows [low,
-    stop), shift (B, 4 n, P, 2) metres in the world
+    Args:
+        deltas, pairs: (B, W, P, 4, 9), (B, W, P, P - 1, 4, 9) of a window.
+        T_world_can: (B, 4 n, P, 4, 4) of its rows [low, stop).
+        shift: (B, 4 n, P, 2) metres in the world.
+        low, stop: rows of the window.
     """
     yaw, _ = to_planar(T_world_can)
     grown = F.pad(shift, (0, 0, 0, 0, 1, 0)).diff(dim=1)

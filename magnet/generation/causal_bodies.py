@@ -98,8 +98,12 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
 def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
     """Decode the bodies of the token steps up to `stop`; they are given from then on.
 
-    world: all earlier token steps are finalized; tokens (B, N, P, D): those up to `near` are read, one past the last
-    finished token step and at least `stop`; expected: see `Expected.behind`, from `near` on
+    Args:
+        world: of which all earlier token steps are finalized.
+        tokens: (B, N, P, D), of which those up to `near` are read.
+        stop: one past the last token step to finalize.
+        near: one past the last finished token step, at least `stop`.
+        expected: see `Expected.behind`, from `near` on.
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 
 def occupied(scene: Scene) -> int:
-    """Number of slots up to the last one that is occupied in any scene: plans need no free slots after it.
+    """Number of slots up to the last one that is occupied in any of the scenes: plans need no free slots after it.
 
-    Raises ValueError: a scene has nobody in it.
+    Raises:
+        ValueError: a scene has nobody in it.
     """
     empty = (~scene.present.any(dim=1)).nonzero()[:, 0].tolist()
     if empty:
@@ -58,10 +59,18 @@ def receptive_field(model: Denoiser) -> tuple[int, int]:
 
 
 def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None = None) -> Scene:
-    """Token steps [first, stop) of recordings without anything unknown, so that nothing leaks. known (N, P) bool
+    """The scene with everything unknown removed, so that nothing can leak. known (N, P) bool
 
-    Unknown frames hold a body at rest at the origin. Frames are added or removed so that their number is right; beyond
-    the end of `known`, where None stops, nothing is known. Raises ValueError: something is known that was not recorded.
+    Unknown frames hold a body at rest at the origin. Frames are added or removed so that their number is right.
+
+    Args:
+        scene: the recordings.
+        known: (N, P) bool, of the whole scene.
+        first: token step at which to begin.
+        stop: token step at which to end; beyond the end of `known` nothing is known. None: at the end of `known`.
+
+    Raises:
+        ValueError: something is known that was not recorded.
     """
     needed = int(known.any(dim=1).nonzero()[-1]) + 1 if bool(known.any()) else 0
     if needed * TOKEN_FRAMES > scene.frames:

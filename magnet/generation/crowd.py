@@ -57,11 +57,14 @@ def generate_crowd(
     stats: SamplingStats | None = None,
     cond: Tensor | None = None,
 ) -> Scene:
-    """Sample a task for any number of people; arguments, result and errors as of `magnet.generation.rollout.generate`.
+    """Sample a task for any number of people; arguments and result as of `magnet.generation.rollout.generate`.
 
     Scenes and samples are made one after the other, and people are always kept apart (`firm`, unless `options` say
-    `light`). Of as many people as the model has slots for, or fewer, a single scene is what `generate` makes, bit for
-    bit. Raises ValueError, too, where somebody's start is not known, or the options or the task are not for crowds.
+    `light`). Of as many people as the model has slots for, or fewer, a single
+    scene is what `generate` makes, bit for bit.
+
+    Raises:
+        ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
     """
     made = []
     for number in range(scene.scenes * samples):

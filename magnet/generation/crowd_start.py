@@ -37,10 +37,17 @@ def start_crowd(
     groups: Sequence[Scene] = (),
     spacing: float = SPACING,
 ) -> Scene:
-    """How a crowd begins: groups again and again, or couples of different shapes that the model samples.
+    """How a crowd begins: given groups again and again, or couples of different shapes that the model makes.
 
-    generator: on the model's device; groups, spacing: as for `compose`. -> one scene of `people`; of `START` frames
-    where the model makes it
+    Args:
+        model: which makes couples where there are no groups.
+        people: how many in all.
+        options: how couples are sampled.
+        generator: source of randomness, on the model's device.
+        groups, spacing: as for `compose`.
+
+    Returns:
+        One scene of `people`; of `START` frames where the model makes it.
     """
     require_whole("people", people, 1)
     turns = torch.Generator()
@@ -56,11 +63,19 @@ def start_crowd(
 
 
 def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, spacing: float = SPACING) -> Scene:
-    """Groups on one floor: in cells of a grid that is as square as possible, turned by chance. -> one scene
+    """Groups on one floor: in the cells of a grid that is as square as possible, turned by chance.
 
-    groups: single scenes of the same length, taken in turns, again and again; who is not present, or not needed of the
-    last group, is left out. generator: of the turns, on the CPU; spacing: metres between the middles of neighbouring
-    cells. Raises ValueError: there are no groups or nobody in them, or counts that are none.
+    Args:
+        groups: single scenes of the same length; taken in turns, again and again. What is not present is left out.
+        people: how many in all; of the last group no more than are needed.
+        generator: of the turns, on the CPU.
+        spacing: metres between the middles of neighbouring cells.
+
+    Returns:
+        One scene of `people`, all present, in the middle of the floor.
+
+    Raises:
+        ValueError: there are no groups or nobody in them, or counts that are none.
     """
     require_whole("people", people, 1)
     require_number("spacing", spacing, over=0)

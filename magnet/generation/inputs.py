@@ -23,8 +23,9 @@ ROUNDED = 0.05
 def check_request(model: Denoiser, scene: Scene, context: int, frames: int | None, samples: int) -> None:
     """Refuse what cannot be sampled whatever the task.
 
-    Raises ValueError: a model that was not trained, no scenes, people or frames that fit the model, another frame rate,
-    or counts that are none.
+    Raises:
+        ValueError: a model that was not trained, no scenes, people or frames that fit the model, another frame rate,
+            or counts that are none.
     """
     model.require_tokenizer()
     if not model.normalizer.ready:
@@ -45,10 +46,16 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
 
 
 def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
-    """Refuse given motion that is not valid; what is not given may hold anything. known (N, P) bool: what is read
+    """Refuse given motion that is not valid; what is not given may hold anything. known (N, P) bool
 
-    any_floor: accept people who stand far from y = 0. Raises ValueError: NaN, infinities or what is no rotation, or
-    everybody stands far from the floor; names scene, agent and frame, and what to do.
+    Args:
+        scene: B recordings; of frames beyond them nothing is known.
+        known: token steps that are read.
+        any_floor: accept people who stand far from y = 0.
+
+    Raises:
+        ValueError: NaN, infinities or what is no rotation, or everybody stands far from the floor; names scene, agent
+            and frame, and what to do.
     """
     unshaped = ~scene.betas.isfinite().all(dim=-1) & scene.present
     if bool(unshaped.any()):

@@ -58,8 +58,12 @@ class Keyframe:
 def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held: bool = False) -> Keyframe:
     """A keyframe from an agent's motion in a scene (B = 1): the token that holds `frame`, at its place there.
 
-    pose: the frame that the motion is taken from, brought to the place of `frame`, None: `frame` itself; held: one pose
-    for all of the token instead of four frames of motion. Raises ValueError: no such agent or frame.
+    Args:
+        pose: the frame that the motion is taken from, brought to the place of `frame`; None: `frame` itself.
+        held: one pose for all of the token instead of four frames of motion.
+
+    Raises:
+        ValueError: no such agent or frame.
     """
     last = scene.frames - 1
     frame, pose = frame // TOKEN_FRAMES * TOKEN_FRAMES, frame // TOKEN_FRAMES * TOKEN_FRAMES if pose is None else pose

@@ -177,7 +177,9 @@ class Live:
         """The task of the settings; fields that it does not have are left out.
 
         A task that generates somebody from the others is for all but whoever is steered, by default the last one.
-        Raises ValueError: no such task, or it does not go on from a past and so cannot be played live.
+
+        Raises:
+            ValueError: no such task, or it does not go on from a past and so cannot be played live.
         """
         kind = registry.get(self.settings.task)
         if kind is Generation:  # after its first window it only goes on
@@ -196,7 +198,8 @@ class Live:
     def advance(self) -> LiveChunk:
         """Generate the next chunk and append it; if it was `asked` for, the one between the keyframes instead.
 
-        Raises ValueError: the task cannot go on here; says why.
+        Raises:
+            ValueError: the task cannot go on here; says why.
         """
         if self.asked:
             self.asked = False
@@ -235,7 +238,8 @@ class Live:
     def between(self) -> LiveChunk:
         """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
 
-        Raises ValueError: there are no keyframes, or one lies where nothing comes before it.
+        Raises:
+            ValueError: there are no keyframes, or one lies where nothing comes before it.
         """
         begun = time.perf_counter()
         with self.lock:
@@ -250,7 +254,11 @@ class Live:
         return dataclasses.replace(self._append(scene, chunk, version, begun, anew=True), between=True)
 
     def between_from(self) -> int:
-        """The first frame that `between` makes anew. Raises ValueError: as `between`."""
+        """The first frame that `between` makes anew.
+
+        Raises:
+            ValueError: as `between`.
+        """
         if not self.keys:
             raise ValueError("no keyframes: add one first")
         first = min(key.frame for key in self.keys)

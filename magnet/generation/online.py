@@ -63,9 +63,13 @@ class OnlineRollout(Rollout):
         return self.first + self.world.finalized
 
     def feed(self, frames: Scene) -> Scene:
-        """The same frames (B, 4 n), a whole number of the task's blocks, with what the task generates in them, final.
+        """The same frames with what the task generates in them, final.
 
-        Of whoever is generated nothing is read. Raises ValueError: motion that is not finite, or no rotation.
+        Args:
+            frames: (B, 4 n), a whole number of the task's blocks; of whoever is generated nothing is read.
+
+        Raises:
+            ValueError: motion that is not finite, or no rotation.
         """
         begins, ends = self.made, self.made + frames.frames // TOKEN_FRAMES
         fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)

@@ -64,9 +64,12 @@ class Partner:
     def answer(self, frames: Scene) -> Scene:
         """The same frames with the answer in them, final; what is given in them comes back as it is.
 
-        frames (B, 4 n), a whole number of blocks: what follows the frames before, of the same people in the same slots
-        and the same world; of those who answer nothing is read. Raises ValueError: not a whole number of blocks, motion
-        that is not finite, or other scenes, people or frame rate.
+        Args:
+            frames: (B, 4 n) what follows the frames before, of the same people in the same slots and the same world;
+                of those who answer nothing is read. A whole number of blocks.
+
+        Raises:
+            ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people or frame rate.
         """
         require_rate(frames, "frames")
         block = self.task.block * TOKEN_FRAMES

@@ -64,8 +64,10 @@ def first_changed(schedule: MaskSchedule) -> list[int]:
 def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> tuple[MaskSchedule, Plan]:
     """The schedule of the beginning of an endless scene, and its plan: that of a long scene, its last stages repeated.
 
-    `slots` are the model's, free ones included. `online`: what is given after the context comes as it happens. Raises
-    ValueError: the plan depends on the scene's end or is not periodic, or the task looks ahead at what is fed.
+    `slots` are the model's, free ones included. `online`: what is given after the context comes as it happens.
+
+    Raises:
+        ValueError: the plan depends on the scene's end or is not periodic, or the task looks ahead at what is fed.
     """
     long, longer = (
         task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)

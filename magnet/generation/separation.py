@@ -39,13 +39,24 @@ def separated(
 ) -> Tensor:
     """Canonical frames of some rows of tokens with the new people moved so far that bodies do not collide.
 
-    Bodies are those of the open body: its capsules are close enough for any shape numbers and joints. latent (B, n, P,
-    C) and deltas (B, n, P, 4, 9) of the rows, T_world_can (B, 4 n, P, 4, 4) where people stand; given (B, 4 n): shapes,
-    who is there, and the poses of those who are `known` (n, P) bool; new (n, P) bool: who may be moved, by row; how: a
-    name in `APART`; begun: the first row is one of before, whence the new ones go on; unseen (P,) bool: whose motion
-    the new ones may know no further than the first row, so that they are taken to stand still from there on;
-    decentralized: the new ones do not see each other either, each makes way alone. -> (B, 4 n, P, 4, 4), others stay
-    where they are, bit for bit
+    Bodies are those of the open body: its capsules are close enough for any shape numbers and joints.
+
+    Args:
+        decode: the tokenizer's.
+        latent: (B, n, P, C) of the rows.
+        deltas: (B, n, P, 4, 9) of the rows.
+        T_world_can: (B, 4 n, P, 4, 4) where people stand.
+        given: (B, 4 n) the rows of the scene: its shapes, who is there, and the poses of those who are known.
+        new: (n, P) bool, who may be moved, by row.
+        how: a name in `APART`.
+        begun: the first row is one of before, whence the new ones go on.
+        known: (n, P) bool, whose poses are in `given`.
+        unseen: (P,) bool, whose motion the new ones may know no further than the first row: they are taken to stand
+            still from there on.
+        decentralized: the new ones do not see each other either; each makes way alone.
+
+    Returns:
+        (B, 4 n, P, 4, 4); others stay where they are, bit for bit.
     """
 
     def bodies(rows: slice) -> Tensor:

@@ -45,11 +45,15 @@ def frozen(scene: Scene, agents: Tensor, frame: int) -> Scene:
 
 
 def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead: int, decentralized: bool) -> Scene:
-    """Poses of some people in a scene (B, T, P) corrected `light` or `firm`, each by what it may see.
+    """Poses of some people corrected, each by what it may see.
 
-    new (T, P) bool: who may be moved; unseen (P,) bool: whom the new ones may know no further than the first `lead`
-    frames, a past, and so take to stand still from there on, or not to be there without a past; decentralized: the new
-    ones do not see each other either.
+    Args:
+        scene: (B, T, P) bodies.
+        new: (T, P) bool, who may be moved.
+        unseen: (P,) bool, whom the new ones may know no further than the first frames: they stand still from there on.
+        how: `light` or `firm`.
+        lead: first frames that are a past; 0: none, and whoever is unseen is not there.
+        decentralized: the new ones do not see each other either.
     """
     body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
@@ -82,9 +86,15 @@ def settled_block(
     lead: int,
     decentralized: bool = False,
 ) -> tuple[Scene, Scene]:
-    """Bodies of some rows of tokens, as they are and with those of new people corrected. -> scenes (B, 4 n, P) twice
+    """Bodies of some rows of tokens, as they are and with those of new people corrected.
 
-    Arguments as for `magnet.generation.separation.separated`; lead: first rows that are of before.
+    Arguments as for `magnet.generation.separation.separated`, and:
+
+    Args:
+        lead: first rows that are of before, whence the new ones go on.
+
+    Returns:
+        (B, 4 n, P) twice.
     """
     there = known.repeat_interleave(TOKEN_FRAMES, dim=0)
     made = posed(decode(latent, given.betas, deltas), T_world_can, given)
@@ -98,10 +108,16 @@ def settled_block(
 
 @torch.no_grad()
 def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) -> tuple[Scene, Tensor]:
-    """Bodies (B, T, P) of a finished chunk corrected, going on from the correction of the chunk before.
+    """Bodies of a finished chunk corrected, going on from the correction of the chunk before.
 
-    fixed (T, P) bool: who stays; how: `light` or `firm`; past: what the last call returned, None: the chunk is the
-    first. -> the scene, and the corrections of its last two frames
+    Args:
+        scene: (B, T, P) bodies.
+        fixed: (T, P) bool, who stays.
+        how: `light` or `firm`.
+        past: what the last call returned; None: the chunk is the first.
+
+    Returns:
+        The scene, and the corrections of its last two frames.
     """
     body = open_body_on(scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
@@ -113,10 +129,18 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) ->
 def settled_on(
     scene: Scene, before: Scene | None, new: Tensor, unseen: Tensor, how: str, past: Tensor | None
 ) -> tuple[Scene, Tensor]:
-    """Bodies (B, T, P) of a causal plan's next frames corrected, each by itself, going on from its own last correction.
+    """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
 
-    before: the frame before, as shown, None: there is none, and nobody else is there yet; new (T, P) bool: who may be
-    moved; unseen (P,) bool: of whom nobody knows more than `before`; how, past and result as of `settled_chunk`
+    Args:
+        scene: (B, T, P) bodies, uncorrected.
+        before: the frame before, as shown; None: there is none, and nobody else is there yet.
+        new: (T, P) bool, who may be moved.
+        unseen: (P,) bool, of whom nobody knows more than `before`.
+        how: `light` or `firm`.
+        past: what the last call returned.
+
+    Returns:
+        The scene, and the corrections of its last two frames.
     """
     body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)

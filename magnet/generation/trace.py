@@ -37,8 +37,11 @@ def record(
 ) -> DenoisingTrace:
     """Sample a task once (B = 1), as `generate` does, and keep what was expected after each step.
 
-    every: so many denoising steps lie between two that are kept; the last one of each window always is. Raises
-    ValueError: several scenes, another frame rate than the model's, or whatever `generate` refuses.
+    Args:
+        every: so many denoising steps lie between two that are kept; the last one of each window always is.
+
+    Raises:
+        ValueError: several scenes, another frame rate than the model's, or whatever `generate` refuses.
     """
     require_one(scene)
     require_rate(scene)

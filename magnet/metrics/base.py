@@ -73,7 +73,11 @@ class MotionMetric(Metric):
         """What was measured, float64 scalars by name."""
 
     def plot(self, val: Any = None, ax: Any = None) -> Any:
-        """A figure and axis of what was measured, or of `val`, a result or several over time. Needs matplotlib."""
+        """A figure and axis of what was measured, or of `val`: a result, or a list of them over time.
+
+        Raises:
+            ModuleNotFoundError: matplotlib is not installed, `pip install "magnet-motion[plot]"`.
+        """
         return self._plot(val, ax)
 
     def add_sum(self, name: str, *shape: int) -> None:

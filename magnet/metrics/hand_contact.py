@@ -25,10 +25,15 @@ def hand_distance(joints: Tensor, partner: Tensor, beyond: float = BEYOND) -> Te
 
 
 def holds(contact: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Contacts (..., T) bool that last without a break, in frames that are scored (`counts`, broadcasts).
+    """Contacts that last without a break.
 
-    -> frames in the hold that each frame lies in, 0 outside of any, (..., T) int; and the first frame of each hold of
-    which any frame is scored, (..., T) bool
+    Args:
+        contact: (..., T) bool.
+        counts: bool that broadcasts to it: frames that are scored.
+
+    Returns:
+        Frames in the hold that each frame lies in, 0 outside of any: (..., T) int. And the first frame of each hold
+        of which any frame is scored: (..., T) bool.
     """
     begins = contact.clone()
     begins[..., 1:] &= ~contact[..., :-1]

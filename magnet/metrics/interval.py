@@ -63,12 +63,21 @@ def bootstrap_interval(
     generator: torch.Generator | None = None,
     units: Tensor | None = None,
 ) -> tuple[Tensor, Tensor] | None:
-    """Confidence interval of a mean by percentile bootstrap over independent units; of fewer than ten, too narrow.
+    """Confidence interval of the mean by percentile bootstrap over independent units.
 
-    totals (C,) one value a clip, or its sum over `counts` (C,); level: share of resamples inside; generator: None draws
-    the same resamples every time; units (C,) int: what each clip is resampled with, a negative one, and None: a clip is
-    its own. Units are sorted first, so their order, which depends on the number of processes, makes no difference. ->
-    lower and upper end; None with fewer than two units, which say nothing of others
+    With fewer than some ten units it is too narrow.
+
+    Args:
+        totals: (C,) one value a clip, or its sum.
+        counts: (C,) what each sum is over; None: plain values.
+        level: share of resamples inside.
+        resamples: how many.
+        generator: None draws the same resamples every time. Units are sorted first, so their order,
+            which depends on the number of processes, makes no difference.
+        units: (C,) int, the unit that each clip is resampled with; a negative one, and None: a clip is its own.
+
+    Returns:
+        Lower and upper end; None with fewer than two units, which say nothing of others.
     """
     counts = torch.ones_like(totals) if counts is None else counts
     rows = torch.stack([totals, counts], dim=-1).double().cpu()

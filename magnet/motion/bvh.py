@@ -38,9 +38,14 @@ class BvhHeader:
 
 
 def bvh_header(lines: Sequence[str], path: object) -> BvhHeader:
-    """The hierarchy in a BVH file's lines, and the two lines after MOTION; `path`: what errors call it.
+    """Read a BVH file's hierarchy and the two lines after MOTION.
 
-    Raises ValueError: no BVH, cut short, or a line that makes no sense; names file and line.
+    Args:
+        lines: of the file.
+        path: what errors call it.
+
+    Raises:
+        ValueError: no BVH, cut short, or a line that makes no sense; names file and line.
     """
     if not _begins(lines):
         raise ValueError(f"{path}: {STRANGE}")
@@ -107,7 +112,11 @@ class _Hierarchy:
 
 
 def parse_hierarchy(path: object, lines: Sequence[str]) -> list[BvhJoint]:
-    """Joints and End Sites of the lines before MOTION, parents first. Raises ValueError: names file and line."""
+    """Joints and End Sites of the lines before MOTION, parents first.
+
+    Raises:
+        ValueError: no BVH, incomplete, or a line that makes no sense; names file and line.
+    """
     if not _begins(lines):
         raise ValueError(f"{path}: {STRANGE}")
     reading = _Hierarchy()

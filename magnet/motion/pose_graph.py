@@ -237,11 +237,14 @@ class BlockTridiagonal:
 
 
 def factor(diagonal: Tensor, before: Tensor) -> BlockTridiagonal:
-    """Factor a symmetric positive definite matrix of which blocks are tied to neighbouring ones only.
+    """Factor a symmetric positive definite matrix whose blocks are tied to neighbouring ones only.
 
-    All but the last block of each run are eliminated at once, which leaves a matrix of the same kind: T blocks take log
-    T rounds of batched products, each by a factor of `RUN` smaller. diagonal (..., T, P, P) each block on the diagonal;
-    before (..., T, P, P) what ties a block to the one before it, that of the first is not read
+    All but the last block of each run are eliminated at once, which leaves a matrix of the same kind: T blocks take
+    log T rounds of batched products, each by a factor of `RUN` smaller.
+
+    Args:
+        diagonal: (..., T, P, P) each block on the diagonal.
+        before: (..., T, P, P) what ties a block to the one before it; that of the first is not read.
     """
     T, P = diagonal.shape[-3:-1]
     if T == 1 or diagonal.shape[:-3].numel() * (T * P) ** 3 <= WHOLE:

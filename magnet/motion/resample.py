@@ -20,7 +20,13 @@ def smoothstep(ramp: Tensor) -> Tensor:
 
 
 def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
-    """Rotations between two (..., 3, 3), along the shorter arc; `share` of the way, 0 to 1, broadcasts to (...)."""
+    """Rotations between two, along the shorter arc.
+
+    Args:
+        first: (..., 3, 3)
+        second: (..., 3, 3)
+        share: how far on, from 0 to 1; broadcasts against (...).
+    """
     turn = roma.rotmat_to_rotvec(first.transpose(-1, -2) @ second)
     return first @ roma.rotvec_to_rotmat(turn * share[..., None])
 
@@ -67,7 +73,11 @@ def resample_valid(valid: NDArray[np.bool_], fps: float, target: float = FPS) ->
 
 
 def at_speed(scene: Scene, speed: float) -> Scene:
-    """Play a scene at another speed (positive), at the same frames a second; rotations between frames by slerp."""
+    """Play a scene at another speed, at the same frames a second; rotations between frames by slerp.
+
+    Raises:
+        ValueError: the speed is not positive.
+    """
     if speed <= 0:
         raise ValueError(f"speed: got {speed}, expected a positive number such as 0.9 or 1.1")
     if speed == 1 or scene.frames < 2:

@@ -176,7 +176,11 @@ class Scene:
         return self.replace(**{name: value[:, frames] for name, value in self.tensors().items() if name in timed})
 
     def pad_agents(self, agents: int) -> Scene:
-        """The same people in `agents` slots; the new slots are absent. Raises ValueError: the scene has more slots."""
+        """The same people in `agents` slots; the new slots are absent.
+
+        Raises:
+            ValueError: the scene has more slots than that.
+        """
         extra = agents - self.agents
         if extra < 0:
             raise ValueError(f"the scene has {self.agents} agents, but room was asked for {agents}")
@@ -203,7 +207,11 @@ class Scene:
 
     @staticmethod
     def load(path: str | Path) -> Scene:
-        """Read what `save` wrote. Raises ValueError: the file is not such a file, or of a later format."""
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: the file is not such a file, or of a later format.
+        """
         try:
             with load_npz(path) as file:
                 meta = json.loads(str(file["meta"]))
@@ -234,7 +242,8 @@ def empty_scene(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:
 def concatenate(scenes: Sequence[Scene]) -> Scene:
     """Several batches of scenes as one batch; slots are padded to the largest group.
 
-    Raises ValueError: there are none, or frames, fps or body differ.
+    Raises:
+        ValueError: there are none, or frames, fps or body differ.
     """
     _require_alike(scenes, ("frames", "fps", "body"))
     first = scenes[0]
@@ -310,7 +319,11 @@ def all_valid(scene: Scene) -> Tensor:
 
 
 def require_rate(scene: Scene, label: str = "the scene") -> None:
-    """Refuse, by a ValueError that says what to do, a scene of another frame rate than the models'."""
+    """Refuse a scene of another frame rate than the models'.
+
+    Raises:
+        ValueError: it has another; says how to bring it there.
+    """
     if not isinstance(scene, Scene):
         raise ValueError(f"{label}: got {type(scene).__name__}, expected a Scene; magnet.read(path) reads one")
     if abs(scene.fps - FPS) > 1e-3:
@@ -321,6 +334,10 @@ def require_rate(scene: Scene, label: str = "the scene") -> None:
 
 
 def require_one(scene: Scene) -> None:
-    """Refuse a batch of several scenes, or of none. Raises ValueError: B is not 1; says how to take one."""
+    """Refuse a batch of several scenes, or of none.
+
+    Raises:
+        ValueError: B is not 1; says how to take one.
+    """
     if scene.scenes != 1:
         raise ValueError(f"got {scene.scenes} scenes, expected one; take each scene.select([b]) by itself")

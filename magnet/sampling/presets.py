@@ -45,7 +45,11 @@ gives every field, so that it stays the paper's whatever the defaults become."""
 
 
 def preset_fields(name: str) -> dict[str, Any]:
-    """Fields of `SamplerOptions` in a preset, guidance as a dictionary. Raises ValueError: no such preset."""
+    """What a preset says of the fields of `SamplerOptions`; guidance as a dictionary of its own.
+
+    Raises:
+        ValueError: no such preset; suggests the closest.
+    """
     if name not in PRESETS:
         close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(PRESETS)}"

@@ -189,8 +189,11 @@ def _predict_in_views(
     """Predict each agent's tokens in its own view, in which hidden tokens are unknown. hidden (P, W, P)
 
     Agents that see the same share a view. A pairwise transform to somebody hidden is unknown too. It is read from the
-    other agent's view if that one sees both, and stays noise otherwise. -> the noisy tokens that the next step starts
-    from and their clean prediction (B, W, P, D), and the levels of their numbers before and after it (W, P, D)
+    other agent's view if that one sees both, and stays noise otherwise.
+
+    Returns:
+        The noisy tokens that the next step starts from and their clean prediction (B, W, P, D), and the levels of their
+        numbers before and after it (W, P, D).
     """
     B, W, P, _ = tokens.shape
     views_hidden, view_of = hidden.unique(dim=0, return_inverse=True)

@@ -66,10 +66,16 @@ def solver_step(
 ) -> Tensor:
     """One step of every number from its level `now` down to its level `after`, given the predicted clean values.
 
-    Without a history this is DDIM. With one, which it brings up to date, it is DPM-Solver++(2M) (Lu et al. 2022, arXiv
-    2211.01095, algorithm 2, data prediction): a DDIM step with the prediction extrapolated to the middle of the step.
-    The first step of a number and the step to level 0 are those of DDIM. noisy, clean (B, N, P, D); now, after (N, P,
-    D) int; eta, step_noise: as for `ddim_step`
+    Without a history this is DDIM. With one it is DPM-Solver++(2M) (Lu et al. 2022, arXiv 2211.01095, algorithm 2, data
+    prediction): a DDIM step with the prediction extrapolated to the middle of the step. The first step of a number and
+    the step to level 0 are those of DDIM.
+
+    Args:
+        noisy, clean: (B, N, P, D).
+        now, after: (N, P, D) int.
+        eta: as for `ddim_step`.
+        step_noise: as for `ddim_step`.
+        history: what came before; brought up to date.
     """
     if history is None:
         return ddim_step(noisy, clean, now, after, eta, step_noise)

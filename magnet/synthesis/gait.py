@@ -77,8 +77,12 @@ def plan_feet(ground: Tensor, yaw: Tensor, people: People, person: int) -> Feet:
     """Footsteps that carry a body along a path: strolling, side-stepping, backing, turning, standing.
 
     A foot lands where the body will be in the middle of its next stance: ahead of a walking body, and below one that
-    stands still. ground (T, 2): path of the pelvis as (x, z), metres; yaw (T,): where it faces, radians, unwrapped;
-    `person` is the index into `people`, their gait and measures.
+    stands still.
+
+    Args:
+        ground: (T, 2) path of the pelvis as (x, z), metres.
+        yaw: (T,) where the body faces, radians, unwrapped.
+        people: gait parameters and body measures; `person` is the index to use.
     """
     steps = _decide(ground.numpy(), yaw.numpy(), people, person)
     return _trace(steps, ground.shape[0], _places(ground.numpy(), yaw.numpy(), people, person))

@@ -61,11 +61,17 @@ def basis(along: Tensor, beside: Tensor) -> Tensor:
 def two_bones(
     start: Tensor, target: Tensor, bend: Tensor, rest: tuple[Tensor, Tensor], hinge: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """World rotations (..., 3, 3) of an upper and a lower bone, so that the chain from `start` ends at `target`.
+    """World rotations of two bones such that the chain from `start` ends at `target`.
 
-    The middle joint lies on the side of the direction `bend`. Out of reach, the chain is stretched toward the target.
-    rest: the two bones at rest, (..., 3) each; hinge (3,): the middle joint's axis at rest, positive turns about it
-    fold the chain
+    The middle joint lies on the side of `bend`. Out of reach, the chain is stretched toward the target.
+
+    Args:
+        start, target, bend: (..., 3) metres; bend is a direction, its length does not matter.
+        rest: the two bones at rest, (..., 3) each.
+        hinge: the middle joint's axis at rest (3,): positive turns about it fold the chain.
+
+    Returns:
+        Rotations (..., 3, 3) of the upper and of the lower bone.
     """
     upper, lower = rest[0].norm(dim=-1), rest[1].norm(dim=-1)
     reach = target - start

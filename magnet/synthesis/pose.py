@@ -81,7 +81,11 @@ class _Bodies:
 
 
 def embody(plan: Plan, people: People, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Whole bodies that do what the plan says. -> body_rot (T, P, 21, 3, 3) and T_world_root (T, P, 4, 4), float64"""
+    """Whole bodies that do what the plan says.
+
+    Returns:
+        body_rot (T, P, 21, 3, 3) and T_world_root (T, P, 4, 4), float64.
+    """
     T, P = plan.yaw.shape
     drift = noise(generator, T, P, 12) * people.energy[:, None]
     fore, load = _strides(plan)

@@ -18,5 +18,9 @@ class Task(Protocol):
     formula: ClassVar[str]  # the distribution it samples, e.g. P(A_0:L | B_0:L)
 
     def schedule(self, grid: Grid) -> MaskSchedule:
-        """The plan on a grid of token steps and agents. Raises ValueError: the task makes no sense on it, and why."""
+        """The plan on a grid of token steps and agents.
+
+        Raises:
+            ValueError: the task makes no sense on this grid (says why).
+        """
         ...

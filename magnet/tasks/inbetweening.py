@@ -42,7 +42,11 @@ class Inbetweening:
         return toward_keys(known, grid)
 
     def _keyframes(self, grid: Grid) -> Iterator[tuple[int, int]]:
-        """All keyframes as (agent, token step). Raises ValueError: one is off the grid, or all is known."""
+        """All keyframes as (agent, token step).
+
+        Raises:
+            ValueError: no such agent or token step, or nothing is left to generate.
+        """
         require_whole("every", self.every, 1)
         require_wholes("keys", self.keys)
         require_wholes("agents", self.agents)
@@ -65,7 +69,10 @@ class Inbetweening:
 def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
     """Generate all that is not known, window by window, each token with the next keyframe in its window if possible.
 
-    known (N, P) bool, not everywhere. In the windows of `MaskSchedule.full_sequence` the last tokens see nothing ahead.
+    known (N, P) bool. In the windows of `MaskSchedule.full_sequence` the last tokens would see nothing ahead.
+
+    Raises:
+        ValueError: everything is known.
     """
     if bool(known.all()):
         raise ValueError("every token is a keyframe: there is nothing to generate between them")

@@ -14,7 +14,11 @@ from magnet.tasks.registry import register_task
 
 
 def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
-    """Which agents are generated. (P,) bool. Raises ValueError: no such agent, or nobody is left to be given."""
+    """Which agents are generated. (P,) bool
+
+    Raises:
+        ValueError: no such agent, or nobody is left to be given.
+    """
     require_wholes("target", target)
     mask = torch.zeros(grid.agents, dtype=torch.bool)
     for agent in target:

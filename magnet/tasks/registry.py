@@ -33,9 +33,11 @@ TASKS = Registry(
 
 
 def register_task(name: str, origin: str = "magnet") -> Callable[[T], T]:
-    """Class decorator that makes a task, a dataclass with `schedule` and a `formula`, known under a name.
+    """Class decorator that makes a task known under a name.
 
-    Raises TypeError: it is none; ValueError: the name is taken by another class.
+    Raises:
+        TypeError: not a dataclass with a `schedule` method and a `formula`.
+        ValueError: the name is taken by another class.
     """
 
     def register(task: T) -> T:

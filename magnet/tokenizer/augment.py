@@ -44,7 +44,8 @@ def swap_limbs(scene: Scene, probability: float, generator: torch.Generator) -> 
 def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene:
     """Turn each joint of each person by a random rotation of its own, the same in all frames.
 
-    angle: standard deviation in radians about each axis; the pelvis turns by a third of it.
+    Args:
+        angle: standard deviation in radians about each axis; the pelvis turns by a third of it.
     """
     B, P = scene.present.shape
     draws = torch.randn(B, 1, P, 22, 3, generator=generator, device=generator.device).to(scene.body_rot)
@@ -59,9 +60,12 @@ def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene
 
 
 def root_noise(deltas: Tensor, speed: float, generator: torch.Generator) -> Tensor:
-    """Add a slow error over the ground to deltas (B, T, P, 9), one for each person, as sampled deltas have it.
+    """Add a slow error over the ground to deltas, one for each person, as sampled deltas have it.
 
-    speed: each person's standard deviation in m/s along either axis is drawn from 0 to this.
+    Args:
+        deltas: (B, T, P, 9) canonical deltas.
+        speed: each person's standard deviation in m/s along either axis is drawn from 0 to this.
+        generator: source of all randomness.
     """
     B, T, P, _ = deltas.shape
     draws = torch.randn(B, T, P, 2, generator=generator, device=generator.device).to(deltas)

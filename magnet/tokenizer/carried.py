@@ -74,12 +74,18 @@ class Carried:
         self.held: list[Steps | None] = []  # of the output of each layer
 
     def __call__(self, network: SpanNetwork, x: Tensor, first: int, final: int, span: Span, edge: int = 0) -> Tensor:
-        """Some steps of what a network makes of the sequence, counted from its beginning. -> (B, stop - start, outputs)
+        """Some steps of what a network makes of the sequence; all are counted from the sequence's beginning.
 
-        network: for another one than before nothing is kept. x (B, n, C): the sequence from `first` on, 0 or a whole
-        number of the network's strides, with all steps that the wanted ones depend on. final: earlier steps of the
-        sequence will be the same in later calls. span: wanted steps of the output. edge: so many first steps of x stand
-        in for others where `first` is not 0; nothing wanted depends on them.
+        Args:
+            network: for another one than before nothing is kept.
+            x: (B, n, C) the sequence from `first` on, with all steps that the wanted ones depend on.
+            first: 0, or a whole number of the network's strides.
+            final: earlier steps of the sequence will be the same in later calls.
+            span: wanted steps of the output.
+            edge: so many first steps of x stand in for others where `first` is not 0; nothing wanted depends on them.
+
+        Returns:
+            (B, stop - start, outputs)
         """
         own = first + (edge if first else 0)
         if network is not self.network or not self._goes_on(x, first, own):

@@ -30,7 +30,9 @@ def shaping(fields: Mapping[str, Any]) -> dict[str, Any]:
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Fields and weights of the tokenizer in a tokenizer's checkpoint, or in that of a denoiser, a shipped one by name.
 
-    Raises FileNotFoundError; ValueError: the file is damaged, or holds no tokenizer.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, or holds no tokenizer.
     """
     path = checkpoints.named(path)
     if not path.exists():

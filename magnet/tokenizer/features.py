@@ -27,7 +27,11 @@ class Features:
 
 
 def features(scene: Scene) -> Features:
-    """Read a scene, cut to a whole number of tokens. Raises ValueError: another frame rate than the model's."""
+    """Read a scene, cut to a whole number of tokens.
+
+    Raises:
+        ValueError: another frame rate than the model's.
+    """
     require_rate(scene)
     scene = scene.slice(0, scene.frames - scene.frames % TOKEN_FRAMES)
     # Mixed precision would round the products of transforms.
@@ -48,7 +52,8 @@ def delta_known(valid: Tensor) -> Tensor:
 def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
     """Mean and standard deviation (D,) of `pose`, `deltas` and `betas` over everybody present in all processes.
 
-    Raises ValueError: nobody is present in any frame.
+    Raises:
+        ValueError: nobody is present in any frame.
     """
     sums: dict[str, Tensor] = {}
     for scene in scenes:

@@ -109,10 +109,17 @@ class Tokenizer(L.LightningModule):
     def encode(
         self, pose: Tensor, betas: Tensor, deltas: Tensor, valid: Tensor | None = None, quantize: bool = True
     ) -> Tensor:
-        """Quantized latents, summed over quantizers. pose (B, T, P, 135), betas (B, P, 10) -> (B, N, P, C) float32
+        """Quantized latents, summed over quantizers.
 
-        T is a multiple of 4; deltas (B, T, P, 9), the identity at the first frame; valid (B, T) bool, frames that may
-        be looked at, None: all; without `quantize` the encoder's latents as they are.
+        Args:
+            pose: (B, T, P, 135), T a multiple of 4.
+            betas: (B, P, 10).
+            deltas: (B, T, P, 9), the identity at the first frame.
+            valid: (B, T) bool, frames that may be looked at; None: all.
+            quantize: False: the encoder's latents as they are.
+
+        Returns:
+            (B, N, P, C) float32.
         """
         latent = self.quantizer.continuous(self.embed(pose, betas, deltas, valid))
         return self.quantizer.nearest(latent) if quantize else latent
@@ -375,8 +382,9 @@ class Tokenizer(L.LightningModule):
     def load(cls, path: str | Path) -> Tokenizer:
         """A trained tokenizer from its checkpoint, or from that of a denoiser that holds one, a shipped one by name.
 
-        Raises FileNotFoundError; ValueError: no such checkpoint, or a weight's shape does not fit its fields; says
-        which.
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no such checkpoint, or a weight's shape does not fit its fields; says which.
         """
         fields, state = read_checkpoint(path)
         fields = {name: value for name, value in fields.items() if name in _fields()}

@@ -68,10 +68,12 @@ class ResidualVQ(Float32):
     def forward(
         self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None
     ) -> Quantized:
-        """Quantize vectors (..., D), in float32 whatever the autocast; in training also update the codes.
+        """Quantize; in training also update the codes.
 
-        mask (...) bool; False: quantized, but left out of updates, loss and counts. generator: draws the vectors that
-        start and revive codes; only that of rank 0 counts.
+        Args:
+            vectors: (..., D), computed in float32 whatever the autocast.
+            mask: (...) bool; False: quantized, but left out of updates, loss and counts.
+            generator: draws the vectors that start and revive codes; only that of rank 0 counts.
         """
         with torch.autocast(vectors.device.type, enabled=False):
             flat = vectors.float().flatten(0, -2)

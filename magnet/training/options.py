@@ -36,7 +36,8 @@ class OptimizerOptions:
 def group_of(kind: type[Group], value: Group | Mapping[str, Any]) -> Group:
     """A group of options from itself, or from plain values as a checkpoint keeps them.
 
-    Raises ValueError: the group has no such option; suggests the closest.
+    Raises:
+        ValueError: the group has no such option; suggests the closest.
     """
     if not isinstance(value, Mapping):
         return value

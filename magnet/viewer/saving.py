@@ -19,7 +19,8 @@ FORMATS = tuple(s.removeprefix(".") for s in formats.WRITTEN if s not in (".fbx"
 def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
     """A take as a file: its suffix without the dot and its content. Several files, as one BVH a person, come as a zip.
 
-    Raises ImportError: the format needs an optional package; says which.
+    Raises:
+        ImportError: the format needs an optional package; says which.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"

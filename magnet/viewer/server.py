@@ -12,7 +12,12 @@ NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
 def start(host: str, port: int, title: str) -> Any:
-    """A viser server on exactly this port, 0: a free one. Raises ImportError; OSError: port or host cannot be used."""
+    """A viser server on exactly this port; port 0 takes one that is free.
+
+    Raises:
+        ImportError: viser is not installed.
+        OSError: the port is taken, or the host is not this machine.
+    """
     viser = require_viser()
     port = free_port(host, port)
     # viser greets with a box of its own; ours says more.
@@ -25,7 +30,11 @@ def start(host: str, port: int, title: str) -> Any:
 
 
 def require_viser() -> Any:
-    """The module viser. Raises ImportError: it is not installed; says how to install it."""
+    """The module viser.
+
+    Raises:
+        ImportError: it is not installed; says how to install it.
+    """
     try:
         import viser
     except ImportError as error:
@@ -36,7 +45,9 @@ def require_viser() -> Any:
 def free_port(host: str, port: int) -> int:
     """The port, if nobody listens there; for 0 one that is free.
 
-    Raises OSError: it is taken, or the host is not this machine; ValueError: no port has this number.
+    Raises:
+        OSError: it is taken, or the host is not this machine.
+        ValueError: no port has this number.
     """
     if not 0 <= port < 2**16:
         raise ValueError(f"--port {port}: expected 0 to {2**16 - 1}; 0 takes any that is free")

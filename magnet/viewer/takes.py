@@ -19,9 +19,13 @@ from magnet.motion.scene import Scene
 def read_takes(
     paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
 ) -> tuple[list[ShownTake], Body]:
-    """All that several files hold, and the body it is shown on: the user's, by default the open one.
+    """All that several files hold, and the body it is shown on.
 
-    Raises FileNotFoundError; ValueError: a file that cannot be read, or files of different frame rates or bodies.
+    body: the user's; by default the open one.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file that cannot be read, files of different frame rates or bodies; says which and what to do.
     """
     body = body or load_body("open")
     found: list[tuple[Path, ShownTake]] = []
@@ -43,7 +47,9 @@ def read_takes(
 def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
     """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
 
-    Raises FileNotFoundError; ValueError: not one of these, damaged, or of another body.
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not one of these, damaged, or of another body.
     """
     if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_trace(path):
         recording = DenoisingTrace.load(path)
@@ -57,7 +63,11 @@ def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
 
 
 def is_trace(path: Path) -> bool:
-    """Whether an npz holds denoising steps. Raises ValueError: the archive is damaged."""
+    """Whether an npz holds denoising steps.
+
+    Raises:
+        ValueError: the archive is damaged.
+    """
     try:
         with load_npz(path) as file:
             return "meta" in file.files and "recording" in json.loads(str(file["meta"]))

@@ -28,6 +28,10 @@ def write_body(path: str | Path, kind: Kind = "smplx") -> Path:
 
     smplx: 55 joints, 20 shape columns, posedirs (V, 3, 486). smpl: 24 joints, 10 columns, posedirs (V, 3, 207). The
     pelvis is 35 cm from the origin and moves with the shape. Always the same bytes.
+
+    Args:
+        path: an npz; folders are made.
+        kind: whose layout.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +41,11 @@ def write_body(path: str | Path, kind: Kind = "smplx") -> Path:
 
 @lru_cache(maxsize=2)
 def arrays(kind: Kind = "smplx") -> dict[str, NDArray]:
-    """The body file's arrays by key. Raises ValueError: no such kind."""
+    """The body file's arrays by key.
+
+    Raises:
+        ValueError: no such kind.
+    """
     if kind not in ("smplx", "smpl"):
         raise ValueError(f"kind: got {kind!r}, expected 'smplx' or 'smpl'")
     J, dirs, parents = _joints(kind)

@@ -39,9 +39,13 @@ MIDDLE = (
 
 
 def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """`takes` of the couple 60 and 61, the first to test, the second to validate on, and one of somebody alone.
+    """Takes of the couple 60 and 61, the first to test, the second to validate on, and one of somebody alone.
 
-    `frames` are at 30 fps; files have 60 a second, that of the one alone 120.
+    Args:
+        out: root of the fake.
+        takes: of the couple.
+        frames: of each at 30 fps; files have 60 a second, of the one alone 120.
+        seed: of the motion.
     """
     numbers = [TEST, VAL, *islice((n for n in count(1) if n not in (TEST, VAL) and n % 5), max(takes - 2, 0))][:takes]
     for folder, subjects in (("salsa", {60: 0.0, 61: 0.8}), ("singles", {2: 0.0})):

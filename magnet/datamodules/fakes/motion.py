@@ -69,9 +69,17 @@ def rest_joints(betas: Array, kind: Kind = "smplx") -> Array:
 
 
 def people(frames: int, persons: int, fps: float = FPS, seed: int = 0, kind: Kind = "smplx") -> FakeMotion:
-    """People (1 to 8) who walk in a line or a circle, feet on the floor at height 0; frame t shows time t / fps.
+    """People walking one behind the other or round in a circle, feet on the floor at height 0.
 
-    Raises ValueError: no frames, or more people than a circle holds.
+    Args:
+        frames: T, at least 1.
+        persons: P, 1 to 8.
+        fps: frame rate; frame t shows time t / fps whatever the rate.
+        seed: the same seed, the same motion.
+        kind: whose body.
+
+    Raises:
+        ValueError: no frames, or more people than a circle holds.
     """
     if frames < 1 or not 1 <= persons <= 8:
         raise ValueError(f"got {frames} frames of {persons} people, expected at least 1 frame and 1 to 8 people")

@@ -101,11 +101,20 @@ def canonicalize(
     family: Family = "smplx",
     options: CanonicalizeOptions | None = None,
 ) -> Canonicalized:
-    """A recording, at any rate and with any up axis, to clips of `body`; positions are fitted to it.
+    """A recording as read to clips of `body`.
 
-    name: the take's; parts of it are called "name [start:stop]" by their frames at 30 fps; source, family: the data
-    set's. Raises DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or
-    positions that the body does not fit within 4 cm.
+    Args:
+        recording: as read, at any rate and with any up axis.
+        body: whose shape numbers `betas` are; for positions: the body to fit.
+        name: the take's; parts of it are called "name [start:stop]" by their frames at 30 fps.
+        source: the data set.
+        split: of the take.
+        family: of the data set.
+        options: what can be chosen.
+
+    Raises:
+        DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or
+            positions that the body does not fit within 4 cm.
     """
     options = options or CanonicalizeOptions()
     recording = of_body(recording, body, source, family)
@@ -148,9 +157,12 @@ def _moved(recording: Recording, body: Body, options: CanonicalizeOptions) -> tu
 
 
 def of_body(recording: Recording, body: Body, source: str, family: Family) -> Recording:
-    """The recording, if its shape numbers can be used with `body`; a DataError if they are another body's.
+    """The recording if its shape numbers can be used with `body`.
 
     Where files may hold anything (`family` any), rotations of SMPL's family go with the open body in its mean shape.
+
+    Raises:
+        DataError: they are another body's.
     """
     if recording.poses is None or recording.body == body.id:
         return recording
@@ -251,10 +263,18 @@ def fit_positions(
     up: Axis = "+y",
     progress: Callable[[int, int], None] | None = None,
 ) -> BodyFit:
-    """A body fitted to a recording's positions, `targets` (T, P, M, 3) at 30 fps, y up, and to its hints.
+    """A body fitted to a recording's positions and to the rotations that it may know.
 
-    valid (T, P); up: axis of the file's world, which hints are in; progress: told steps done and in all. Raises
-    ValueError: the body does not fit.
+    Args:
+        recording: whose joints and hints they are.
+        targets: (T, P, M, 3) its positions at 30 fps, y up.
+        valid: (T, P) at 30 fps.
+        body: to fit.
+        up: axis of the file's world, which hints are in.
+        progress: is told of steps done, and of how many there are.
+
+    Raises:
+        ValueError: the body does not fit.
     """
     rotations = weights = None
     if recording.hints is not None:

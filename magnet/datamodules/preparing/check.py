@@ -82,7 +82,10 @@ def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], pe
 def check_store(folder: StoreReader, body: Body | None = None, progress: Progress | None = None) -> CheckReport:
     """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
 
-    body: the store's, to check that it is; None: not checked. progress: told files done and in all.
+    Args:
+        folder: the opened store.
+        body: its body, to check that it is; None: not checked.
+        progress: is told of progress, by file.
     """
     manifest = folder.manifest
     found = CheckReport(manifest["name"], manifest["title"])
@@ -183,7 +186,11 @@ def _scenes(folder: StoreReader, part: StoreSplit, most: int) -> list[tuple[str,
 
 
 def recognise(root: Path) -> str:
-    """Which data set's layout lies under a folder. Raises ValueError: none or several do, or an own table is wrong."""
+    """Which data set's layout lies under a folder.
+
+    Raises:
+        ValueError: none does, or several do, or a table of a user's own recordings is wrong.
+    """
     found = _readable(root, [name for name, kind in registry.readers().items() if not kind.own])
     found = found or _own(root)
     if len(found) == 1:
@@ -221,9 +228,18 @@ def check_download(
     limit: int | None = None,
     progress: Progress | None = None,
 ) -> CheckReport:
-    """Every take of a download read and canonicalized; nothing is written. Arguments as for `prepare`.
+    """Every take of a download read and canonicalized; nothing is written.
 
-    Raises DataError: there are no takes at all; ValueError: splits that do not fit, or a number out of range.
+    Args:
+        job: which data set, where, and how.
+        workers: processes.
+        splits: as for `prepare`.
+        limit: as for `prepare`.
+        progress: is told of progress.
+
+    Raises:
+        DataError: there are no takes at all.
+        ValueError: a list of splits that does not fit, or a number out of range.
     """
     at_least(1, workers=workers, limit=limit)
     reader: Reader = job.reader()

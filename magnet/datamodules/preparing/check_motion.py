@@ -48,7 +48,8 @@ CONVERT = "convert the file, or take it as it was published"
 def usable(recording: Recording) -> Bools:
     """The recording's valid frames, when its numbers can be used at all. -> (T, P)
 
-    Raises DataError: an impossible frame rate, no valid frame, or NaN where the frame is called valid.
+    Raises:
+        DataError: an impossible frame rate, no valid frame, or NaN where the frame is called valid.
     """
     fps = recording.fps
     if not (math.isfinite(fps) and 1.0 <= fps <= 1000.0):
@@ -88,7 +89,11 @@ def filled(array: Array, valid: Bools) -> Array:
 
 
 def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
-    """Refuse, by a DataError that says where, axis-angle vectors (T, P, 22, 3) of which too many exceed a full turn."""
+    """Check that axis-angle vectors (T, P, 22, 3) are in radians.
+
+    Raises:
+        DataError: too many are longer than a full turn; says where the longest is.
+    """
     with np.errstate(all="ignore"):  # of frames that are not valid
         size = np.linalg.norm(np.asarray(poses, dtype=np.float64), axis=-1)
         size[np.abs(poses).max(axis=-1) > WILD_ANGLE] = 0.0  # what is no angle at all is another matter
@@ -118,10 +123,16 @@ def up_vector(joints: Array, valid: Bools) -> Array:
 
 
 def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) -> None:
-    """Refuse heads that are not above ankles along the declared up axis. joints (T, P, 22, 3) in the file's axes
+    """Check that heads are above ankles along the declared up axis. joints: (T, P, 22, 3)
 
-    NaN: the joint is not known. chosen: the user gave the axis, perhaps because people lie down: only a clear
-    contradiction is refused. Raises DataError: another axis is the dominant one, or none is.
+    Args:
+        declared: by the reader, or by the user.
+        joints: in the file's axes, metres or not; NaN where a joint is not known.
+        valid: (T, P).
+        chosen: the user gave the axis, perhaps because people lie down: only a clear contradiction is refused.
+
+    Raises:
+        DataError: another axis is the dominant one, or none is.
     """
     vector = up_vector(joints, valid)
     size = np.abs(vector)
@@ -142,9 +153,10 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
 
 
 def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
-    """Refuse translations that are not in metres, as bodies are. joints (T, P, 22, 3), pelvis (T, P, 3), y up
+    """Check that translations are in metres, as bodies are. joints (T, P, 22, 3), pelvis (T, P, 3), y up
 
-    Raises DataError: people are too far from each other, from the floor or from where they were.
+    Raises:
+        DataError: people are too far from each other, from the floor or from where they were.
     """
     lowest = joints[:, :, [j for foot in FEET for j in foot], 1].min(axis=-1)
     bob = float(np.ptp(np.percentile(lowest[valid], [5, 95])))
@@ -165,7 +177,11 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
 
 
 def check_apart(transl: Array, valid: Bools) -> None:
-    """Refuse, by a DataError, translations (T, P, 3) that put everybody into one place, before shapes move pelvises."""
+    """Check that translations (T, P, 3) alone keep people apart, before their shapes move pelvises.
+
+    Raises:
+        DataError: they put everybody into one place.
+    """
     apart = _apart(transl, valid)
     if apart is not None and apart < INSIDE:
         raise DataError(
@@ -175,7 +191,11 @@ def check_apart(transl: Array, valid: Bools) -> None:
 
 
 def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
-    """Refuse positions (T, P, M, 3) whose trunks have no person's length in metres, or without hips or shoulders."""
+    """Check that positions (T, P, M, 3) are in metres: trunks have a person's length.
+
+    Raises:
+        DataError: they have not, or hips and shoulders are not among the joints.
+    """
     place = {joint: i for i, joint in enumerate(joints)}
     if not {*HIPS, *SHOULDERS} <= set(place):
         raise DataError(
@@ -196,7 +216,8 @@ def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
 def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
     """Frames at which somebody jumps elsewhere. pelvis (T, P, 3) -> (number,) first frame after each jump
 
-    Raises DataError: there are so many that speeds themselves are wrong.
+    Raises:
+        DataError: there are so many that speeds themselves are wrong.
     """
     step = np.linalg.norm(np.diff(pelvis, axis=0), axis=-1)
     both = valid[1:] & valid[:-1]
@@ -211,10 +232,13 @@ def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
 
 
 def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None:
-    """Refuse a declared frame rate at which people move as nobody does. joints of `WALKING`, y up
+    """Check the declared frame rate by how fast people move. joints of `WALKING`, y up
 
     A rate that is too high shows in the pelvis, in drops faster than falling, and in short footsteps; one that is too
-    low shows in long footsteps alone, where somebody walks. Raises DataError; also where nothing moves at all.
+    low shows in long footsteps alone, where somebody walks.
+
+    Raises:
+        DataError: speeds, accelerations or the duration of footsteps are nobody's; or nothing moves at all.
     """
     together: Bools = np.logical_and.reduce(valid, axis=1)
     if together.sum() < 2 * fps:

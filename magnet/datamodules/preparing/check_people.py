@@ -70,7 +70,11 @@ def who(person: int, names: Sequence[str]) -> str:
 
 
 def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
-    """Check that shape numbers (P, 10) are possible. Raises DataError: one is too far from the mean."""
+    """Check that shape numbers (P, 10) are possible.
+
+    Raises:
+        DataError: one is too far from the mean.
+    """
     size = np.abs(betas).max(axis=1)
     if wrong := np.flatnonzero(~(size <= SHAPE)).tolist():
         listed = "; ".join(f"{who(p, names)}: {', '.join(f'{b:.3g}' for b in betas[p])}" for p in wrong)
@@ -81,7 +85,11 @@ def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
 
 
 def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
-    """Check that bodies at rest (P, 22, 3) have a possible size. Raises DataError: one is not."""
+    """Check that bodies at rest (P, 22, 3) have a possible size.
+
+    Raises:
+        DataError: one is not.
+    """
     tall = rest[:, HEAD, 1] - rest[:, ANKLES, 1].mean(axis=1)
     for p in np.flatnonzero(~((tall >= STATURE[0]) & (tall <= STATURE[1]))).tolist():
         raise DataError(
@@ -94,7 +102,15 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
 
 
 def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
-    """Valid frames (T, P) without those whose numbers are no motion, and flags for these; DataError: none are left."""
+    """Valid frames without those whose numbers are no motion, and flags for the latter.
+
+    Args:
+        recording: as read.
+        valid: (T, P).
+
+    Raises:
+        DataError: nothing is left of somebody.
+    """
     found: list[Flag] = []
     for mask, what in _nonsense(recording):
         for person in range(valid.shape[1]):
@@ -137,9 +153,12 @@ def _far(places: Array) -> Bools:
 
 
 def frozen(still_place: Bools, still_pose: Bools, valid: Bools) -> list[Flag]:
-    """Flags people who are held still while others move. valid (T, P)
+    """Flags people who are held still while others move.
 
-    still_place, still_pose (T - 1, P): whether the pelvis, and all joints' turns, are as in the frame before.
+    Args:
+        still_place: (T - 1, P) whether the pelvis is where it was in the frame before.
+        still_pose: (T - 1, P) whether all joints are turned as in the frame before.
+        valid: (T, P).
     """
     both = valid[1:] & valid[:-1]
     kinds: tuple[tuple[Bools, int, str], ...] = (
@@ -176,17 +195,24 @@ def held_points(points: Array) -> tuple[Bools, Bools]:
 def seen(quat: Array, pelvis: Array, valid: Bools, joints: Array | None = None) -> list[Flag]:
     """Everything of this part that is wrong with motion at 30 fps: who is held, and what jumps.
 
-    quat (T, P, 22, 4) of any one length, the pelvis's in the world; pelvis (T, P, 3) and, where a body is at hand,
-    joints (T, P, 22, 3) metres; valid (T, P)
+    Args:
+        quat: (T, P, 22, 4) quaternions of any one length, the pelvis's in the world.
+        pelvis: (T, P, 3) metres.
+        valid: (T, P).
+        joints: (T, P, 22, 3) metres, where a body is at hand.
     """
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
     return frozen(*held(pelvis, quat), valid) + jumps(quat, joints, valid)
 
 
 def jumps(quat: Array | None, joints: Array | None, valid: Bools, but: Sequence[Flag] = ()) -> list[Flag]:
-    """Joints that turn or move from one frame to the next as none does, less the jumps `but` that are known already.
+    """Joints that turn or move from one frame to the next as none does.
 
-    quat (T, P, 22, 4), the pelvis's in the world, joints (T, P, 22, 3) metres, NaN: not known; either may be None
+    Args:
+        quat: (T, P, 22, 4) unit quaternions, the pelvis's in the world; None: not looked at.
+        joints: (T, P, 22, 3) metres, NaN where a joint is not known; None: not looked at.
+        valid: (T, P).
+        but: jumps that are known already.
     """
     both = valid[1:] & valid[:-1]
     for flag in but:
@@ -210,7 +236,11 @@ def jumps(quat: Array | None, joints: Array | None, valid: Bools, but: Sequence[
 
 
 def without(valid: Bools, flags: Sequence[Flag], names: Sequence[str], fps: float) -> Bools:
-    """(T, P) less the frames of flags that are cut out. Raises DataError: nothing is left of somebody."""
+    """(T, P) less the frames of flags that are cut out.
+
+    Raises:
+        DataError: nothing is left of somebody.
+    """
     left = valid.copy()
     for flag in flags:
         if not flag.cut:

@@ -45,7 +45,11 @@ def families_of(kind: type[Reader]) -> tuple[str, ...]:
 
 
 def require_family(kind: type[Reader], body: Body, option: str, file: str) -> None:
-    """Refuse, by a ValueError, a body of another family: its shape numbers mean something else."""
+    """Refuse a body whose tree of joints is another family's: its shape numbers mean something else.
+
+    Raises:
+        ValueError: it is.
+    """
     families = families_of(kind)
     if not families or body.family in ("", *families) or body.id.startswith("open"):
         return
@@ -84,7 +88,12 @@ class PrepareJob:
         return registry.reader(self.name)(self.root, **self.options)
 
     def body(self) -> Body:
-        """The body model. Raises ValueError: shape numbers without a body file of their family; says whence."""
+        """The body model.
+
+        Raises:
+            ValueError: the data set holds shape numbers, but no body file was given, or another family's; says where to
+                get it.
+        """
         kind = registry.reader(self.name)
         if self.body_file == "open" and kind.family not in ("positions", "any"):
             raise ValueError(
@@ -97,7 +106,11 @@ class PrepareJob:
         return body
 
     def bodies(self) -> dict[Gender, Body]:
-        """Gendered bodies that shape numbers belong to. Raises ValueError: files lack or do not fit."""
+        """Gendered bodies that shape numbers belong to.
+
+        Raises:
+            ValueError: files that are not there, not to be told apart, or of another family.
+        """
         kind = registry.reader(self.name)
         bodies = load_bodies(self.body_files, families_of(kind)) if self.body_files else {}
         for gender, body in bodies.items():
@@ -121,7 +134,11 @@ class PrepareJob:
 
 
 def content(value: Any) -> str:
-    """An option's value as text; of a file or folder its name and content, but not where it lies."""
+    """An option's value as text; of a file or folder its name and content, but not where it lies.
+
+    Raises:
+        ValueError: no such file or folder.
+    """
     if not isinstance(value, Path):
         return str(value)
     if not value.exists():
@@ -184,7 +201,11 @@ class ConvertedTake:
 
     @staticmethod
     def load(path: Path, rows: bool = True) -> ConvertedTake:
-        """What `save` wrote, with or without its rows. Raises ValueError: it is damaged."""
+        """What `save` wrote, with or without its rows.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         with path.open("rb") as file:
             facts = json.loads(str(np.lib.format.read_array(file, allow_pickle=False)))
             betas = np.lib.format.read_array(file, allow_pickle=False)
@@ -278,7 +299,8 @@ def convert_all(
 ) -> Iterator[tuple[Take, ConvertedTake]]:
     """Make the parts of all takes as they are done, each on disk, whole, where `file` says; in any order.
 
-    Raises OSError: a worker process died.
+    Raises:
+        OSError: a worker process died.
     """
     size = {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
     total, done = sum(size.values()), 0

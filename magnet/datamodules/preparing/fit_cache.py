@@ -69,7 +69,11 @@ class FitCache:
         return [take for take in takes if not (self.file(take).exists() or "error" in self.report(take))]
 
     def fill(self, title: str, takes: Sequence[Take]) -> dict[str, str]:
-        """Fit what is lacking. Returns why takes cannot be used, by name. Raises CannotWrite."""
+        """Fit what is lacking. Returns why takes cannot be used, by name.
+
+        Raises:
+            CannotWrite: the disk is full, or the folder does not take files.
+        """
         if todo := self.lacking(takes):
             with writing(self.folder, ADVICE):
                 self.folder.mkdir(parents=True, exist_ok=True)

@@ -48,7 +48,11 @@ def fit_recordings(
     trim: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Fitted:
-    """People captured together as bodies in one scene at 30 fps, standing on y = 0. Raises ValueError: no fit."""
+    """People captured together as bodies in one scene at 30 fps, standing on y = 0.
+
+    Raises:
+        ValueError: lengths differ, or the body does not fit.
+    """
     return fit_whole(*measured(recordings, trim), body, progress)
 
 
@@ -60,7 +64,8 @@ def fit_whole(
 ) -> Fitted:
     """A whole take as bodies in one scene at 30 fps, standing on y = 0; what was mended too long ago is masked.
 
-    Raises ValueError: the body does not fit.
+    Raises:
+        ValueError: the body does not fit.
     """
     assert recording.positions is not None and recording.valid is not None
     targets, good = torch.from_numpy(recording.positions), torch.from_numpy(recording.valid)
@@ -85,7 +90,10 @@ def fit_whole(
 
 
 def wrists_apart(wrists: Tensor, valid: Tensor) -> Tensor:
-    """Metres between two people's nearest wrists, in frames with two valid ones. (T, P, 2, 3), (T, P) -> (frames,)"""
+    """Metres between the nearest wrists of two people, in frames with two who are valid; none for one person.
+
+    (T, P, 2, 3), (T, P) -> (frames,)
+    """
     pairs = [(p, q) for p in range(wrists.shape[1]) for q in range(p)]
     nearest = torch.full((len(wrists), 1), torch.inf, dtype=wrists.dtype)
     for p, q in pairs:

@@ -25,8 +25,10 @@ def find_bodies(paths: Sequence[str | Path], families: Sequence[str] = ()) -> di
     """Body files by gender: from a folder, or files, named such as SMPLX_FEMALE.npz or female/model.npz.
 
     SMPL's own names, such as basicModel_f_lbs_10_207_0_v1.0.0.pkl, are known too. Of an npz and a pkl of one name the
-    npz is taken; where a folder holds bodies of several families, those of `families`. Raises ValueError: no such file
-    or folder, a file of no gender, or two of one.
+    npz is taken; where a folder holds bodies of several families, those of `families`.
+
+    Raises:
+        ValueError: no such file or folder, a file of no gender, or two of one.
     """
     found: dict[Gender, Path] = {}
     for given in map(Path, paths):
@@ -74,9 +76,15 @@ def load_bodies(paths: Sequence[str | Path], families: Sequence[str] = ()) -> di
 def one_body(recording: Recording, bodies: Mapping[Gender, Body], body: Body) -> Recording:
     """The same motion with everybody's shape expressed in `body`; notes say how far joints at rest are off.
 
-    The pelvis stays where the person's own body has it: transl + J0(beta) is that of the gendered body. People of no
-    gender are "neutral", for whom `body` will do if it is of the same family; positions come back as they are. Raises
-    DataError: a gender without a body, or joints at rest further off than 4 cm.
+    The pelvis stays where the person's own body has it: transl + J0(beta) is that of the gendered body.
+
+    Args:
+        recording: as read; positions are given back as they are.
+        bodies: by gender; people of no gender are "neutral", for whom `body` will do if it is of the same family.
+        body: the one that trains.
+
+    Raises:
+        DataError: a gender without a body, or joints at rest further off than 4 cm.
     """
     if recording.poses is None or recording.transl is None or recording.betas is None or not bodies or recording.body:
         return recording

@@ -43,20 +43,22 @@ def prepare(
     shard_rows: int = SHARD_ROWS,
     progress: Progress | None = None,
 ) -> PrepareReport:
-    """Make or bring up to date the store at `out`; finished takes in it are kept while nothing of theirs changes.
+    """Make or bring up to date the store at `out`.
 
     Args:
         job: which data set, where, and how.
-        out: the store's folder.
+        out: the store's folder; an earlier run's finished takes in it are kept while their files and the options
+            are the same.
         workers: processes; 1: this one. The store's bytes do not depend on it.
         splits: split of each take by name, in place of the official rule; takes it does not name are left out.
         limit: at most so many takes of each split, to try things out.
         shard_rows: rows of a shard, one frame of one person each; a take stays in one shard.
         progress: is told of progress.
 
-    Raises DataError: nothing was found, or no take could be used, says why for each; ValueError: a number or a list of
-    splits does not fit, or `out` holds something else; OSError: another prepare works there, or it cannot be written
-    to.
+    Raises:
+        DataError: nothing of the data set was found, or no take could be used; says why for each.
+        ValueError: a number out of range, a list of splits that does not fit, or `out` holds something else.
+        OSError: another prepare works there, the disk is full, or the folder may not be written to.
     """
     at_least(1, workers=workers, limit=limit, shard_rows=shard_rows)
     reader, body = job.reader(), job.body()
@@ -115,7 +117,8 @@ class TakeSelection:
 def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> TakeSelection:
     """The takes to prepare; official lists are not looked at where `splits` are given.
 
-    Raises DataError: there are none, two of a name, or a group in two splits.
+    Raises:
+        DataError: there are none, two of a name, or a group in two splits.
     """
     takes = reader.takes() if splits is None else reader.found()
     if not takes:
@@ -165,7 +168,9 @@ def absent_note(names: list[str], most: int = 5) -> str:
 def read_splits(path: str | Path) -> dict[str, Split]:
     """A user's list of splits: lines `NAME SPLIT`, or JSON {name: split} or {split: [names]}.
 
-    Raises ValueError: a line that is neither, no such split, or a name in two of them; OSError: no such file.
+    Raises:
+        ValueError: a line that is neither, a split that is none of train, val and test, or a name in two of them.
+        OSError: no such file.
     """
     pairs: list[tuple[str, str]] = []
     try:
@@ -198,7 +203,11 @@ def read_splits(path: str | Path) -> dict[str, Split]:
 
 
 def opened(out: Path, reader: Reader) -> StoreReader | None:
-    """The store that is there already. Raises ValueError: the folder holds something else, perhaps another store."""
+    """The store that is there already.
+
+    Raises:
+        ValueError: the folder holds another data set's store, or something that is no store.
+    """
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file, expected a folder; choose another --out")
     if not out.exists() or not any(out.iterdir()):

@@ -17,8 +17,10 @@ YOURS = "a split of your own is given to prepare with --splits FILE, lines NAME 
 def split_gaps(clips: Mapping[Split, Mapping[int, int]]) -> list[str]:
     """A sentence for every gap, then what to do; none where every split has clips of every number of people.
 
-    Somebody alone is no gap where others are together: data sets hold such clips to learn bodies from. `clips`: how
-    many, by split and number of people.
+    Somebody alone is no gap where others are together: data sets hold such clips to learn bodies from.
+
+    Args:
+        clips: number of clips by number of people, of each split that has any.
     """
     counts = {split: {n: count for n, count in clips.get(split, {}).items() if count} for split in SPLITS}
     if not any(counts.values()):

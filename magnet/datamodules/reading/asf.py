@@ -110,9 +110,13 @@ def _order(where: str, word: str) -> str:
 
 
 def read_asf(path: str | Path) -> AsfSkeleton:
-    """A skeleton from an ASF file. Raises FileNotFoundError, or ValueError: names the line that makes no sense.
+    """A skeleton from an ASF file.
 
     Lengths: `:units length` u says that a number x is x / u inches (checked on CMU's files, where u is 0.45).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not an ASF file, or a line makes no sense; names the line.
     """
     path = Path(path)
     root, bones, bone, section = _Bone(name="root"), {"root": (one := _Bone(name="root"))}, _Bone(), ""

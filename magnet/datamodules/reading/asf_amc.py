@@ -71,8 +71,10 @@ class AmcRecording:
 def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecording:
     """Motion from an AMC file, which does not say its frame rate.
 
-    Raises FileNotFoundError; DataError: a bone that the skeleton lacks, a frame without a bone it has, a wrong number
-    of values, no numbers, a truncated file or one without frames; names file and line.
+    Raises:
+        FileNotFoundError: there is no such file.
+        DataError: a bone that the skeleton lacks, a frame without a bone it has, a wrong number of values, something
+            that is not a number, NaN, a truncated file or one without frames; names file and line.
     """
     path = Path(path)
     values = parse_regular(path, skeleton)
@@ -181,7 +183,8 @@ def parse_any(path: Path, skeleton: AsfSkeleton) -> Floats:
 def together(recordings: Sequence[AmcRecording], trim: bool = False) -> list[AmcRecording]:
     """Recordings of people captured together, which must be equally long; `trim` cuts them to the shortest.
 
-    Raises DataError: lengths or frame rates differ.
+    Raises:
+        DataError: lengths or frame rates differ.
     """
     first = recordings[0]
     for other in recordings[1:]:

@@ -35,7 +35,11 @@ class BvhSkeleton:
 
 
 def read_bvh_header(path: Path) -> BvhSkeleton:
-    """Read a BVH file's hierarchy; of its motion, only that all frames are there. Raises DataError: names the line."""
+    """Read a BVH file's hierarchy; of its motion, only that all frames are there.
+
+    Raises:
+        DataError: no such file, no BVH, or cut short; names the line.
+    """
     lines = contents(path).decode("latin-1").removeprefix("\xef\xbb\xbf").splitlines()
     try:
         said = bvh_header(lines, path)

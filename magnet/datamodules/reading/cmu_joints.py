@@ -157,7 +157,8 @@ class CMUHints:
 def measured(recordings: Sequence[AmcRecording], trim: bool = False) -> tuple[Recording, tuple[Glitches, ...]]:
     """People captured together as joints at 30 fps, with hints for the fit; and what was mended on the way.
 
-    Raises ValueError: lengths differ.
+    Raises:
+        ValueError: lengths differ.
     """
     recordings = together(recordings, trim)
     mended, glitches = zip(*(repaired(recording) for recording in recordings), strict=True)
@@ -210,10 +211,13 @@ def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def check_rate(recording: AmcRecording) -> None:
-    """Refuse, by a ValueError, a frame rate at which people do not move, or faster than anybody; files do not tell it.
+    """Whether people move like that: the frame rate is not in the file, and a wrong one shows in speeds.
 
     A rate that is wrong by two shows only where somebody jumps or falls, and then gives a warning: 143_35, called
     120 fps, was found so.
+
+    Raises:
+        ValueError: speeds that no person reaches, or nobody moves at all.
     """
     if recording.frames < recording.fps:
         return  # too short to say

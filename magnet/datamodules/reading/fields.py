@@ -32,7 +32,11 @@ class PersonMotion:
 
 
 def mapping(where: object, held: Any) -> Mapping[str, Any]:
-    """What a file holds, when it is a dict with text keys. Raises DataError: it is not."""
+    """What a file holds, when it is a dict with text keys.
+
+    Raises:
+        DataError: it is not.
+    """
     if not isinstance(held, Mapping) or not all(isinstance(key, str) for key in held):
         what = f"an array {held.shape}" if isinstance(held, np.ndarray) else f"a {type(held).__name__}"
         raise DataError(f"{where}: holds {what}, expected a dict of named arrays; is it another file of the data set?")
@@ -40,7 +44,11 @@ def mapping(where: object, held: Any) -> Mapping[str, Any]:
 
 
 def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Doubles:
-    """A key's value as so many numbers a frame, however a frame is shaped. -> (T, width). Raises DataError."""
+    """A key's value as so many numbers a frame, however a frame is shaped. -> (T, width)
+
+    Raises:
+        DataError: no such key, no frames, another width, or NaN.
+    """
     require(where, held, (key,))
     value = held[key]
     if isinstance(value, np.ndarray) and value.ndim > 2 and math.prod(value.shape[1:]) == width:
@@ -49,7 +57,11 @@ def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Double
 
 
 def shape_numbers(where: object, held: Mapping[str, Any], key: str = "betas") -> tuple[Doubles, tuple[str, ...]]:
-    """A person's first ten shape numbers from (10+,), (1, 10+) or (T, 10+). -> (10,), notes. Raises DataError."""
+    """A person's first ten shape numbers from (10+,), (1, 10+) or (T, 10+). -> (10,), notes
+
+    Raises:
+        DataError: no such key, another shape, or NaN.
+    """
     require(where, held, (key,))
     value = held[key]
     if isinstance(value, np.ndarray) and value.ndim == 1:
@@ -76,8 +88,17 @@ def person(
 ) -> PersonMotion:
     """One person from a dict with keys of SMPL-X's family: root and 21 body joints in axis-angle, metres.
 
-    where: for messages; gender: of the body that the shape is of, as the data set says it; orient, body, transl: the
-    keys. Raises DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
+    Args:
+        where: the file, for messages.
+        held: what it holds.
+        name: of the person.
+        gender: of the body that the shape is of, as the data set says it.
+        orient: the root's key.
+        body: the joints' key.
+        transl: the translation's key.
+
+    Raises:
+        DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
     """
     require(where, held, (orient, body, transl, "betas"))
     parts = {key: rows(where, held, key, width) for key, width in ((orient, 3), (body, 63), (transl, 3))}
@@ -90,9 +111,18 @@ def person(
 def side_by_side(
     where: object, people: Sequence[PersonMotion], fps: float, up: Axis, *, cut: bool = False, notes: Iterable[str] = ()
 ) -> Recording:
-    """People who were recorded together, in their order of agents, as one recording; `up` as the data set declares it.
+    """People who were recorded together as one recording.
 
-    cut: cut unequal lengths to the shortest, with a note, in place of a DataError; notes: what else was found.
+    Args:
+        where: the take, for messages.
+        people: in their order of agents.
+        fps: of all of them.
+        up: as the data set declares it.
+        cut: cut unequal lengths to the shortest, with a note.
+        notes: what else was found.
+
+    Raises:
+        DataError: unequal lengths.
     """
     lengths, said = {someone.name: someone.frames for someone in people}, list(notes)
     if not cut:

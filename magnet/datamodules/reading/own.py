@@ -185,9 +185,14 @@ class OwnReader(Reader, Generic[T]):
 
     @abstractmethod
     def open(self, person_file: PersonFile, alone: bool) -> tuple[list[T], list[str]]:
-        """The people in a file, and what should be known of it. Raises DataError: it is not what it should be.
+        """The people in a file, and what should be known of it.
 
-        alone: it is the only file of its scene, and may hold several people.
+        Args:
+            person_file: whose file.
+            alone: it is the only one of its scene, and may hold several people.
+
+        Raises:
+            DataError: the file is damaged, or not what it should be.
         """
 
     @abstractmethod

@@ -118,8 +118,10 @@ def _told(root: Path, path: Path) -> tuple[str, str, Path]:
 def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[SceneFiles], list[Path]]:
     """Groups by a pattern of the path under `root` without its suffix, such as {scene}/{person} or {person}-{scene}.
 
-    A `*` stands for anything but a slash. Also returns the files that do not fit. Raises ValueError: the pattern lacks
-    {scene} or {person}, or holds one twice.
+    A `*` stands for anything but a slash. Also returns the files that do not fit.
+
+    Raises:
+        ValueError: the pattern lacks {scene} or {person}, or holds one twice.
     """
     if any(pattern.count(word) != 1 for word in ("{scene}", "{person}")):
         raise ValueError(
@@ -144,8 +146,9 @@ def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Sc
 def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[SceneFiles]:
     """Groups by a CSV with a head: scene and file (under `root`), and, where they are wanted, person, role and start.
 
-    Raises DataError: a column is missing or unknown, a file is not there, lies elsewhere, is of another kind or is
-    named twice, or a start is no number of seconds; names the line.
+    Raises:
+        DataError: a column is missing or unknown, a file is not there, lies elsewhere, is of another kind or is named
+            twice, or a start is no number of seconds; names the line.
     """
     together: dict[str, list[PersonFile]] = {}
     used: dict[Path, int] = {}

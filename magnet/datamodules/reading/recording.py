@@ -54,7 +54,8 @@ class PosedSkeleton(Protocol):
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
         """The person on `body`, y up, at `fps`: a scene with B = P = 1, and how far joints are off, (T,) metres.
 
-        Raises ValueError: the body does not fit.
+        Raises:
+            ValueError: the body does not fit.
         """
         ...
 
@@ -63,9 +64,13 @@ class FitHints(Protocol):
     """What a recording tells of the rotations of joints; it depends on the body that is fitted."""
 
     def __call__(self, rest: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (T, P, 22, 3, 3) from a body's rest pose, and weights (T, P, M) of the positions.
+        """Rotations from a body's rest pose, and weights of the positions.
 
-        rest (22, 3): joints of the body in its mean shape. Rotations are in the file's world, NaN where not known.
+        Args:
+            rest: (22, 3) joints of the body in its mean shape.
+
+        Returns:
+            (T, P, 22, 3, 3) in the file's world, NaN where they are not known; (T, P, M) how much each position counts.
         """
         ...
 
@@ -169,7 +174,11 @@ class Reader(ABC):
 
     @classmethod
     def write_fake(cls, out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-        """Write a made-up download of so many takes and frames at 30 fps. Raises ValueError: there is no fake."""
+        """Write a made-up download of so many takes and frames at 30 fps into a folder.
+
+        Raises:
+            ValueError: the data set brings no fake.
+        """
         module, _, name = cls.fake.partition(":")
         if not name:
             raise ValueError(f"{cls.title} brings no made-up download; ask for the data at {cls.source}")
@@ -182,7 +191,8 @@ class Reader(ABC):
     def official(self) -> Mapping[str, Split] | None:
         """The split of each group by the data set's lists or rule; None: `found` tells. Not asked where the user does.
 
-        Raises DataError: a list is missing or damaged.
+        Raises:
+            DataError: a list is missing or damaged.
         """
         return None
 
@@ -197,4 +207,8 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self, take: Take) -> Recording:
-        """Open a take's files. Raises DataError, never a bare numpy error: cut short, other shapes, no key, NaN."""
+        """Open a take's files.
+
+        Raises:
+            DataError: a file is truncated, lacks a key, has another shape or holds NaN; never a bare numpy error.
+        """

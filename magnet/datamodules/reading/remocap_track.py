@@ -42,9 +42,14 @@ def file_like(folder: Path, pattern: str, usual: str) -> Path:
 
 
 def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
-    """Positions of the mapped joints in metres (T, M, 3), frame rate, and what was found. `scale`: metres a unit
+    """Positions of the mapped joints in metres (T, M, 3), frame rate, and what was found.
 
-    Raises DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.
+    Args:
+        folder: one person's, with motion.bvh, csv files of positions and rotations and motion_offsets.pkl.
+        scale: metres a unit.
+
+    Raises:
+        DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder: a partner's files are missing; {AGAIN}")
@@ -141,7 +146,11 @@ def _misfit(header: BvhSkeleton, table: _Table) -> float:
 
 
 def _proof(folder: Path, header: BvhSkeleton, table: _Table, scale: float) -> str:
-    """The Euler order with which rotations and offsets give the positions within 1 cm. Raises DataError: none does."""
+    """Find the Euler order with which rotations and offsets give the positions.
+
+    Raises:
+        DataError: none leads there within 1 cm.
+    """
     paths = sorted(folder.glob("*rotation*.csv"))
     if not paths:
         return "no csv of rotations: joints and units are not proven"
@@ -176,10 +185,14 @@ def _order(
     positions: dict[int, Doubles],
     close: float,
 ) -> tuple[str, float]:
-    """The Euler order that leads closest, and how far off in the files' unit; `close`: near enough for the BVH's order.
+    """The Euler order that leads closest, and how far off in the files' unit.
 
-    offsets (K, 3) in the parent's frame; namings: angles (T, 3) by joint, for each way of naming the columns; positions
-    (T, 3) by joint.
+    Args:
+        header: the joints.
+        offsets: (K, 3) in the parent's frame.
+        namings: angles (T, 3) by joint, for each way of naming the columns.
+        positions: (T, 3) by joint.
+        close: how far off is near enough for the order of the BVH.
     """
     best, error = "", np.inf
     for turns in namings:

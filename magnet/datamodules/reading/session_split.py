@@ -26,12 +26,19 @@ LACKS = 10 * WHOLE**2
 
 
 def split_sessions(sessions: Mapping[str, Amounts], fixed: Mapping[str, Split] | None = None) -> dict[str, Split]:
-    """The split of each session, given its frames by number of people; `fixed` ones count, but do not move.
+    """The split of each session.
 
     A hash of its name draws a tenth of the sessions for test and a tenth for val. Then single sessions move, or two
     change places, always the one that helps most, until none helps: each of test and val should hold a tenth of the
     frames of every number of people and of all, and no split may lack a number of people that three sessions have
     (train and test one that two have, train one that only one has). Above all, none may be empty.
+
+    Args:
+        sessions: frames of scenes by number of people, of each session.
+        fixed: sessions whose split is settled already; they count, but do not move.
+
+    Returns:
+        The split of each of `sessions`; of `fixed` ones the settled one.
     """
     fixed = {name: split for name, split in (fixed or {}).items() if name in sessions}
     names = sorted(sessions, key=lambda name: (hashlib.sha256(name.encode(errors="replace")).digest(), name))

@@ -12,13 +12,22 @@ from magnet.motion.planar import rotate_ground
 def place_apart(
     T_world_root: Tensor, present: Tensor, second: Tensor, relative_pose: Tensor, clearance: float
 ) -> Tensor:
-    """Turn each scene's second group about its own centre and put it beside the first, in whose world all then are.
+    """Turn each scene's second group about its own centre and put it beside the first.
 
-    A group's centre is the mean of its pelvises over people and frames. Where pelvises of the two groups would come
-    closer than `clearance` metres at any frame, the groups move further apart in the same direction. Heights do not
-    change. T_world_root (B, T, P, 4, 4), each group's in its own world; present, second (B, P) bool, who is there and
-    of the second group; relative_pose (B, 3): radians that the second group turns, direction in radians, 0 along +z, of
-    its centre from the first group's, least metres between the centres. -> (B, T, P, 4, 4)
+    A group's centre is the mean of its pelvises over people and frames. Where pelvises of the two groups
+    would come closer than `clearance` at any frame, the groups move further apart in the same direction.
+    Heights do not change.
+
+    Args:
+        T_world_root: (B, T, P, 4, 4) pelvis poses; each group in its own recording's world.
+        present: (B, P) bool.
+        second: (B, P) bool, True for people of the second group.
+        relative_pose: (B, 3) radians that the second group turns; direction in radians, 0 along +z, of its centre as
+            seen from the first group's; least metres between the centres.
+        clearance: metres between pelvises of different groups, at every frame.
+
+    Returns:
+        (B, T, P, 4, 4) in the first group's world.
     """
     yaw, direction, distance = relative_pose.unbind(-1)
     ground = T_world_root[..., [0, 2], 3]

@@ -70,7 +70,11 @@ class SplitData:
 
     @staticmethod
     def concatenate(parts: Sequence[SplitData]) -> SplitData:
-        """One after the other. Raises ValueError: bodies or rates differ."""
+        """One after the other.
+
+        Raises:
+            ValueError: bodies or rates differ.
+        """
         first, clips = parts[0], 0
         bad: dict[int, NDArray[np.bool_]] = {}
         most = max(data.slot_order.shape[1] for data in parts)
@@ -270,7 +274,11 @@ NOBODY = NOBODY.view(BYTES)
 
 
 def mirrored(body: Tensor) -> Tensor:
-    """Joints' quaternions xyzw seen in the plane x = 0, left and right exchanged. (..., 21, 4) int16 -> same"""
+    """Joints' quaternions seen in the plane x = 0, left and right exchanged: `mirror_scene` on eight bytes a joint.
+
+    Args:
+        body: (..., 21, 4) int16, xyzw.
+    """
     whole = body.view(torch.int64)[..., 0]
     swapped = whole[..., OTHER_SIDE].unsqueeze(-1).view(torch.int16)
     swapped[..., 1:3].neg_()

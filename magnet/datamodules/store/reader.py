@@ -100,7 +100,11 @@ class StoreSplit:
         return order
 
     def shard(self, number: int) -> NDArray[np.void]:
-        """The rows of a shard, mapped when first asked for. Raises StoreError: they are not what the manifest says."""
+        """The rows of a shard, mapped when first asked for.
+
+        Raises:
+            StoreError: the file is missing or is not what the manifest says.
+        """
         if number not in self.maps:
             path, begin = self.files[number], int(self.ends[number - 1]) if number else 0
             try:

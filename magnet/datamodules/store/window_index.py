@@ -49,7 +49,11 @@ def all_starts(good: NDArray[np.bool_], frames: int) -> Ints:
 
 
 def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
-    """First frames of clean whole windows, `stride` >= 1 apart; an invalid frame is stepped over. good: (T,) bool"""
+    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool
+
+    Raises:
+        ValueError: the stride is less than a frame.
+    """
     require_whole("stride", stride, 1)
     starts, start = [], 0
     while start + frames <= len(good):

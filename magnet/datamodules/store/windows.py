@@ -168,7 +168,14 @@ def without_empty_groups(windows: WindowIndex) -> WindowIndex:
 
 
 def fixed_windows(store: MemoryStore, frames: int, stride: int, pad: bool = False) -> WindowIndex:
-    """Clean windows of every clip in order, `stride` frames apart; `pad`: one, padded, of each clip that is shorter."""
+    """Clean windows of every clip in order, `stride` apart.
+
+    Args:
+        store: the clips.
+        frames: window length.
+        stride: frames between the starts of windows of a clip.
+        pad: a clip shorter than the window gives one, padded; otherwise none.
+    """
     pairs = []
     for c in range(len(store.length)):
         good = store.good(c)
@@ -199,8 +206,10 @@ def composed_windows(
 ) -> WindowIndex:
     """Scenes of three and four people in turn, each made of two of the plain windows of different clips.
 
-    Where the second clip has more people than the scene still needs, some of them are left out. Raises ValueError: the
-    clips or slots do not allow such scenes.
+    Where the second clip has more people than the scene still needs, some of them are left out.
+
+    Raises:
+        ValueError: the clips or slots do not allow such scenes.
     """
     people = store.people[plain.clips[:, 0]]
     sizes = [size for size in (3, 4) if size <= store.max_agents]

@@ -64,7 +64,10 @@ def simplified(points: Floats, faces: Ints, weights: Floats, vertices: int) -> L
     A collapse takes a vertex into a neighbour. Its cost is the sum of squared distances of the neighbour from the
     planes of all triangles that have gone into either (Garland and Heckbert 1997, with the neighbour as the place),
     and what the skinning weights differ. Many collapses that do not touch each other make one round. Vertices at holes
-    stay. points (V, 3) metres, faces (F, 3), weights (V, 22)
+    stay.
+
+    Args:
+        points: (V, 3) metres; faces: (F, 3); weights: (V, 22).
     """
     planes, area = _planes(points, faces)
     quadric = np.zeros((len(points), 4, 4))  # squared distance from the planes of a vertex's triangles

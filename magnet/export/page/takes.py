@@ -51,9 +51,12 @@ class ShownTake:
 
 
 def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None) -> ShownTake:
-    """A scene (B = 1) made ready to be shown; what was given says its own `given`, else `context`, first frames.
+    """A scene (B = 1) made ready to be shown.
 
-    Raises ValueError: nobody is there, no frames, or numbers that are not finite.
+    Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
+
+    Raises:
+        ValueError: nobody is there, no frames, or numbers that are not finite.
     """
     slots = scene.present[0].nonzero()[:, 0]
     if not len(slots) or not scene.frames:
