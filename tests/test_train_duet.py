@@ -78,11 +78,11 @@ def beginnings(folder: Path, frames: int = 300) -> Path:
     for name in ("60.asf", "61.asf", "02.asf"):
         (source,) = Path(RECORDINGS).rglob(name)
         (folder / name).write_bytes(source.read_bytes())
-    for take in ("01", "03", "05"):
-        for subject in ("60", "61") if take != "01" else ("60", "61", "02"):
-            (source,) = Path(RECORDINGS).rglob(f"{subject}_{take}.amc")
-            text = source.read_text(encoding="latin-1")
-            (folder / source.name).write_text(text.partition(f"\n{frames + 1}\n")[0] + "\n", encoding="latin-1")
+    couples = [f"{subject}_{take}" for subject in ("60", "61") for take in ("01", "03", "05")]
+    for name in (*couples, "02_01", "02_04", "02_06", "02_08"):
+        (source,) = Path(RECORDINGS).rglob(f"{name}.amc")
+        text = source.read_text(encoding="latin-1")
+        (folder / source.name).write_text(text.partition(f"\n{frames + 1}\n")[0] + "\n", encoding="latin-1")
     return folder
 
 

@@ -40,6 +40,7 @@ class RollOuts(Callback):
     Args:
         share: of the batch's scenes.
         every: training steps from one roll-out to the next.
+        start: training steps before the first: what an untrained model makes is no past to learn from.
         scenes: how many are rolled out at a time.
         frames: fewest and most frames that are rolled out.
         steps: denoising steps of the sampler.
@@ -56,8 +57,10 @@ class RollOuts(Callback):
         steps: int = 8,
         return_frames: int = 32,
         stretches: int = 2000,
+        start: int = 0,
     ) -> None:
         require_number("share", share, 0, 1)
+        require_whole("start", start, 0)
         counts = {"every": every, "scenes": scenes, "steps": steps, "stretches": stretches}
         for name, value in {**counts, "return_frames": return_frames, "frames": frames[0]}.items():
             require_whole(name, value, 1)
@@ -67,17 +70,18 @@ class RollOuts(Callback):
         self.sampler, self.return_frames = SamplerOptions(steps=steps), return_frames
         self.task = registry.get("joint_future")()
         self.kept: list[Scene] = []
-        self.filled = -1
+        self.filled, self.start = -1, start
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         if not isinstance(pl_module, Denoiser) or not isinstance(batch, Scene):
             raise ValueError("RollOuts: only a Denoiser can be rolled out; leave the callback out of this training")
         self.keep(batch)
-        due = self.filled < 0 or trainer.global_step - self.filled >= self.every
+        step = trainer.global_step
+        due = step >= self.start and (self.filled < 0 or step - self.filled >= self.every)
         if not due or sum(each.scenes for each in self.kept) < min(4 * self.scenes, self.stretches):
             return
-        self.filled = trainer.global_step
-        seed = derive(pl_module.hparams["seed"], "roll-outs", trainer.global_step, pl_module.global_rank)
+        self.filled = step
+        seed = derive(pl_module.hparams["seed"], "roll-outs", step, pl_module.global_rank)
         generator = torch.Generator(device=pl_module.device).manual_seed(seed)
         precision = trainer.precision_plugin.forward_context()
         pl_module.made_pasts = self.rolled_out(pl_module, batch, generator, precision)

@@ -205,7 +205,15 @@ class ViewerBase:
         for each in [client] if client is not None else self.server.get_clients().values():
             with each.atomic():
                 each.camera.position = self._eye(preset, self.distance)
-                each.camera.look_at = np.array([0.0, AIM, 0.0])
+                each.camera.look_at = self._aim(each.camera, self.distance)
+
+    def _aim(self, camera: Any, distance: float) -> Array:
+        """Where a camera so far away looks: below people's middle, so that feet are above the timeline. -> (3,)"""
+        return np.array([0.0, AIM - self._covered(camera) * distance * np.tan(camera.fov / 2), 0.0])
+
+    def _covered(self, camera: Any) -> float:
+        """Share of the picture's height that the timeline covers."""
+        return min(self.timeline.height / max(camera.image_height, 1), 0.4)
 
     def frame_all(self) -> None:
         """Put the camera as far away as everybody needs, at the start, in the middle and at the end."""
@@ -265,18 +273,20 @@ class ViewerBase:
         away = self.places_in_sight(frame) - self.centre
         reach = max(float(np.linalg.norm(away[:, [0, 2]], axis=1).max()) + ROOM, 1.2)
         for client in self.server.get_clients().values():
-            camera, aim = client.camera, np.array([0.0, AIM, 0.0])
-            if client.client_id not in self.placed:
-                if not np.allclose(camera.look_at, aim, atol=1e-3):
+            camera, middle = client.camera, np.array([0.0, AIM, 0.0])
+            come = client.client_id not in self.placed
+            if come:
+                if not np.allclose(camera.look_at, middle, atol=1e-3):
                     continue  # it still tells of a camera of its own, which may stand below the floor
                 self.placed.add(client.client_id)
-            half = min(camera.fov / 2, float(np.arctan(np.tan(camera.fov / 2) * camera.aspect)))
-            view = np.asarray(camera.position) - aim
-            far, needed = float(np.linalg.norm(view)), reach / float(np.sin(half))
-            if 1e-3 < far < needed:
+            narrow = min(1 - self._covered(camera), camera.aspect)
+            half = float(np.arctan(np.tan(camera.fov / 2) * narrow))
+            view = np.asarray(camera.position) - middle
+            far, needed = max(float(np.linalg.norm(view)), 1e-3), reach / float(np.sin(half))
+            if come or far < needed:
                 with client.atomic():
-                    camera.position = aim + view * (needed / far)
-                    camera.look_at = aim
+                    camera.position = middle + view * max(needed / far, 1.0)
+                    camera.look_at = self._aim(camera, max(far, needed))
 
     def caption(self, frame: int) -> str:
         """What the panel says about a frame."""

@@ -74,10 +74,10 @@ def test_a_continuation_that_fits_stays_as_it_is():
     torch.testing.assert_close(joined.body_rot, still.slice(8).body_rot, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_training_with_it_rolls_out_as_often_as_asked(tmp_path, precision):
+@pytest.mark.parametrize(("precision", "start", "times"), [("32-true", 0, 2), ("bf16-mixed", 3, 1)])
+def test_training_with_it_rolls_out_as_often_as_asked(tmp_path, precision, start, times):
     model = tiny_denoiser(max_agents=3)
-    rolling = RollOuts(share=0.5, every=2, scenes=2, frames=(8, 8), steps=1, stretches=8)
+    rolling = RollOuts(share=0.5, every=2, scenes=2, frames=(8, 8), steps=1, stretches=8, start=start)
     seen: list[object] = []
     plain = rolling.rolled_out
 
@@ -87,11 +87,11 @@ def test_training_with_it_rolls_out_as_often_as_asked(tmp_path, precision):
 
     rolling.rolled_out = counted
     trainer(4, default_root_dir=tmp_path, callbacks=[rolling], precision=precision).fit(model, datamodule=data())
-    assert len(seen) == 2 and all(each is not None for each in seen)
+    assert len(seen) == times and all(each is not None for each in seen)
     assert model.made_pasts is None, "a model that is trained keeps none of it"
 
 
-@pytest.mark.parametrize("wrong", [{"share": 2.0}, {"every": 0}, {"frames": (40, 20)}])
+@pytest.mark.parametrize("wrong", [{"share": 2.0}, {"every": 0}, {"start": -1}, {"frames": (40, 20)}])
 def test_wrong_options_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         RollOuts(**wrong)

@@ -64,6 +64,16 @@ def test_the_timeline_is_as_wide_as_the_picture_and_nothing_happens_while_nobody
     assert EDGE > 0
 
 
+def shares_of_height(camera, points):
+    """Where points are in a camera's picture, from its upper edge (0) to its lower one (1). -> (M,)"""
+    ahead = camera.look_at - camera.position
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 1.0, 0.0])
+    up = np.cross(right / np.linalg.norm(right), ahead)
+    away = points - camera.position
+    return 0.5 - 0.5 * (away @ up) / (away @ ahead) / np.tan(camera.fov / 2)
+
+
 def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, monkeypatch) -> None:
     pytest.importorskip("viser")
     from magnet.viewer.watch import Viewer
@@ -79,7 +89,7 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
 
         def __init__(self) -> None:
             self.camera = SimpleNamespace(
-                position=np.array([0.0, -0.2, -4.0]), look_at=np.zeros(3), fov=0.7, aspect=1.5
+                position=np.array([0.0, -0.2, -4.0]), look_at=np.zeros(3), fov=0.7, aspect=1.5, image_height=500
             )
 
         def atomic(self):
@@ -98,9 +108,12 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
         viewer.clock.seek(20)
         viewer.draw()
         far = client.camera.position - np.array([0.0, 0.85, 0.0])
+        low = shares_of_height(client.camera, np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+        covered = viewer.timeline.height / 500
     finally:
         viewer.stop()
     assert before[1] == -0.2  # a browser that has not been told where to stand is left alone
-    assert near == pytest.approx(4.0, rel=0.1)
+    assert near == pytest.approx(4.0, rel=0.2)
+    assert (low < 1 - covered).all()  # feet are above the timeline
     assert np.linalg.norm(far) * np.sin(0.35) >= 3.0
     assert np.allclose(far / np.linalg.norm(far), [0, 0, 1])  # on the line that it looked along
