@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import copy
-import functools
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import lightning as L
 import torch
 from torch import Tensor, nn
 
 from magnet import checkpoints
-from magnet.body import Body, load_body
 from magnet.checks import require_choice
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
@@ -24,24 +19,21 @@ from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, Tra
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
-from magnet.denoiser.transformer import Transformer
+from magnet.denoiser.token_model import TokenModel
+from magnet.denoiser.transformer import Transformer, skipped
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
-from magnet.old_names import renamed_checkpoint
-from magnet.precision import dtype_of, require_float32_scenes
+from magnet.motion.tokens import TokenLayout
+from magnet.precision import dtype_of
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
-from magnet.tokenizer.module import RawPose, Tokenizer
-from magnet.tokenizer.normalizer import Normalizer
 from magnet.training.optim import adamw_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
 
 Target = Literal["quantized", "continuous"]
 
 
-class Denoiser(L.LightningModule):
+class Denoiser(TokenModel):
     """Diffusion forcing transformer over the motion tokens of all agents (paper 3.2).
 
     Holds the frozen tokenizer it was trained with, so one checkpoint is all that a user needs.
@@ -90,109 +82,33 @@ class Denoiser(L.LightningModule):
         rest = {"start_from": start_from, "compile": compile, "seed": seed}
         self.save_hyperparameters(plain({**sizes, **groups, "optimizer": self.optimizer, **rest}))
         self.window = window
-        self.tokenizer: PoseTokenizer
         self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
-        self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
-        if tokenizer == "raw":
-            self.build(RawPose())
-        elif tokenizer is not None and checkpoints.named(tokenizer).exists():
-            self.build(Tokenizer.load(tokenizer))
-        elif tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
+        self.build_named(tokenizer)
+        if tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
             self.build(starting.tokenizer_of(start_from))
 
     # -- parts ---------------------------------------------------------------------------------
 
     def build(self, tokenizer: PoseTokenizer) -> None:
         """Make the parts whose sizes depend on the tokenizer, any `PoseTokenizer`."""
-        self.tokenizer = tokenizer.requires_grad_(False).eval()
         agents, pairwise = self.hparams["max_agents"], self.network.pairwise
-        self.layout = TokenLayout(tokenizer.codebook_dim, agents, pairwise, self.noise.pairwise)
-        self.normalizer = Normalizer(self.layout.width, floor=0.0)
+        self.hold(tokenizer, TokenLayout(tokenizer.codebook_dim, agents, pairwise, self.noise.pairwise))
         self.transformer = Transformer(self.layout, self.network)
         posterior = self.network.pairwise_posterior and self.layout.slots
         self.posterior = PairwisePosterior(self.layout) if posterior else None
 
     @property
     def quantized(self) -> bool:
-        """Whether latents are codes, in training and so in sampling."""
         return bool(self.hparams["target"] == "quantized")
 
-    @property
-    def built(self) -> bool:
-        return hasattr(self, "transformer")
-
-    def require_tokenizer(self) -> None:
-        if not self.built:
-            name = "tokenizer" if self.hparams["tokenizer"] or not self.hparams["start_from"] else "start_from"
-            path = self.hparams[name]
-            given = "not given" if path is None else f"{path!r}, which is no file and no shipped model"
-            raise ValueError(
-                f"the denoiser has no tokenizer: --model.{name} is {given}. "
-                "Train one with `magnet fit --config configs/synthetic_tokenizer.yaml` and give its checkpoint, or go "
-                "on from the shipped model: --model.start_from duet"
-            )
-
-    def train(self, mode: bool = True) -> Denoiser:
-        super().train(mode)
-        if self.built:
-            self.tokenizer.eval()  # frozen: its codebook must never move
-        return self
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        tokenizer = self.tokenizer
-        checkpoint["tokenizer_hyper_parameters"] = dict(tokenizer.hparams) if isinstance(tokenizer, Tokenizer) else None
-
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
-        checkpoint.update(renamed_checkpoint(checkpoint))
-        if "tokenizer_hyper_parameters" not in checkpoint:
-            raise ValueError("this is not a denoiser's checkpoint: it carries no tokenizer")
-        stored = checkpoint["tokenizer_hyper_parameters"]
-        given = dict(self.tokenizer.hparams) if self.built and isinstance(self.tokenizer, Tokenizer) else None
-        if not self.built or stored != given:
-            self.build(RawPose() if stored is None else Tokenizer(**stored))
-            self.to(self.device)
-        if self.posterior is not None:  # a checkpoint from before it was switched on has none
+        """As `TokenModel`; a posterior that the checkpoint is older than starts as it is."""
+        super().on_load_checkpoint(checkpoint)
+        if self.posterior is not None:
             for name, value in self.posterior.state_dict().items():
                 checkpoint["state_dict"].setdefault(f"posterior.{name}", value)
 
-    @classmethod
-    def load(cls, name_or_path: str | Path | None = None) -> Denoiser:
-        """A trained model ready for use: one that comes with the package by name, or a checkpoint's path.
-
-        Raises:
-            ValueError: no such checkpoint, or not a denoiser's.
-        """
-        path = checkpoints.resolve(name_or_path)
-        checkpoint = checkpoints.read(path)
-        if "tokenizer_hyper_parameters" not in checkpoint:
-            raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
-        fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these
-        stored = {name: value for name, value in checkpoint["hyper_parameters"].items() if name in fields}
-        model = cls(**{**stored, "tokenizer": None, "start_from": None})
-        model.on_load_checkpoint(checkpoint)
-        model.load_state_dict(checkpoint["state_dict"])
-        return model.eval()
-
     # -- what the model does -------------------------------------------------------------------
-
-    def encode(
-        self, scene: Scene, tokens: slice = slice(None), packed: bool = False, growing: Growing | None = None
-    ) -> Tensor:
-        """Latents of those present, codes if `quantized`; invalid frames are not looked at. -> (B, N, P, C) float32
-
-        The first and the last pose are held for a token each and those tokens dropped: beyond the edge a
-        convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
-        `tokens` says which are wanted; `packed`, `growing`: see `magnet.tokenizer.lean`.
-        """
-        held = scene.people().pad_frames(TOKEN_FRAMES)
-        first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
-        wanted = slice(first + 1, stop + 1)
-        encode = functools.partial(encoded, growing=growing) if packed else encoded_plainly
-        people = encode(self.tokenizer, held, self.quantized, wanted)[:, :, 0]
-        latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
-        latent[scene.present] = people
-        return latent.transpose(1, 2)
 
     def condition(self, scene: Scene) -> Tensor | None:
         """What scenes are conditioned on, (B, C) or (B, N, C); None: nothing, as in the paper.
@@ -229,8 +145,9 @@ class Denoiser(L.LightningModule):
         network: Callable[..., Tensor] | None = None,
     ) -> Tensor:
         """What the transformer itself predicts, before `fused`; as `denoise`."""
-        network = network or self.transformer
-        return network(self._without_lead(noisy).to(dtype_of(self.transformer)), levels, present, cond)
+        shown = self._without_lead(noisy).to(dtype_of(self.transformer))
+        made = (network or self.transformer)(shown, levels, present, cond)
+        return skipped(made, shown, levels, self.layout) if self.network.skip else made
 
     def fused(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Predicted tokens with their deltas and pairwise transforms as one posterior, if the model has one."""
@@ -247,22 +164,7 @@ class Denoiser(L.LightningModule):
         tokens[:, 0, :, lead] = still.to(tokens.dtype)
         return tokens
 
-    def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
-        """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
-        scene = scene.pad_agents(self.layout.agents)
-        latent = self.encode(scene)
-        with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
-            tokens = self.layout.pack(latent, *scene_transforms(scene))
-        there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
-        if scene.valid is not None:
-            whole = scene.valid.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
-            there = there & whole[:, :, None, None]
-        return tokens, there
-
     # -- training ------------------------------------------------------------------------------
-
-    def setup(self, stage: str) -> None:
-        require_float32_scenes(self.trainer.precision)
 
     def on_fit_start(self) -> None:
         if not self.normalizer.ready:
@@ -278,16 +180,6 @@ class Denoiser(L.LightningModule):
         """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
         metres = self.noise.pairwise_metres
         starting.start_from(path, self.transformer, self.tokenizer, self.normalizer, metres)
-
-    @torch.no_grad()
-    def _fit_statistics(self) -> None:
-        """z-scores from the first training batches; the same on every rank, because ranks draw alike here."""
-        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-        scenes = [scene.to(self.device) for scene in datamodule.statistics_batches()]
-        if not isinstance(self.tokenizer, Tokenizer):  # a `Tokenizer` has been trained
-            self.tokenizer.fit_normalizers(scenes)
-        parts = [self.tokenize(scene) for scene in scenes]
-        self.fit_normalizer(torch.cat([tokens for tokens, _ in parts]), torch.cat([there for _, there in parts]))
 
     def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
         """Set how tokens are normalized from real ones, as `tokenize` returns them."""
@@ -380,14 +272,6 @@ class Denoiser(L.LightningModule):
         requantize = self.tokenizer.requantize if self.quantized else None
         parts = (self.denoise, requantize, self.normalizer, self.layout)
         return with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift, cond)
-
-    def require_body(self) -> Body:
-        """The body whose joints decoded losses compare, on this model's device."""
-        if not self._body:
-            datamodule = getattr(self._trainer, "datamodule", None)
-            # A copy, because this one moves to the model's device.
-            self._body = (copy.deepcopy(getattr(datamodule, "body", None) or load_body()).to(self.device),)
-        return self._body[0]
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()

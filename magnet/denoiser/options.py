@@ -28,16 +28,17 @@ class TransformerOptions:
         agent_width: size of the agent embedding.
         slot_width: size of the level embedding of each partner slot (ours: the paper has one level a token).
         rope: where time enters: `hidden` rotates the embedded token once, as in the paper, `heads` rotates queries and
-            keys, as usual elsewhere, `none` leaves time out (ablation, paper Table A.5).
+            keys, `none` leaves time out (ablation, paper Table A.5).
         agent_embedding: false takes the agents' identities away (ablation, paper Table A.5).
         pairwise: false takes pairwise transforms out of the tokens (ablation, paper Table 5).
-        causal_block: token steps of a block of attention: a token sees blocks up to its own, so that what is finished
-            is not changed by what is not (ours). 0: everything sees everything, as in the paper.
-        pairwise_posterior: replaces predicted pairwise transforms by their posterior, given what is shown of them and
-            the predicted deltas (ours), see `PairwisePosterior`.
+        causal_block: token steps of a block of attention; a token sees blocks up to its own (ours). 0: it sees
+            everything, as in the paper.
+        pairwise_posterior: pairwise transforms are their posterior, given what is shown and the deltas (ours), see
+            `PairwisePosterior`.
+        skip: the network tells only what noise hides (ours), see `skipped`.
         cond_dim: numbers C of a condition, such as a text's embedding (ours); 0: there is none.
-        cond_dropout: share of training scenes whose condition is hidden, so that the model can also do without one
-            (classifier-free guidance, Ho and Salimans 2022).
+        cond_dropout: share of training scenes whose condition is hidden, for classifier-free guidance (Ho and Salimans
+            2022).
     """
 
     width: int = 512
@@ -53,6 +54,7 @@ class TransformerOptions:
     pairwise: bool = True
     causal_block: int = 0
     pairwise_posterior: bool = False
+    skip: bool = False
     cond_dim: int = 0
     cond_dropout: float = 0.1
 

@@ -86,7 +86,11 @@ class PortableDenoiser(nn.Module):
         self.transformer._blocks = functools.partial(all_at_once, denoiser.transformer)  # type: ignore[method-assign]
 
     def forward(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        return self.transformer(self.denoiser[0]._without_lead(noisy), levels, present)
+        return self.denoiser[0].predict_tokens(noisy, levels, present, network=self.alone)
+
+    def alone(self, noisy: Tensor, levels: Tensor, present: Tensor, cond: None) -> Tensor:
+        """The transformer, which a file has without a condition."""
+        return self.transformer(noisy, levels, present)
 
 
 class PortableDecoder(nn.Module):

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from magnet.denoiser.options import TransformerOptions
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.noise import LEVELS, alpha_bar
 
 
 def sinusoids(values: Tensor, width: int, longest: float = 10_000.0) -> Tensor:
@@ -42,6 +42,17 @@ def block_causal(time: Tensor, size: int) -> Tensor:
     """
     block = time // size
     return block[:, None] >= block[None, :]
+
+
+def skipped(made: Tensor, shown: Tensor, levels: Tensor, layout: TokenLayout) -> Tensor:
+    """Clean tokens where a network tells what noise hides: sqrt(a) shown + sqrt(1 - a) made, of a = `alpha_bar`.
+
+    The preconditioning of Karras et al. 2022 (Elucidating the design space of diffusion-based generative models, Table
+    1) for numbers of unit variance, with noise that takes the signal's place: what is shown clean comes back as it was.
+    made, shown (B, N, P, D), levels (B, N, P) int -> (B, N, P, D)
+    """
+    signal = alpha_bar(layout.spread(layout.group_levels(levels)))
+    return (signal.sqrt() * shown + (1 - signal).sqrt() * made).to(made.dtype)
 
 
 @contextmanager

@@ -5,9 +5,9 @@ import torch
 from torch.nn import functional as F
 
 from magnet.denoiser.options import TransformerOptions
-from magnet.denoiser.transformer import Transformer, block_causal, rotate
+from magnet.denoiser.transformer import Transformer, block_causal, rotate, skipped
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.noise import LEVELS
+from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
 
 LAYOUT = TokenLayout(latent=8, agents=4)
 SMALL = {"width": 32, "layers": 2, "heads": 2, "level_width": 16, "agent_width": 16, "slot_width": 4}
@@ -171,3 +171,16 @@ def test_whom_a_token_sees_written_out():
 def test_a_block_of_a_negative_size_is_refused():
     with pytest.raises(ValueError, match="causal_block: got -1, expected at least 0"):
         build(causal_block=-1)
+
+
+def test_with_a_skip_what_is_shown_clean_comes_back_and_what_noise_hides_is_the_networks(generator):
+    """The network that tells sqrt(1 - a) x - sqrt(a) noise is right at every level (Salimans and Ho 2022, v)."""
+    clean, _ = batch(generator)
+    noise = torch.randn(clean.shape, generator=generator)
+    levels = torch.tensor([0, 3, 400, LEVELS]).repeat(3)[None, :, None].expand(2, -1, 4)[:, :6]
+    spread = LAYOUT.spread(LAYOUT.group_levels(levels))
+    signal = alpha_bar(spread)
+    shown, told = add_noise(clean, noise, spread), (1 - signal).sqrt() * clean - signal.sqrt() * noise
+    assert torch.allclose(skipped(told, shown, levels, LAYOUT), clean, atol=1e-5)
+    anything = skipped(noise, shown, levels, LAYOUT)
+    assert torch.equal(anything[:, 0], clean[:, 0]) and torch.equal(anything[:, 3], noise[:, 3])
