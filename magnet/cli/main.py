@@ -25,6 +25,7 @@ LIGHT_COMMANDS = {
     "agent": "be one agent of a scene in a process of its own, together with others",
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
+    "score": "measure submissions to the open benchmark, of any method",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
     "export-model": "write a model as ONNX files, for programs without torch",
     "doctor": "what is installed, what is missing and what to do about it",

@@ -43,7 +43,8 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
         results if full else replace(results, rows={m: row for m, row in results.rows.items() if m not in UNALIGNED})
     )
     print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
-    print(cost(results.meta["sampling"]))
+    if "sampling" in results.meta:
+        print(cost(results.meta["sampling"]))
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
     more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"

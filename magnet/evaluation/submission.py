@@ -1,0 +1,201 @@
+"""`Submission`: joints that a method answers the benchmark's scenes with, as an npz that needs none of our models."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from magnet.baselines.predictor import Generators, Predictor
+from magnet.datamodules.base import MotionDataModule
+from magnet.evaluation.benchmark import Benchmark
+from magnet.evaluation.results import Results
+from magnet.evaluation.scoring import TRAINING, TRUTH, UNALIGNED, Scoring, generators_of
+from magnet.files import load_npz, writing
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+KEYS = ("benchmark", "task", "method", "fps", "scenes", "joints")
+
+
+@dataclass(frozen=True)
+class Submission:
+    """What a method makes of the test scenes.
+
+    Args:
+        benchmark: name and version, such as "cmu-salsa-duets-1".
+        task: that was done.
+        method: what the row of a table is called.
+        scenes: names of the scenes.
+        joints: (B, S, horizon, P, 22, 3) metres in the recording's world, y up, in the order of `scenes`; of people
+            who are given, anything.
+        file: where it was read from.
+    """
+
+    benchmark: str
+    task: str
+    method: str
+    scenes: tuple[str, ...]
+    joints: Tensor
+    file: str = ""
+
+    @property
+    def samples(self) -> int:
+        """Futures of each scene."""
+        return self.joints.shape[1]
+
+    def answer(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
+        """As a `Predictor`: what was handed in for these scenes, however many samples are asked for."""
+        place = {name: number for number, name in enumerate(self.scenes)}
+        chosen = torch.tensor([place[name] for name in scene.names or ()], device=self.joints.device)
+        return self.joints[chosen].transpose(0, 1).to(scene.device)
+
+    def save(self, path: str | Path, fps: float) -> Path:
+        """Write it as npz."""
+        path = Path(path).with_suffix(".npz")
+        arrays: dict[str, Any] = {
+            "benchmark": self.benchmark,
+            "task": self.task,
+            "method": self.method,
+            "fps": fps,
+            "scenes": list(self.scenes),
+            "joints": self.joints.float().numpy(),
+        }
+        with writing(path, "choose another file"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(path, **arrays)
+        return path
+
+    @staticmethod
+    def load(path: str | Path, benchmark: Benchmark) -> Submission:
+        """Read and check a file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is no submission to this benchmark; says what it has and what is expected.
+        """
+        path = Path(path)
+        try:
+            with load_npz(path, KEYS) as file:
+                lacking = [key for key in KEYS if key not in file.files]
+                if lacking:
+                    there = ", ".join(sorted(file.files)) or "nothing"
+                    raise ValueError(f"{path}: lacks {', '.join(lacking)}; it has {there}. See docs/benchmark.md")
+                read = {key: file[key] for key in KEYS}
+        except (EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: not a readable npz ({error}); write it with numpy.savez") from error
+        names = tuple(map(str, np.atleast_1d(read["scenes"])))
+        _require_facts(path, read, benchmark)
+        _require_scenes(path, names, benchmark.scenes)
+        joints = _joints(path, read["joints"], benchmark, str(read["task"]))
+        method = str(read["method"]).strip() or path.stem
+        return Submission(str(read["benchmark"]), str(read["task"]), method, names, joints, path.name)
+
+
+def _require_facts(path: Path, read: dict[str, Any], benchmark: Benchmark) -> None:
+    """Raise ValueError where a file is for something else."""
+    if str(read["benchmark"]) != benchmark.label:
+        raise ValueError(f"{path}: benchmark: got {str(read['benchmark'])!r}, expected {benchmark.label!r}")
+    if str(read["task"]) not in benchmark.tasks:
+        known = ", ".join(benchmark.tasks)
+        raise ValueError(f"{path}: task: got {str(read['task'])!r}, expected one of {known}")
+    fps = read["fps"]
+    if fps.size != 1 or fps.dtype.kind not in "iuf" or abs(float(fps.item()) - benchmark.fps) > 1e-6:
+        raise ValueError(f"{path}: fps: got {fps.tolist()}, expected {benchmark.fps:g}; resample the joints to it")
+
+
+def _require_scenes(path: Path, names: Sequence[str], expected: Sequence[str]) -> None:
+    """Raise ValueError unless each scene is there once."""
+    missing = [name for name in expected if name not in names]
+    unknown = [name for name in names if name not in expected]
+    if missing or unknown or len(names) != len(expected):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        what = [
+            f"{said} {', '.join(each[:3])}{f' and {len(each) - 3} more' if len(each) > 3 else ''}"
+            for said, each in (("lacks", missing), ("has the unknown", unknown), ("has twice", twice))
+            if each
+        ]
+        raise ValueError(f"{path}: scenes: {'; '.join(what)}; expected each of the {len(expected)} scenes once")
+
+
+def _joints(path: Path, joints: Any, benchmark: Benchmark, task: str) -> Tensor:
+    """The joints, once they have the shape and are numbers where they count."""
+    rest = (benchmark.horizon_frames, benchmark.people, BODY_JOINTS, 3)
+    count = len(benchmark.scenes)
+    right = joints.ndim == 6 and joints.shape[0] == count and joints.shape[2:] == rest
+    if joints.dtype.kind != "f" or not right or joints.shape[1] not in (1, benchmark.samples):
+        raise ValueError(
+            f"{path}: joints: got {joints.dtype} {joints.shape}, expected floats "
+            f"({count}, {benchmark.samples} or 1, {', '.join(map(str, rest))}): scenes, samples, frames after the "
+            f"context, people, joints, xyz"
+        )
+    scored = benchmark.sight(task).generated.numpy()
+    bad = ~np.isfinite(joints).all(axis=(-1, -2)) & scored
+    if bad.any():
+        scene, sample, frame, person = (int(each) for each in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{path}: joints: not a number in scene {scene}, sample {sample}, frame {frame}, person {person}, who is "
+            f"scored in {task}; {int(bad.sum())} such places"
+        )
+    return torch.from_numpy(np.nan_to_num(joints.astype(np.float32)))
+
+
+def answered(
+    datamodule: MotionDataModule, method: Predictor, samples: int, seed: int = 1111
+) -> tuple[list[str], Tensor]:
+    """Names of all test scenes, and what a method answers to them. -> (B,), (B, S, horizon, P, 22, 3)"""
+    names: list[str] = []
+    joints = []
+    for batch in datamodule.test_dataloader():
+        numbers = list(range(len(names), len(names) + batch.scenes))
+        joints.append(method(batch, samples, generators_of(seed, numbers, samples)).transpose(0, 1).cpu())
+        names += batch.names or ()
+    return names, torch.cat(joints)
+
+
+def score(
+    benchmark: Benchmark,
+    datamodule: MotionDataModule,
+    submissions: Sequence[Submission],
+    baselines: bool = True,
+    seed: int = 1111,
+) -> dict[str, Results]:
+    """A table for each task that somebody handed in for, beside baselines, recordings and training windows."""
+    benchmark.check(datamodule)
+    tables = {}
+    for task in dict.fromkeys(each.task for each in submissions):
+        handed = [each for each in submissions if each.task == task]
+        scoring = Scoring(
+            datamodule,
+            {name: each.answer for name, each in zip(row_names(handed), handed, strict=True)},
+            lambda slots, task=task: benchmark.sight(task, slots),  # type: ignore[misc]
+            samples=benchmark.samples,
+            baselines=baselines,
+            seed=seed,
+        )
+        done = 0
+        for batch in datamodule.test_dataloader():
+            scoring.step(batch, list(range(done, done + batch.scenes)))
+            done += batch.scenes
+        samples = {name: each.samples for name, each in zip(row_names(handed), handed, strict=True)}
+        facts = {"benchmark": benchmark.label, "task": task, "test scenes": done, "samples": samples, "seed": seed}
+        tables[task] = scoring.finish(facts)
+    return tables
+
+
+def row_names(submissions: Iterable[Submission]) -> list[str]:
+    """Names of rows: the method's, with its file where another row has it already."""
+    taken = {TRUTH, TRAINING, *UNALIGNED, "NN", "RS", "zero velocity", "ridge"}
+    names = []
+    for each in submissions:
+        name = each.method if each.method not in taken else f"{each.method} ({each.file})"
+        while name in taken:
+            name += "'"
+        taken.add(name)
+        names.append(name)
+    return names
