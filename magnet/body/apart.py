@@ -14,31 +14,31 @@ from magnet.body.joints import PELVIS
 from magnet.motion.scene import FPS
 
 ARMS = [capsule.name.endswith("arm") for capsule in CAPSULES]
-"""Capsules of arms: people hold, link arms and lay them around each other."""
+"""Capsules of arms, which may overlap: people hold each other and link arms."""
 
 FARTHEST = 0.6
-"""Metres that two people are moved apart at most: nobody is thicker than that."""
+"""Most metres that two people are moved apart: no body is thicker."""
 
 HALVINGS = 7
-"""Of `FARTHEST`, until the distance is known to half a centimetre."""
+"""Bisections of `FARTHEST`, which find the distance to half a centimetre."""
 
 FEW = 8
-"""People up to whom pairs are gone through one after the other, each seeing what the ones before have moved."""
+"""Up to so many people, pairs are treated one by one, each after the moves of the pairs before."""
 
 CROWD_ROUNDS, PAIRS = 4, 64
-"""How often all pairs of a crowd are moved at once, and how many are looked at together, to bound memory."""
+"""How often all pairs of a crowd are moved, and how many are computed together, which bounds memory."""
 
 CROWD_SPEED = 1.0
-"""Metres a second at which people of a crowd make way: strangers walk into each other faster than partners do."""
+"""Speed in m/s at which people in a crowd make way: strangers collide faster than partners."""
 
 REACH = 2.2
-"""Metres between two pelvises beyond which no trunk, head or leg is in anybody's arm."""
+"""Metres between pelvises beyond which no arm reaches the other's trunk, head or legs."""
 
 BRIEF = 75
-"""Frames of an encounter, its approach and its end included, up to which it is one of people who pass each other."""
+"""Longest encounter, in frames, approach and end included, that counts as passing each other."""
 
 SMOOTHED = 15
-"""Frames before and after over which the direction between two people is averaged."""
+"""Frames before and after that the direction between two people is averaged over."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Apart:
     """How people are kept apart.
 
     Args:
-        body: depth in metres that trunks, heads and legs may have in each other.
-        arms: the same where an arm is one of the two. Arm on arm may be as deep as it likes.
-        ease: frames before and after a collision over which people make way, in two halves.
-        speed: metres a second at which anybody is pushed at most where the motion goes on from a past that stays.
-        rounds: how often all pairs are gone through; more than one matters from three people on.
+        body: depth in metres that is allowed between trunks, heads and legs.
+        arms: the same between an arm and any of these. Arms may overlap each other without limit.
+        ease: frames before and after a collision over which people make way, twice (maximum, then mean).
+        speed: highest speed in m/s of a push where the motion continues a past that stays.
+        rounds: passes over all pairs; from three people on, more than one matters.
     """
 
     body: float = 0.03
@@ -64,13 +64,13 @@ APART: dict[str, Apart] = {
     "light": Apart(body=0.06, arms=0.08, speed=0.2),
     "firm": Apart(),
 }
-"""By name: `light` lets people lean on each other, `firm` leaves them touch."""
+"""By name: `light` lets people lean on each other, `firm` lets them touch."""
 
 
 def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
-    """How much deeper two bodies are in each other than they may be; below 0 what is still to spare.
+    """How much deeper than allowed two bodies are in each other; negative: the room that is left.
 
-    joints (..., 22, 3) in the world x 2 -> (...) metres, of the capsules that are worst
+    joints (..., 22, 3) in the world x 2 -> (...) metres, of the deepest pair of capsules
     """
     a, b, radius = capsule_segments(one)
     c, d, _ = capsule_segments(other)
@@ -82,10 +82,10 @@ def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
 
 
 def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
-    """Ground direction in which one may leave the other, of unit length.
+    """Direction over the ground, of unit length, in which one person can leave another.
 
-    It leads from pelvis to pelvis, smoothed over time. People who meet for a moment only pass, and from one frame to
-    the next are on the other side: they get one direction for the whole encounter, its mean, and so step aside.
+    It leads from pelvis to pelvis, smoothed over time. People who pass each other change sides from one frame to the
+    next: for a brief encounter the direction is its mean over all frames, and so they step aside.
 
     Args:
         one: (B, T, 22, 3) joints in the world.
@@ -115,7 +115,7 @@ def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
 
 
 def distance_needed(one: Tensor, other: Tensor, away: Tensor, keep: Apart) -> Tensor:
-    """How far one body must move along a ground direction until it is out of the other, frame by frame.
+    """How far one body must move along a ground direction to leave the other, frame by frame.
 
     joints (n, 22, 3) x 2, away (n, 2) of unit length -> (n,) metres, 0 where nothing is in the way
     """
@@ -134,12 +134,12 @@ def distance_needed(one: Tensor, other: Tensor, away: Tensor, keep: Apart) -> Te
 
 
 def widened(mask: Tensor, frames: int) -> Tensor:
-    """True as well so many frames before and after. (B, T) bool -> (B, T) bool"""
+    """The mask, True also `frames` before and after each True. (B, T) bool -> same"""
     return F.max_pool1d(F.pad(mask.float(), (frames, frames))[:, None], 2 * frames + 1, stride=1)[:, 0] > 0
 
 
 def eased(needed: Tensor, ease: int) -> Tensor:
-    """A smooth distance that is never less than what is needed. (B, T) -> (B, T)"""
+    """A smooth distance, nowhere less than needed. (B, T) -> (B, T)"""
     width = 2 * ease + 1
     most = F.max_pool1d(F.pad(needed, (ease, ease))[:, None], width, stride=1)
     return F.avg_pool1d(F.pad(most, (ease, ease), mode="replicate"), width, stride=1)[:, 0]
@@ -153,16 +153,16 @@ def kept_apart(
     begun: bool = False,
     fps: float = FPS,
 ) -> Tensor:
-    """Ground offsets that keep people out of each other; where nobody is in anybody's way, exactly 0.
+    """Offsets over the ground that keep bodies out of each other, exactly 0 where nobody is in the way.
 
-    Two people make way along the line between them, half each, or he alone who may be moved.
+    Two people make way along the line between them, half each; if one is fixed, the other makes all of it.
 
     Args:
         joints: (B, T, P, 22, 3) in the world, metres.
         present: (B, P) bool.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
         keep: depths and times.
-        begun: the motion goes on from a past that stays where it is, so that offsets grow from 0.
+        begun: the motion continues a past that stays, so offsets grow from 0.
         fps: frames a second.
 
     Returns:
@@ -181,15 +181,14 @@ def kept_apart(
         moved = joints + lifted(offsets)[..., None, :]
         for i, j in combinations(range(P), 2):
             one, other = moved[:, :, i], moved[:, :, j]
-            inside = (excess_depth(one, other, keep) > 0) & (present[:, i] & present[:, j])[:, None]
+            both = (present[:, i] & present[:, j])[:, None]
+            inside = (excess_depth(one, other, keep) > 0) & both
             if not bool(inside.any()):
                 continue
             away = direction(one, other, widened(inside, 2 * keep.ease))
             needed = distance_needed(one.flatten(0, 1), other.flatten(0, 1), away.flatten(0, 1), keep).view(B, T)
             movable = free[:, :, i].int() + free[:, :, j].int()
-            needed = eased(
-                torch.where((present[:, i] & present[:, j])[:, None] & (movable > 0), needed, 0.0), keep.ease
-            )
+            needed = eased(torch.where(both & (movable > 0), needed, 0.0), keep.ease)
             if begun:
                 ramp = keep.speed / fps * torch.arange(1, T + 1, device=joints.device, dtype=joints.dtype)
                 needed = torch.minimum(needed, ramp * movable)
@@ -200,7 +199,7 @@ def kept_apart(
 
 
 def _crowd_apart(joints: Tensor, present: Tensor, free: Tensor, keep: Apart, begun: bool, fps: float) -> Tensor:
-    """`kept_apart` of one scene of many people: pairs who are near, all at once, in `CROWD_ROUNDS`.
+    """`kept_apart` of one scene of many people: all near pairs at once, `CROWD_ROUNDS` times.
 
     joints (T, P, 22, 3), present (P,), free (T, P) bool -> (T, P, 2)
     """
@@ -232,7 +231,7 @@ def _crowd_apart(joints: Tensor, present: Tensor, free: Tensor, keep: Apart, beg
 
 
 def near_pairs(moved: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """People whose bodies could touch in some frame, by their pelvises. moved (P, T, 22, 3) -> (E,) int x 2"""
+    """Pairs whose pelvises come near enough for bodies to touch. moved (P, T, 22, 3) -> (E,) int x 2"""
     ground = moved[:, :, PELVIS, [0, 2]].transpose(0, 1)  # (T, P, 2)
     near = (torch.cdist(ground, ground) < REACH).any(dim=0) & present[:, None] & present
     i, j = near.triu(1).nonzero(as_tuple=True)

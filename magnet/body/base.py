@@ -1,7 +1,7 @@
-"""What a body model is: shape numbers to rest joints, rotations and pelvis poses to joints or vertices.
+"""Body models: from shape numbers, rotations and pelvis poses to joints and vertices.
 
-A body is read from an npz or pickled file with SMPL's keys. Hands, jaw and eyes stay at rest, so that every joint
-beyond the 22 moves rigidly with its nearest ancestor among them; their skinning weights are added to it.
+A body is read from an npz or pickled file with SMPL's keys. Hands, jaw and eyes stay at rest: each joint beyond the 22
+moves rigidly with its nearest ancestor among them, to whose skinning weights its own are added.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from magnet.files import load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SHAPES = 10
-"""Shape numbers a body has; further ones in a file are left out."""
+"""Shape numbers of a body; a file may have more, which are ignored."""
 
 
 def _depths() -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
-    """Joints of equal depth below the pelvis, and where each one's parent stands one level above."""
+    """For each depth below the pelvis: its joints, and the position of each one's parent one level above."""
     depths: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
     above: tuple[int, ...] = (0,)
     while above:
@@ -46,20 +46,20 @@ FROM_DEPTH = tuple(BY_DEPTH.index(j) for j in range(BODY_JOINTS))
 
 
 class Body(nn.Module):
-    """A frozen body model; its tensors are float32 buffers that checkpoints do not store.
+    """A frozen body model; its tensors are float32 buffers.
 
-    They stay out of checkpoints because a user's body may not be redistributed; `id` says which one it was.
-    Input in float64 is computed in float64; half precision is computed in float32.
+    Checkpoints do not store them, because a user's body may not be redistributed, but only the `id`. Input in float64
+    is computed in float64, input in half precision in float32.
 
     Args:
-        id: name that scenes and checkpoints carry, so that shapes never meet another body.
+        id: name that scenes and checkpoints carry, so that shape numbers are never used with another body.
         J_template: (22, 3) rest joints at zero shape, metres.
-        J_shapedirs: (22, 3, 10) what a unit of each shape number adds.
+        J_shapedirs: (22, 3, 10) metres that one unit of each shape number adds.
         v_template, shapedirs: (V, 3), (V, 3, 10), the same for the vertices.
         weights: (V, 22) skinning weights; rows sum to one.
         faces: (F, 3) int.
-        posedirs: (V, 3, 189) pose correctives over the 21 rotations less the identity, or None.
-        family: "smpl", "smplh" or "smplx" by the file's whole tree of joints; "": another tree, or not known.
+        posedirs: (V, 3, 189) pose correctives, linear in the 21 rotations minus the identity, or None.
+        family: "smpl", "smplh" or "smplx", by the file's tree of joints; "": another tree, or unknown.
     """
 
     J_template: Tensor
@@ -131,7 +131,7 @@ class Body(nn.Module):
             if self.posedirs is not None:
                 bend = _wide(scene.body_rot) - torch.eye(3, dtype=R.dtype, device=R.device)
                 rest = rest + _blend(self.posedirs, bend.flatten(-3))
-            # A joint takes a point x of the rest body to R (x - rest joint) + t = R x + shift.
+            # A joint moves a point x of the rest body to R (x - rest joint) + t = R x + shift.
             shift = t - (R @ rest_joints[..., None])[..., 0]
             # Vertices last: every product below runs along long rows.
             blended = torch.cat([R.flatten(-2), shift], dim=-1).transpose(-1, -2) @ self.weights.to(R).T
@@ -147,7 +147,7 @@ class Body(nn.Module):
             )
 
     def bone_chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
-        """World rotations (..., 22, 3, 3) and positions (..., 22, 3): one batch of products a level of the tree."""
+        """World rotations (..., 22, 3, 3) and positions (..., 22, 3), in one batched product per level of the tree."""
         body_rot, T_world_root = _wide(body_rot), _wide(T_world_root)
         parents = list(PARENTS[1:])
         offset = (rest_joints[..., 1:, :] - rest_joints[..., parents, :])[..., None]
@@ -169,7 +169,7 @@ class Body(nn.Module):
 
 
 def _exact(like: Tensor) -> torch.autocast:
-    """Mixed precision would round a chain of matrix products to centimetres."""
+    """No mixed precision: it would round a chain of matrix products to centimetres."""
     return torch.autocast(like.device.type, enabled=False)
 
 
@@ -178,7 +178,7 @@ def _wide(tensor: Tensor) -> Tensor:
 
 
 def _blend(directions: Tensor, amounts: Tensor) -> Tensor:
-    """(N, 3, C), (..., C) -> (..., N, 3)"""
+    """Directions (N, 3, C) times amounts (..., C), summed. -> (..., N, 3)"""
     with _exact(amounts):
         flat = directions.flatten(0, 1).to(amounts)
         return (amounts @ flat.T).unflatten(-1, (directions.shape[0], 3))
@@ -190,8 +190,8 @@ def _blend(directions: Tensor, amounts: Tensor) -> Tensor:
 def load_body(which: str | Path = "open") -> Body:
     """The open body that ships with the package ("open"), or one from a file of SMPL, SMPL-H or SMPL-X: npz or pkl.
 
-    Nothing in a pickle is run, and chumpy is not needed. The body's id is the file's own `body_id` if it has one, else
-    made from its name: SMPLX_NEUTRAL.npz is "smplx-neutral". Each call gives a module of its own; "open" is read once.
+    No code in a pickle is run, and chumpy is not needed. The body's id is the file's `body_id`, or else made from its
+    name: "smplx-neutral" of SMPLX_NEUTRAL.npz. Each call returns a new module; the file of "open" is read once.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -210,13 +210,11 @@ def open_body_arrays() -> dict:
 
 
 KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
-
-
 WANTED = (*KEYS, "J_regressor", "J_template", "J_shapedirs", "posedirs", "body_id")
 
 
 def _arrays(path: Path) -> dict[str, NDArray]:
-    """The arrays of a file that a body is made from."""
+    """The arrays in a file that make a body."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder; {_told(path)}")
     if not path.is_file():
@@ -237,7 +235,7 @@ def _arrays(path: Path) -> dict[str, NDArray]:
 
 
 def _npz_arrays(path: Path) -> tuple[dict[str, NDArray], set[str]]:
-    """Those of an npz without pickles, and all its keys."""
+    """Wanted arrays of an npz without pickles, and all its keys."""
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable body file (no npz archive, or cut short); download or copy it again")
     name = ""
@@ -258,7 +256,7 @@ def _npz_arrays(path: Path) -> tuple[dict[str, NDArray], set[str]]:
 
 
 def _told(folder: Path, most: int = 8) -> str:
-    """Which bodies lie in a folder, and how one is given."""
+    """Which bodies a folder holds, and how to give one, for a message."""
     found = []
     for path in body_files(folder):
         with contextlib.suppress(ValueError, OSError, LookupError):
@@ -335,7 +333,7 @@ def _read(path: Path) -> dict[str, object]:
 
 
 def _fold(path: Path, weights: NDArray, kintree_table: NDArray) -> NDArray:
-    """Weights of joints beyond the 22 added to their nearest ancestor among them. (V, K) -> (V, 22)"""
+    """Weights of joints beyond the 22, added to their nearest ancestor among them. (V, K) -> (V, 22)"""
     parents = kintree_table[0].astype(np.int64)
     parents[0] = -1  # files write 2^32 - 1
     if tuple(parents[:BODY_JOINTS]) != PARENTS:

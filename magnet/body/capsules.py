@@ -1,4 +1,4 @@
-"""Thirteen capsules that stand for a body where people might run through each other (docs/metrics.md)."""
+"""Thirteen capsules that approximate a body, to measure how deep people are in each other (docs/metrics.md)."""
 
 from typing import NamedTuple
 

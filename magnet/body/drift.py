@@ -1,4 +1,4 @@
-"""Bodies that slide over the ground as a whole: the drift under their standing feet, and the scene without it."""
+"""Bodies that slide over the ground as a whole: how fast they drift, and the scene without drift."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene
 
 AVERAGED = 0.5
-"""Seconds before and after over which the speed of the stillest standing toe is averaged."""
+"""Seconds before and after that the velocity of the slowest standing toe is averaged over."""
 
 STILL, DRIFTS = 0.06, 0.12
-"""Averaged speeds in m/s: up to the first a body stands, from the second on it drifts. In CMU's salsa 90 % of the
-frames are under 0.06 and 99 % under 0.12."""
+"""Averaged speeds in m/s: below the first a body stands, above the second it drifts. In CMU's salsa 90 % of the
+frames are below 0.06 and 99 % below 0.12."""
 
 
 def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
     """Velocity over the ground of bodies whose standing feet slide along. -> (B, T, P, 2) m/s
 
-    Of the standing toes the slower counts; feet that turn or step move to and fro, and a drift goes on.
+    The slower standing toe counts. Averaging cancels feet that turn or step, which move to and fro; drift remains.
     joints (B, T, P, 22, 3), stands (B, T - 1, P, 2) bool
     """
     half = max(round(AVERAGED * fps), 1)
@@ -35,8 +35,8 @@ def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
 
     def averaged(values: Tensor) -> Tensor:
         """(B, T, P, D) -> same"""
-        rows = F.avg_pool1d(values.flatten(2).transpose(1, 2), 2 * half + 1, stride=1, padding=half)
-        return rows.transpose(1, 2).unflatten(2, values.shape[2:])
+        mean = F.avg_pool1d(values.flatten(2).transpose(1, 2), 2 * half + 1, stride=1, padding=half)
+        return mean.transpose(1, 2).unflatten(2, values.shape[2:])
 
     mean = averaged(slowest * counts[..., None]) / averaged(counts[..., None]).clamp_min(1e-3)
     speed = mean.norm(dim=-1, keepdim=True)
@@ -45,13 +45,13 @@ def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
 
 
 def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: float = SLIDES) -> Scene:
-    """A scene whose people do not slide over the ground; the first frame stays, and whoever does not drift.
+    """A scene whose people do not slide over the ground. The first frame and people who do not drift stay as they are.
 
     Args:
         scene: (B, T, P).
-        body: that its shapes belong to.
+        body: the body of its shape numbers.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved, if only in some frames.
-        slides: m/s under which a low toe is to stand.
+        slides: m/s below which a low toe is meant to stand.
     """
     if scene.frames < 2:
         return scene
@@ -60,7 +60,11 @@ def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: flo
     if fixed is not None:
         whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
         velocity = torch.where(whole.to(velocity.device)[..., None], 0.0, velocity)
-    moved = -velocity.cumsum(dim=1) / scene.fps
-    shifted = from_planar(torch.zeros_like(moved[..., 0]), moved) @ scene.T_world_root
-    still = (moved == 0).all(dim=-1)[..., None, None]
-    return scene.replace(T_world_root=torch.where(still, scene.T_world_root, shifted))
+    return moved_over_ground(scene, -velocity.cumsum(dim=1) / scene.fps)
+
+
+def moved_over_ground(scene: Scene, offsets: Tensor) -> Scene:
+    """The scene with everybody moved by offsets (B, T, P, 2) in metres; poses with offset 0 stay bit-identical."""
+    moved = from_planar(torch.zeros_like(offsets[..., 0]), offsets) @ scene.T_world_root
+    still = (offsets == 0).all(dim=-1)[..., None, None]
+    return scene.replace(T_world_root=torch.where(still, scene.T_world_root, moved))

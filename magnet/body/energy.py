@@ -1,7 +1,7 @@
 """The energy of bodies together: depth, held hands, standing feet, floor, limits of joints, balance.
 
-Each term is a function of points or rotations, batched, differentiable and in metres or radians; `body_energy` adds
-their squares up. What counts as contact and what as penetration is told by the parts that meet (`Contact`).
+Each term is a function of points or rotations, batched, differentiable and in metres or radians. Which depth is contact
+and which is penetration depends on the parts that meet (`Contact`).
 """
 
 from __future__ import annotations
@@ -12,14 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.capsules import nearest_points
-from magnet.body.fitted_capsules import (
-    FOREARMS,
-    HANDS,
-    LEGS,
-    PARTS,
-    TRUNK,
-    UPPER_ARMS,
-)
+from magnet.body.fitted_capsules import FOREARMS, HANDS, LEGS, PARTS, TRUNK, UPPER_ARMS
 
 from magnet.body.joints import (  # isort: skip
     ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
@@ -30,19 +23,19 @@ GRAVITY = 9.81
 BEYOND = 0.08
 """Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""
 SOLE = 0.10
-"""Metres around the line between the feet over which somebody can be in balance: about half a foot's length."""
+"""Metres around the line between the feet that support a body: about half a foot's length."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """How deep parts of bodies may be in each other before it is penetration, in metres.
+    """Depths in metres up to which parts of bodies touch, and beyond which they penetrate.
 
-    Hands and forearms of two people, or one's own, may be in each other as deep as they like: they hold.
+    Hands and forearms, of two people or one's own, may overlap without limit: they hold each other.
 
     Args:
         body: trunks, heads and legs of two people.
-        arms: the same where an arm or a hand is one of the two.
-        own: parts of one body, apart from neighbours, which always overlap.
+        arms: an arm or a hand of one, and any part of the other.
+        own: parts of one body; neighbouring parts always overlap and do not count.
     """
 
     body: float = 0.02
@@ -51,11 +44,11 @@ class Contact:
 
 
 CONTACT: dict[str, Contact] = {"light": Contact(body=0.05, arms=0.06, own=0.06), "firm": Contact()}
-"""By name: `light` lets people lean on each other, `firm` leaves them touch."""
+"""By name: `light` lets people lean on each other, `firm` lets them touch."""
 
 
 def allowed_between(contact: Contact) -> Tensor:
-    """Depth that capsules of two people may have. -> (K, K) metres, infinite where it is never penetration"""
+    """Depth allowed between capsules of two people. -> (K, K) metres, infinite: no limit"""
     K = len(PARTS)
     arm, hold = torch.zeros(K, dtype=torch.bool), torch.zeros(K, dtype=torch.bool)
     arm[list(UPPER_ARMS + FOREARMS + HANDS)], hold[list(FOREARMS + HANDS)] = True, True
@@ -64,7 +57,7 @@ def allowed_between(contact: Contact) -> Tensor:
 
 
 def allowed_within(contact: Contact) -> Tensor:
-    """The same of one body: an upper triangle, infinite on the diagonal, below it and for neighbours. -> (K, K)"""
+    """The same within one body, infinite except in the upper triangle and for neighbours. -> (K, K)"""
     K = len(PARTS)
     allowed = torch.full((K, K), torch.inf)
     free = list(FOREARMS + HANDS)
@@ -74,18 +67,18 @@ def allowed_within(contact: Contact) -> Tensor:
     left, right = LEGS[::2], LEGS[1::2]  # thigh, shin, foot
     for i, one in enumerate(left):
         for j, other in enumerate(right):
-            if i + j:  # thighs touch in everybody
+            if i + j:  # everybody's thighs touch
                 allowed[one, other] = contact.own
     allowed = torch.minimum(allowed, allowed.T)
     return torch.where(torch.ones(K, K, dtype=torch.bool).triu(1), allowed, torch.inf)
 
 
 def capsule_depth(ends: Tensor, radius: Tensor, others: Tensor, other_radius: Tensor) -> Tensor:
-    """How deep capsules are in others; below 0 what is between them. (..., K, 2, 3), (..., K) x 2 -> (..., K, K) m"""
+    """Depth of capsules in others, negative: the gap. (..., K, 2, 3), (..., K) x 2 -> (..., K, K) metres"""
     a, b = ends[..., :, None, 0, :], ends[..., :, None, 1, :]
     c, d = others[..., None, :, 0, :], others[..., None, :, 1, :]
     first, second = nearest_points(a, b, c, d)
-    gap = (first - second).square().sum(dim=-1).clamp_min(1e-12).sqrt()  # its slope is finite where axes cross
+    gap = (first - second).square().sum(dim=-1).clamp_min(1e-12).sqrt()  # a finite slope where axes cross
     return radius[..., :, None] + other_radius[..., None, :] - gap
 
 
@@ -101,11 +94,11 @@ def hand_points(joints: Tensor, beyond: float = BEYOND) -> Tensor:
 
 
 def hold_error(joints: Tensor, partner: Tensor, between: Tensor, held: Tensor) -> Tensor:
-    """How far hands that hold have left each other. -> (..., 2, 2) metres
+    """How far hands that held each other have moved apart. -> (..., 2, 2) metres
 
     Args:
         joints, partner: (..., 22, 3) in the world.
-        between: (..., 2, 2, 3) from each hand of the partner to each hand of one's own, as it was.
+        between: (..., 2, 2, 3) from each hand of the partner to each own hand, when they held.
         held: (..., 2, 2) bool, which of them hold.
     """
     now = hand_points(joints)[..., :, None, :] - hand_points(partner)[..., None, :, :]
@@ -113,17 +106,16 @@ def hold_error(joints: Tensor, partner: Tensor, between: Tensor, held: Tensor) -
 
 
 def slide(joints: Tensor, stands: Tensor, still: float = 0.05, fps: float = FPS) -> Tensor:
-    """How much farther than standing allows toes move over the floor in a frame.
+    """How much farther than allowed standing toes move over the floor in a frame, in metres.
 
-    joints (..., T, P, 22, 3), stands (..., T - 1, P, 2) bool; still: speed in m/s that is standing
-    -> (..., T - 1, P, 2) metres
+    joints (..., T, P, 22, 3), stands (..., T - 1, P, 2) bool; still: m/s that are allowed -> (..., T - 1, P, 2)
     """
     moved = joints[..., TOES, :][..., [0, 2]].diff(dim=-4).square().sum(dim=-1).clamp_min(1e-12).sqrt()
     return torch.where(stands, (moved - still / fps).clamp_min(0), 0.0)
 
 
 def under_floor(joints: Tensor, clearance: Tensor) -> Tensor:
-    """How deep soles are under y = 0. joints (..., P, 22, 3), clearance (..., P, 4) of `FEET` -> (..., P, 4) metres"""
+    """Depth of soles under y = 0. joints (..., P, 22, 3), clearance (..., P, 4) of `FEET` -> (..., P, 4) metres"""
     return (clearance - joints[..., ANKLES + TOES, 1]).clamp_min(0)
 
 
@@ -141,11 +133,11 @@ TURNS: dict[int, float] = {
     **dict.fromkeys((NECK, HEAD), 1.2),
     **dict.fromkeys(WRISTS, 1.6),
 }
-"""Radians that a joint may be turned from rest, somewhat over the ranges that clinics measure; others 1.2."""
+"""Radians that a joint may turn from rest, a little more than clinical ranges of motion; other joints 1.2."""
 
 
 def limit_excess(body_rot: Tensor) -> Tensor:
-    """How far joints are turned beyond what bodies do. (..., 21, 3, 3) -> (..., 21) radians, 0 inside the range"""
+    """How far joints are turned beyond `TURNS`. (..., 21, 3, 3) -> (..., 21) radians, 0 within"""
     most = torch.tensor([TURNS.get(joint, 1.2) for joint in range(1, BODY_JOINTS)]).to(body_rot)
     cosine = (body_rot.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
     return (cosine.clamp(-1 + 1e-6, 1 - 1e-6).acos() - most).clamp_min(0)
@@ -160,12 +152,12 @@ MASSES: tuple[tuple[int, int, float, float], ...] = (
     *((hip, knee, 0.433, 0.100) for hip, knee in zip(HIPS, KNEES, strict=True)),
     *((knee, ankle, 0.606, 0.061) for knee, ankle in zip(KNEES, ANKLES, strict=True)),
 )
-"""From joint, to joint, where between them the mass lies, share of the body's mass: Dempster's segments as tabled by
+"""From joint, to joint, position of the mass between them, share of the body's mass: Dempster's segments, after
 Winter (Biomechanics and Motor Control of Human Movement, table 4.1), hands with forearms and feet with shins."""
 
 
 def centre_of_mass(joints: Tensor) -> Tensor:
-    """(..., 22, 3) -> (..., 3) metres"""
+    """The body's centre of mass. (..., 22, 3) -> (..., 3) metres"""
     first, second, place, mass = zip(*MASSES, strict=True)
     share = torch.tensor(place).to(joints)[:, None]
     points = (1 - share) * joints[..., first, :] + share * joints[..., second, :]
@@ -174,10 +166,10 @@ def centre_of_mass(joints: Tensor) -> Tensor:
 
 
 def off_balance(joints: Tensor, fps: float = FPS) -> Tensor:
-    """How far the zero moment point lies outside of the feet. (..., T, P, 22, 3) -> (..., T - 2, P) metres
+    """Distance of the zero moment point from the support of the feet. (..., T, P, 22, 3) -> (..., T - 2, P) metres
 
-    The point is where the floor must push so that nobody tips over: under the centre of mass, shifted by its
-    acceleration (Vukobratovic and Borovac 2004). The feet support it on the line between them and `SOLE` around it.
+    There the floor must push to keep the body from tipping over: below the centre of mass, shifted by its acceleration
+    (Vukobratovic and Borovac 2004). The feet support the line between them and `SOLE` around it.
     """
     centre = centre_of_mass(joints)
     pull = (centre[..., 2:, :, :] - 2 * centre[..., 1:-1, :, :] + centre[..., :-2, :, :]) * fps**2
@@ -193,13 +185,13 @@ def off_balance(joints: Tensor, fps: float = FPS) -> Tensor:
 
 
 def pair_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) -> Tensor:
-    """Squared excess of depth between people and of each body with itself, by frame.
+    """Squared excess of depth between people, and of each body with itself, by frame.
 
     Args:
         ends: (B, T, P, K, 2, 3) of posed capsules, metres.
         radius: (B, P, K) metres.
-        seen: (B, T, P) bool, whoever counts.
-        contact: depths that are no penetration.
+        seen: (B, T, P) bool, who counts.
+        contact: depths that are allowed.
 
     Returns:
         (B, T) m^2
@@ -215,7 +207,7 @@ def pair_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) ->
 
 
 def own_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) -> Tensor:
-    """Of each body with itself. (B, T, P, K, 2, 3), (B, T, P, K), (B, T, P) -> (B, T) m^2"""
+    """`pair_energy` of each body with itself. (B, T, P, K, 2, 3), (B, T, P, K), (B, T, P) -> (B, T) m^2"""
     allowed = allowed_within(contact)
     i, j = allowed.isfinite().nonzero(as_tuple=True)
     first, second = nearest_points(ends[..., i, 0, :], ends[..., i, 1, :], ends[..., j, 0, :], ends[..., j, 1, :])

@@ -1,4 +1,4 @@
-"""The model of SMPL's family in a body file, found by its tree of joints; shape numbers differ between them."""
+"""Which model of SMPL's family a body file holds, by its tree of joints; shape numbers differ between models."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ TREES: dict[str, tuple[int, ...]] = {
     "smplh": (*PARENTS, *_hand(L_WRIST, 22), *_hand(R_WRIST, 37)),
     "smplx": (*PARENTS, HEAD, HEAD, HEAD, *_hand(L_WRIST, 25), *_hand(R_WRIST, 40)),
 }
-"""Parents of all joints: SMPL ends in two hands, SMPL-H in thirty finger joints, SMPL-X has a jaw and eyes as well."""
+"""Parents of all joints: SMPL has two hand joints, SMPL-H thirty finger joints, SMPL-X also a jaw and eyes."""
 TITLES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 FILES = (".npz", ".pkl")
 
 
 def family_of(parents: Sequence[int]) -> str:
-    """ "smpl", "smplh", "smplx", or "" for another tree. parents: of all joints, the root's anything"""
+    """ "smpl", "smplh" or "smplx" by the parents of all joints, whatever the root's; "": another tree."""
     tree = (-1, *(int(parent) for parent in parents[1:]))
     return next((family for family, known in TREES.items() if known == tree), "")
 
@@ -35,7 +35,7 @@ def title(family: str) -> str:
 
 
 def body_files(folder: Path) -> list[Path]:
-    """Files in a folder or its folders that may be bodies; of an npz and a pkl of one name, the npz."""
+    """Possible body files in a folder and its subfolders; of an npz and a pkl of one name, the npz."""
     found = [path for end in FILES for path in (*folder.glob(f"*{end}"), *folder.glob(f"*/*{end}"))]
     return sorted({path.with_suffix(""): path for path in reversed(found)}.values())
 

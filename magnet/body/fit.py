@@ -1,7 +1,7 @@
 """Fitting a body to joint positions: one shape a person, one pose a frame.
 
-A closed-form start, from known rotations or from the directions between joints alone, is refined by a short
-optimisation over all frames at once. Motion of other bodies and skeletons is converted in this way.
+A closed-form start, from known rotations or only from the directions between joints, is refined by a short optimisation
+over all frames at once. Motion of other bodies and skeletons is converted this way.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from magnet.motion.scene import BODY_JOINTS, FPS, Scene
 
 CENTIMETRE = 0.01
 NEARLY_RIGID = (HIPS, SHOULDERS, (L_HIP, L_SHOULDER), (R_HIP, R_SHOULDER))
-"""Distances that say something of a shape although joints between them bend a little: hips, shoulders, flanks."""
+"""Distances that tell the shape although they change a little with the pose: hips, shoulders, flanks."""
 TORSO = (PELVIS, *HIPS, SPINE1, SPINE2, SPINE3, NECK, *SHOULDERS)
 UPPER, LOWER = (SPINE3, NECK, *COLLARS, *SHOULDERS), (PELVIS, *HIPS, SPINE1, SPINE2)
 """Joints that turn with the chest, and with the pelvis."""
@@ -41,17 +41,17 @@ class BodyFit:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Weights against one square centimetre of one joint's error in one frame."""
+    """Weights, relative to a squared error of 1 cm of one joint in one frame."""
 
     steps: int = 80
     shape_steps: int = 160
-    shape_frames: int = 96  # frames, evenly spaced, that the shape is refined on
+    shape_frames: int = 96  # evenly spaced frames that refine the shape
     learning_rate: float = 0.03
     hint: float = 6.0  # of the squared chordal distance to a joint's known rotation
-    rest: float = 0.5  # the same, to the closed-form start, for joints without one
+    rest: float = 0.5  # the same to the closed-form start, for joints without a known rotation
     smooth: float = 20.0  # of squared second differences of rotations (at 30 fps)
     shape: float = 2.0  # of a squared shape number, in the refinement of shapes
-    floor: float = 2.0  # of a squared centimetre that a foot's joint is nearer to the floor than its sole allows
+    floor: float = 2.0  # of a squared centimetre of a sole under the floor
     shape_prior: float = 0.5  # of a squared shape number, against a square centimetre of a length's error
 
 
@@ -61,7 +61,7 @@ class FitSettings:
 def swing(a: Tensor, b: Tensor) -> Tensor:
     """Smallest rotation that takes direction a to direction b. (..., 3) x 2 -> (..., 3, 3)
 
-    Opposite directions have no smallest one; some half turn is returned.
+    For opposite directions, some half turn is returned.
     """
     a, b = torch.nn.functional.normalize(a, dim=-1), torch.nn.functional.normalize(b, dim=-1)
     cross, cos = torch.linalg.cross(a, b, dim=-1), (a * b).sum(-1)[..., None, None]
@@ -78,7 +78,7 @@ def swing(a: Tensor, b: Tensor) -> Tensor:
 
 
 def kabsch(rest: Tensor, posed: Tensor) -> Tensor:
-    """Rotation that best takes centred points to centred points. (..., N, 3) x 2 -> (..., 3, 3)"""
+    """Rotation that best maps points to points, both centred. (..., N, 3) x 2 -> (..., 3, 3)"""
     rest = rest - rest.mean(dim=-2, keepdim=True)
     posed = posed - posed.mean(dim=-2, keepdim=True)
     U, _, Vh = torch.linalg.svd(posed.transpose(-1, -2) @ rest)
@@ -109,14 +109,14 @@ def fit_body(
 
     Args:
         targets: (T, P, M, 3) world positions of M of the 22 joints, metres, y up.
-        joints: which ones; both hips and both shoulders must be among them.
-        rotations: (T, P, 22, 3, 3) world rotations from the body's rest pose where known, NaN elsewhere.
-        weights: (M,) or (T, P, M), how much each target matters, 0: it is not known; None: equally.
-        valid: (T, P) bool; frames that are not valid are filled but count for nothing.
+        joints: which M, both hips and both shoulders among them.
+        rotations: (T, P, 22, 3, 3) known world rotations from the body's rest pose, NaN where unknown.
+        weights: (M,) or (T, P, M) of the targets, 0: not known; None: equal.
+        valid: (T, P) bool; other frames are filled in but do not count.
         betas: (P, 10) known shapes; None: fitted, one a person.
-        grounded: everybody stands on one level floor, whose height is found; soles are kept above it.
+        grounded: find the height of one level floor and keep soles above it.
         fps: of the targets.
-        refuse_above: largest mean distance in metres, over targets that count, that is still a fit.
+        refuse_above: largest mean error in metres, over targets that count, that is accepted.
         progress: called with (steps done, steps in all).
 
     Raises:
@@ -136,7 +136,7 @@ def fit_body(
         betas = shape_from_lengths(targets, joints, body, weights > 0, settings.shape_prior)
     floor = None
     if fit_shape or grounded:
-        # An even choice of frames is enough for ten numbers and a height, and far cheaper than all of them.
+        # Evenly spaced frames suffice for ten numbers and a height, and cost far less than all.
         good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
         some = good[torch.linspace(0, len(good) - 1, min(settings.shape_frames, len(good))).long()]
         near = None if hints is None else hints[some]
@@ -191,7 +191,7 @@ def _checked(targets: Tensor, joints: Sequence[int], rotations: Tensor | None, v
 
 
 def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, sure: Tensor, prior: float) -> Tensor:
-    """Shapes whose bones are as long as the targets' are, each length its median over the frames that count.
+    """Shapes with the bone lengths of the targets, medians over the frames that count.
 
     targets (T, P, M, 3), sure (T, P, M) bool -> (P, 10)
     """
@@ -224,7 +224,7 @@ def shape_from_lengths(targets: Tensor, joints: Sequence[int], body: Body, sure:
 def clearance(body: Body, betas: Tensor) -> Tensor:
     """Height of the feet's joints above the sole of a body at rest. (P, 10) -> (P, 4) metres
 
-    A kneeling person's ankles are lower than at rest, so theirs is that of the balls of the feet at most.
+    Ankles count at most as high as the balls of the feet: a kneeling person's are lower than at rest.
     """
     low = body.v_template[:, 1] < body.v_template[:, 1].min() + 0.15
     soles = body.v_template[low, 1] + betas @ body.shapedirs[low, 1].T  # (P, V)
@@ -237,28 +237,23 @@ def floor_height(found: Tensor, body: Body, betas: Tensor) -> Tensor:
     return (found[:, :, list(FEET), 1] - clearance(body, betas)).amin(dim=-1)
 
 
+@dataclass(frozen=True)
 class _Problem:
-    """Everything that the optimisation looks at."""
+    """What the optimisation needs, of T frames of P people and M joints."""
 
-    def __init__(
-        self,
-        body: Body,
-        targets: Tensor,
-        joints: Sequence[int],
-        weights: Tensor,
-        hints: Tensor | None,
-        settings: FitSettings,
-        smooth: float,
-        floor: float | None = None,
-    ) -> None:
-        self.body, self.targets, self.joints, self.weights = body, targets, list(joints), weights
-        self.hints, self.settings, self.smooth = hints, settings, smooth
-        self.floor = floor
+    body: Body
+    targets: Tensor  # (T, P, M, 3)
+    joints: Sequence[int]
+    weights: Tensor  # (T, P, M)
+    hints: Tensor | None  # (T, P, 22, 3, 3)
+    settings: FitSettings
+    smooth: float
+    floor: float | None = None
 
     def solve(
         self, betas: Tensor, steps: int, shape: bool, tell: Callable[[int], None]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Local rotations with the pelvis's first (T, P, 22, 3, 3), pelvis positions (T, P, 3), shapes (P, 10)."""
+        """Local rotations (T, P, 22, 3, 3), the pelvis's in the world, pelvis positions (T, P, 3), shapes (P, 10)."""
         R, t, known = start(self.targets, self.joints, self.body.rest_joints(betas), self.hints, self.weights > 0)
         trust = torch.where(known, self.settings.hint, self.settings.rest)
         prior = R
@@ -284,7 +279,7 @@ class _Problem:
 
     def _loss(self, R: Tensor, t: Tensor, betas: Tensor, prior: Tensor, trust: Tensor) -> Tensor:
         found = self.body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
-        off = (found[:, :, self.joints] - self.targets) / CENTIMETRE
+        off = (found[:, :, list(self.joints)] - self.targets) / CENTIMETRE
         loss = (self.weights * off.square().sum(-1)).sum()
         loss = loss + (trust * (R - prior).square().sum((-1, -2))).sum()
         loss = loss + self.settings.shape * len(self.targets) * betas.square().sum()
@@ -302,7 +297,7 @@ class _Problem:
 def start(
     targets: Tensor, joints: Sequence[int], rest: Tensor, hints: Tensor | None, sure: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Closed-form local rotations (T, P, 22, 3, 3), pelvis positions (T, P, 3), which rotations were known (bool).
+    """Closed-form local rotations (T, P, 22, 3, 3), pelvis positions (T, P, 3), known rotations (T, P, 22) bool.
 
     targets (T, P, M, 3), rest (P, 22, 3), hints (T, P, 22, 3, 3) or None, sure (T, P, M) bool: the target counts
     """
@@ -348,5 +343,5 @@ def start(
 
 
 def _between(a: Tensor, b: Tensor, share: float) -> Tensor:
-    """A rotation on the way from a to b, which must not be opposite. (..., 3, 3) x 2 -> (..., 3, 3)"""
+    """A rotation between a and b, which must not be opposite. (..., 3, 3) x 2 -> (..., 3, 3)"""
     return from_6d(to_6d(a) * (1 - share) + to_6d(b) * share)

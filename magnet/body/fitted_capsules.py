@@ -1,4 +1,4 @@
-"""Capsules fitted to a body's own mesh: hands, feet and the width of the trunk included, for any shape numbers."""
+"""Capsules fitted to a body's mesh, for any shape numbers; hands and feet included."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from magnet.body.joints import (  # isort: skip
 
 
 class BodyPart(NamedTuple):
-    """A stretch of the body that one capsule stands for.
+    """A part of the body that one capsule approximates.
 
-    `bone` is the joint that it moves with, `skin` the joints whose vertices belong to it, `axis` the joint that its
-    bone leads to, or -1 where it lies across the body, from the left to the right. `low` and `high` cut its vertices,
-    as shares of their extent upward (across) or along the bone.
+    It moves with the joint `bone` and covers the vertices of the joints `skin`. Its axis leads to the joint `axis`, or
+    runs across the body where that is -1; then `low` and `high` select vertices by height, as shares of the extent.
     """
 
     name: str
@@ -60,18 +59,18 @@ FOREARMS = (9, 10)
 UPPER_ARMS = (7, 8)
 TRUNK = tuple(range(7))
 LEGS = tuple(range(13, 19))
-"""Places in `PARTS`."""
+"""Indices into `PARTS`."""
 
 MIDDLE = (0.2, 0.8)
-"""Stretch of a limb, as shares of its length, over which its thickness is taken: joints are thicker."""
+"""Part of a limb's length over which its thickness is measured: joints are thicker."""
 
 
 @dataclass(frozen=True)
 class FittedCapsules:
-    """Capsules of B scenes of P people, each fixed to a bone: K of `PARTS`.
+    """K capsules, one for each of `PARTS` and fixed to its bone, of P people in B scenes.
 
     Attributes:
-        ends: (B, P, K, 2, 3) ends in the frame of the bone at rest, from its joint, metres.
+        ends: (B, P, K, 2, 3) metres from the bone's joint, in its frame at rest.
         radius: (B, P, K) metres.
     """
 
@@ -90,7 +89,7 @@ class FittedCapsules:
 
 
 _KEPT: WeakKeyDictionary[Body, dict[bytes, FittedCapsules]] = WeakKeyDictionary()
-"""Capsules of the last bodies asked for: while a scene is sampled they are asked for many times."""
+"""Cache: while a scene is sampled, the same bodies are asked for many times."""
 
 MOST_KEPT = 8
 
@@ -98,8 +97,8 @@ MOST_KEPT = 8
 def fit_capsules(body: Body, betas: Tensor) -> FittedCapsules:
     """Capsules fitted to the mesh at rest. betas (B, P, 10)
 
-    Across the trunk a capsule is as thick as that stretch is deep; elsewhere as thick as the skin is far from the axis
-    on average. Its ends reach to the skin.
+    In the trunk the radius is half the depth of the part; in limbs it is the mean distance of the skin from the axis.
+    The ends reach the skin.
     """
     kept = _KEPT.setdefault(body, {})
     key = betas.detach().float().cpu().numpy().tobytes() + repr((betas.shape, betas.device)).encode()
@@ -128,7 +127,7 @@ def _fit(body: Body, betas: Tensor) -> FittedCapsules:
 def _fitted(
     part: BodyPart, body: Body, vertices: Tensor, rest: Tensor, owner: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Ends (M, 2, 3) from the bone's joint, and radius (M,), of M people's part."""
+    """Ends (M, 2, 3) from the bone's joint, and radius (M,), of one part of M people."""
     mine = torch.isin(owner, torch.tensor(part.skin, device=owner.device))
     across = part.axis < 0
     height = body.v_template[:, 1]

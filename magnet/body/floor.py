@@ -1,4 +1,4 @@
-"""How high people stand over y = 0, where models take the floor to be."""
+"""Height of people over y = 0, which models take for the floor."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from magnet.body.joints import FEET
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SKIN = 0.03
-"""Metres between a joint that is none of the feet's and the floor that somebody lies or leans on."""
+"""Metres between the floor that somebody lies on and a joint that is not of the feet."""
 LOW = 0.05
-"""Share of the frames that may be lower than where somebody is said to stand: jumps count little, glitches nothing."""
+"""The standing height is this quantile over frames: jumps count little, glitches not at all."""
 OFF = 0.25
-"""Metres over or under the floor that nobody is. Over all CMU takes kept with this project people whose floor is right
-are said to stand up to 0.15 m off in half a second, somebody who dips a foot into it included."""
+"""Metres off the floor at which it cannot be right. In CMU's takes with a right floor, half a second of motion gives up
+to 0.15 m, also where somebody dips a foot into it."""
 JUMP, JUMPED = 16, 0.9
-"""In fewer frames than this somebody may be in the air throughout, lower than so many metres; CMU's reach 0.78."""
+"""In fewer frames somebody may be in the air all the time, up to so many metres; in CMU up to 0.78."""
 MOMENTS = 32
-"""Frames that are looked at, evenly spaced."""
+"""Evenly spaced frames that are examined."""
 
 
 def lowest(scene: Scene, body: Body | None = None) -> Tensor:
-    """Height over y = 0 of each person's lowest point: soles, or whatever is lower. -> (B, T, P) metres
+    """Height of each person's lowest point over y = 0: soles, or a lower joint. -> (B, T, P) metres
 
-    body: whose shapes the scene has; None: the open body, of average shape where the scene has another's.
+    body: the body of the scene's shapes; None: the open body, of average shape for shapes of another.
     """
     body = open_body() if body is None else body
     betas = scene.betas.float() if scene.body == body.id else torch.zeros_like(scene.betas, dtype=torch.float32)
@@ -40,22 +40,22 @@ def lowest(scene: Scene, body: Body | None = None) -> Tensor:
 
 
 def standing(lowest: Tensor, counts: Tensor) -> Tensor:
-    """Height over y = 0 that each person stands, sits or lies at, taken from the lowest frames.
+    """Height over y = 0 at which each person stands, sits or lies, from the lowest frames.
 
-    lowest (B, T, P), counts (B, T, P) bool, frames that are looked at -> (B, P) metres, NaN where there are none
+    lowest (B, T, P), counts (B, T, P) bool: frames to examine -> (B, P) metres, NaN without any
     """
     return torch.where(counts, lowest, torch.nan).nanquantile(LOW, dim=1)
 
 
 def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> Tensor:
-    """How far over y = 0 everybody stands, in scenes whose floor cannot be there; 0 in the others.
+    """Height over y = 0 at which everybody stands, of scenes whose floor cannot be there; 0 for others.
 
-    One person near the floor, or possibly jumping, is enough for a scene to count as standing on it.
+    One person near the floor, or possibly jumping, is enough for a scene to stand on it.
 
     Args:
         lowest: (B, F, P) metres.
-        counts: (B, F, P) bool, frames that are looked at.
-        frames: (B, P) how many there are of each person, where `counts` has but some of them; None: all.
+        counts: (B, F, P) bool, frames to examine.
+        frames: (B, P) how many each person has, if `counts` holds only some; None: all.
 
     Returns:
         (B,) metres, negative where they stand under it.
@@ -72,7 +72,7 @@ def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> T
 
 
 def on_floor(scene: Scene, body: Body | None = None) -> Scene:
-    """The same motion with whoever stands lowest on y = 0, in each of the B scenes by itself.
+    """The same motion, each scene moved so that its lowest person stands on y = 0.
 
     body: as for `lowest`.
     """
@@ -86,7 +86,7 @@ def on_floor(scene: Scene, body: Body | None = None) -> Scene:
 
 
 def level(scene: Scene, body: Body | None = None) -> float:
-    """Metres over y = 0 at which everybody stands in the scene that is farthest from it; 0 where somebody is near.
+    """Height in metres of the scene whose people all stand farthest from y = 0; 0 if none does.
 
     body: as for `lowest`.
     """

@@ -1,4 +1,4 @@
-"""The 22 joints that scenes hold, by name: the pelvis and the body joints that SMPL, SMPL-H and SMPL-X share."""
+"""The 22 joints of scenes: the pelvis and the body joints that SMPL, SMPL-H and SMPL-X share."""
 
 JOINT_NAMES: tuple[str, ...] = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -14,13 +14,13 @@ COLLARS, SHOULDERS = (L_COLLAR, R_COLLAR), (L_SHOULDER, R_SHOULDER)
 ELBOWS, WRISTS = (L_ELBOW, R_ELBOW), (L_WRIST, R_WRIST)
 SPINE = (PELVIS, SPINE1, SPINE2, SPINE3)
 FEET = (*ANKLES, *TOES)
-"""Left before right. SMPL's joint `foot` is the ball of the foot, here called toes."""
+"""Left before right. SMPL's joint `foot` is the ball of the foot, here called toe."""
 
 PARENTS: tuple[int, ...] = (
     -1, PELVIS, PELVIS, PELVIS, L_HIP, R_HIP, SPINE1, L_KNEE, R_KNEE, SPINE2, L_ANKLE, R_ANKLE, SPINE3, SPINE3, SPINE3,
     NECK, L_COLLAR, R_COLLAR, L_SHOULDER, R_SHOULDER, L_ELBOW, R_ELBOW,
 )  # fmt: skip
-"""The joint that each one hangs on."""
+"""Each joint's parent."""
 
 MIRROR: tuple[int, ...] = (
     PELVIS, R_HIP, L_HIP, SPINE1, R_KNEE, L_KNEE, SPINE2, R_ANKLE, L_ANKLE, SPINE3, R_FOOT, L_FOOT, NECK, R_COLLAR,

@@ -1,4 +1,4 @@
-"""SMPL's pickled body files, read without chumpy, without SciPy, and without running anything in them."""
+"""SMPL's pickled body files, read without chumpy or SciPy and without running code in them."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from magnet.unpickle import StandIn, contents, unpickled
 
 
 class _Nothing(StandIn):
-    """A class whose numbers nobody needs."""
+    """A class whose numbers are not needed."""
 
     def real(self, inner: Callable[[Any], Any]) -> None:
         """None."""
 
 
 class _Chumpy(StandIn):
-    """An array of chumpy: `Ch` holds numbers, others are made from another array."""
+    """An array of chumpy: `Ch` holds numbers, other classes compute theirs from another array."""
 
     def real(self, inner: Callable[[Any], Any]) -> NDArray:
-        """Its numbers."""
+        """The array's numbers."""
         if "x" in self.state:
             return _numbers(inner(self.state["x"]))
         return self.made(_numbers(inner(self.state.get("a"))), inner)
 
     def made(self, a: NDArray, inner: Callable[[Any], Any]) -> NDArray:
-        """The same from the array that it was made of."""
+        """The numbers, computed from the array `a`."""
         raise DataError("an array of chumpy without numbers")
 
     def shape(self, key: str, size: int, inner: Callable[[Any], Any]) -> tuple[int, ...]:
-        """A shape in its state, of so many numbers."""
+        """The shape under a key of its state; it must hold `size` numbers."""
         found = tuple(int(n) for n in np.ravel(inner(self.state.get(key))))
         if min(found, default=0) < 0 or math.prod(found) != size:
             raise DataError(f"{size} numbers of chumpy for an array of shape {found}")
@@ -43,7 +43,7 @@ class _Chumpy(StandIn):
 
 
 class _Select(_Chumpy):
-    """chumpy.reordering.Select: numbers of a flattened array by their places."""
+    """chumpy.reordering.Select: elements of a flattened array by index."""
 
     def made(self, a: NDArray, inner: Callable[[Any], Any]) -> NDArray:
         at = _numbers(inner(self.state.get("idxs"))).astype(np.int64).ravel()
@@ -72,12 +72,12 @@ class _Transpose(_Chumpy):
 
 
 class _Sparse(StandIn):
-    """A matrix of scipy.sparse whose rows or columns are packed."""
+    """A compressed sparse matrix of scipy."""
 
     by_column: ClassVar[bool] = True
 
     def real(self, inner: Callable[[Any], Any]) -> NDArray:
-        """The same with its zeros."""
+        """The dense matrix."""
         state = {key.lstrip("_"): value for key, value in self.state.items() if isinstance(key, str)}
         parts = {key: _numbers(inner(state.get(key))).ravel() for key in ("data", "indices", "indptr", "shape")}
         rows, columns = (int(n) for n in parts["shape"]) if parts["shape"].size == 2 else (0, 0)
@@ -98,11 +98,11 @@ class _Rows(_Sparse):
 
 
 LARGEST = 10**7
-"""Numbers of a matrix with its zeros: SMPL-X's joints by vertices are half a million."""
+"""Most elements of a dense matrix: SMPL-X's joints by vertices are half a million."""
 
 
 def _instance(kind: Any, *_: object) -> Any:
-    """What copyreg makes an instance with; only stand-ins get here."""
+    """Stands for copyreg's function that makes instances; only stand-ins may be made."""
     if not (isinstance(kind, type) and issubclass(kind, StandIn)):
         raise DataError("the pickle makes an instance of something that is no class")
     return kind()
@@ -124,17 +124,17 @@ STAND_INS: dict[str, Any] = {
         for what in ("matrix", "array")
     },
 }
-"""What body files name besides numpy's arrays."""
+"""What body files may name besides numpy's arrays."""
 
 
 def stand_in(module: str, name: str) -> Any:
-    """What stands for a class in a body file: of chumpy and SciPy, others are nothing, and do no harm unless needed."""
+    """The stand-in for a class in a body file; unknown classes of chumpy and SciPy become `_Nothing`."""
     known = STAND_INS.get(f"{module} {name}")
     return known or (_Nothing if module.split(".")[0] in ("chumpy", "scipy", "weakref") else None)
 
 
 def pickled_arrays(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray], set[str]]:
-    """Those of `keys` that a pickled body file has, as arrays, and all keys that it has.
+    """The arrays under `keys` in a pickled body file, as far as they are there, and all its keys.
 
     Raises:
         DataError: damaged, no dict, or it names a class that is not admitted.

@@ -1,4 +1,4 @@
-"""Scenes put right: people out of each other, hands that held still holding, feet still and on the floor."""
+"""Repair of scenes: bodies out of each other, held hands kept, feet still and on the floor."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from torch.nn import functional as F
 
 from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
-from magnet.body.drift import undrifted
+from magnet.body.drift import moved_over_ground, undrifted
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import SLIDES, Wishes
-from magnet.motion.frames import from_planar
 from magnet.motion.scene import FPS, Scene
 
 DEEP: dict[str, Apart] = {
     name: replace(each, body=each.body + 0.03, arms=each.arms + 0.04) for name, each in APART.items()
 }
-"""Depths beyond which people are first moved away from each other as a whole; poses do the rest."""
+"""Depths beyond which whole people are first moved apart; poses do the rest."""
 
 LET_GO = 0.10
-"""Metres that people may be moved from each other before hands that were together are let go."""
+"""Metres that people may be moved apart before their held hands are let go."""
 
 
 def moved_apart(scene: Scene, body: Body, keep: Apart, fixed: Tensor | None = None, begun: bool = False) -> Scene:
-    """A scene whose people are out of each other's bodies as far as moving them over the ground can do it.
+    """A scene whose people are moved over the ground, out of each other's bodies.
 
     Args:
         scene: of any people.
@@ -37,9 +36,7 @@ def moved_apart(scene: Scene, body: Body, keep: Apart, fixed: Tensor | None = No
         begun: as for `kept_apart`.
     """
     offsets = kept_apart(body.joints(scene), scene.present, fixed, keep, begun, scene.fps)
-    shifted = from_planar(torch.zeros_like(offsets[..., 0]), offsets) @ scene.T_world_root
-    still = (offsets == 0).all(dim=-1)[..., None, None]
-    return scene.replace(T_world_root=torch.where(still, scene.T_world_root, shifted))
+    return moved_over_ground(scene, offsets)
 
 
 def repaired(
@@ -52,20 +49,20 @@ def repaired(
     slides: float = SLIDES,
     drifting: bool = True,
 ) -> Scene:
-    """A scene put right: people who are deep in each other are moved, then poses are corrected.
+    """A repaired scene: people who are deep in each other are moved apart, then poses are corrected.
 
-    Contacts are those of the scene as it is: hands within 20 cm hold, low toes under `slides` stand, and who is in the
-    air without falling floats.
+    Contacts are read from the scene itself: hands within 20 cm hold each other, low toes slower than `slides` stand,
+    and who is in the air without falling floats.
 
     Args:
-        scene: (B, T, P), of any people; over 45 frames a second corrections are made for some 30 of them.
-        body: that its shapes belong to.
-        how: a name in `CONTACT`: `light` or `firm`.
+        scene: (B, T, P); above 45 fps corrections are computed for about 30 frames a second.
+        body: the body of its shape numbers.
+        how: `light` or `firm`, see `CONTACT`.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; they come back bit-identical.
         settle: how poses are corrected.
-        begun: the motion goes on from a past that stays, so that corrections grow from 0.
-        slides: m/s under which a low toe is to stand.
-        drifting: whether people who slide over the ground as a whole are held back first (`undrifted`).
+        begun: the motion continues a past that stays, so corrections grow from 0.
+        slides: m/s below which a low toe is meant to stand.
+        drifting: first stop people who slide over the ground as a whole (`undrifted`).
     """
     every = max(round(scene.fps / FPS), 1)
     if drifting:
@@ -91,7 +88,7 @@ def settling(
     past: Tensor | None = None,
     slides: float = SLIDES,
 ) -> Tensor:
-    """The correction (B, T, P, DOFS) that puts a scene right: people move apart, poses do the rest.
+    """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
     Arguments as for `repaired` and `correction`.
     """
@@ -100,13 +97,13 @@ def settling(
     wishes = Wishes.of(scene, body, how, slides, begun=begun)
     first, second = torch.triu_indices(scene.agents, scene.agents, 1)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
-    # Whoever is moved far from somebody does not reach after their hands.
+    # People who are moved far apart let go of each other's hands.
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
     return correction(scene, body, wishes, fixed, settle, begun, past, toward)
 
 
 def between_frames(offset: Tensor, few: Tensor, frames: int) -> Tensor:
-    """Corrections of some frames, evenly spaced, for all frames: cubic between them. (B, F, P, D) -> (B, T, P, D)"""
+    """Corrections of evenly spaced frames interpolated to all frames, cubic. (B, F, P, D) -> (B, T, P, D)"""
     if len(few) < 2:
         return offset.expand(-1, frames, -1, -1)
     last = int(few[-1])

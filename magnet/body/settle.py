@@ -1,7 +1,7 @@
-"""Damped least squares over poses of several people: out of each other, hands held, feet still, on the floor.
+"""Damped least squares over the poses of several people: out of each other, hands held, feet still, on the floor.
 
-What is moved are root, legs and arms in a window of frames, and a little the back. Corrections are smooth in time and
-as small as they can be; frames and people that are fixed stay bit-identical.
+Root, legs, arms and, a little, the back are moved in a window of frames. Corrections are small and smooth in time;
+fixed frames and people stay bit-identical.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from torch import Tensor
 from magnet.body.base import Body
 from magnet.body.fitted_capsules import fit_capsules
 from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
-from magnet.body.settle_rows import Rows, Seen, all_rows
+from magnet.body.settle_residuals import Residuals, Seen, all_residuals
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MOVED: tuple[int, ...] = (0, SPINE2, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
-"""Joints that are turned; the pelvis turns with the whole body."""
+"""Joints that are turned; turning the pelvis turns the whole body."""
 
 DOFS = 3 + 3 * len(MOVED)
-"""Numbers that correct a pose: the root's shift in metres, then a rotation vector of each joint in `MOVED`, radians."""
+"""Numbers that correct a pose: the root's shift in metres, then rotation vectors of the joints `MOVED`, radians."""
 
 LEAD = 2
-"""Frames of the past that a correction goes on from."""
+"""Frames of the past that a correction continues."""
 
 RAMP = 6
-"""Frames after a past that stays over which wishes grow to their full weight."""
+"""Frames after a fixed past over which weights grow to their full value."""
 
 FOLLOWS = 20.0
-"""Cost of a squared metre between where people are first moved to and a smooth way there."""
+"""Cost of a squared metre between where people are to be moved and a smooth path there."""
 
 WINDOW, AHEAD = 240, 24
-"""Frames that are corrected together, and how many after them are looked at: the cost of a frame does not grow."""
+"""Frames that are corrected together, and frames after them that are computed and dropped."""
 
 DONE = 1e-10
-"""Gain that is left at which conjugate gradients stop."""
+"""Squared norm of the preconditioned residual at which conjugate gradients stop."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Settle:
     Args:
         iterations: Gauss-Newton steps.
         inner: conjugate gradient steps in each.
-        stay: cost of a correction itself, of a metre or radian.
-        speed: cost of its change from frame to frame.
-        bend: cost of the second difference.
-        root: how many times more than to turn a limb it costs to move the whole body.
-        tilt: the same of turning the whole body or the back.
-        most: metres or radians that one step changes at most.
+        stay: cost of a squared metre or radian of correction.
+        speed: cost of its squared change from frame to frame.
+        bend: cost of its squared second difference.
+        root: factor of these costs for moving the whole body.
+        tilt: factor for turning the whole body or the back.
+        most: largest change of a step, metres or radians.
     """
 
     iterations: int = 8
@@ -68,7 +68,7 @@ class Settle:
 
 
 def _ancestry() -> Tensor:
-    """Whether turning a joint of `MOVED` moves a bone. -> (M, 22) bool"""
+    """Which bones each joint of `MOVED` moves. -> (M, 22) bool"""
     moves = torch.zeros(len(MOVED), BODY_JOINTS, dtype=torch.bool)
     for bone in range(BODY_JOINTS):
         joint = bone
@@ -83,9 +83,9 @@ ANCESTRY = _ancestry()
 
 
 def corrected(scene: Scene, offset: Tensor) -> Scene:
-    """A scene with its poses corrected; frames without a correction come back bit-identical. offset (B, T, P, DOFS)
+    """The scene with corrected poses; poses with offset 0 stay bit-identical. offset (B, T, P, DOFS)
 
-    Turns are in the frame of each joint's parent as it was, for the pelvis in the world's.
+    Turns are in the frame of each joint's parent before the correction, those of the pelvis in the world.
     """
     turns = roma.rotvec_to_rotmat(offset[..., 3:].unflatten(-1, (len(MOVED), 3)))
     body_rot = scene.body_rot.clone()
@@ -101,11 +101,11 @@ def corrected(scene: Scene, offset: Tensor) -> Scene:
 
 
 def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tensor) -> Tensor:
-    """How points move along a direction with the numbers that correct a pose. -> (M, DOFS)
+    """How far points move along a direction per unit of each number that corrects a pose. -> (M, DOFS)
 
     Args:
-        seen: poses of all nodes, which are people in frames.
-        node, bone: (M,) int, whose and which bone each point is fixed to.
+        seen: poses of all nodes; a node is one person in one frame.
+        node, bone: (M,) int, the node and the bone that each point is fixed to.
         point, along: (M, 3) in the world.
     """
     joints = list(MOVED)
@@ -120,7 +120,7 @@ def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tenso
 
 
 def stiffness(settle: Settle, frames: int) -> Tensor:
-    """The cost of a correction over time, quadratic: of itself and of its first two differences. -> (T, T)"""
+    """Quadratic cost of a correction over time: of itself and of its first two differences. -> (T, T)"""
     eye = torch.eye(frames, dtype=torch.float64)
     total = settle.stay * eye
     for order, cost in ((1, settle.speed), (2, settle.bend)):
@@ -131,12 +131,12 @@ def stiffness(settle: Settle, frames: int) -> Tensor:
 
 
 class Smoothness:
-    """The cost of corrections, each number for itself, and what undoes it: whatever a step is made of is smooth.
+    """The cost of corrections, number by number, and its inverse, the preconditioner, which makes every step smooth.
 
     Args:
         settle: the costs.
-        free: (B, T, P) bool, whoever may move.
-        past: (B, L, P, DOFS) corrections just before, which stay; None: there are none.
+        free: (B, T, P) bool, who may move.
+        past: (B, L, P, DOFS) corrections just before, which stay; None: none.
     """
 
     def __init__(self, settle: Settle, free: Tensor, past: Tensor | None, like: Tensor) -> None:
@@ -151,47 +151,47 @@ class Smoothness:
         self.undone = self.inverse(0.0)  # (B, P, T, T)
 
     def inverse(self, pull: float) -> Tensor:
-        """Of the cost of one number, and of so much more for each frame. -> (B, P, T, T)"""
+        """Inverse of one number's cost with `pull` added for each frame. -> (B, P, T, T)"""
         T = self.cost.shape[0]
         own = self.cost[:, self.lead :].double()
         eye = torch.eye(T, dtype=own.dtype, device=own.device)
         return torch.linalg.inv(torch.where(self.free, own + pull * eye, eye)).to(self.cost)
 
     def toward(self, ground: Tensor) -> Tensor:
-        """A smooth correction that moves people over the ground about so far. (B, T, P, 2) metres -> (B, T, P, DOFS)"""
+        """A smooth correction that moves people about so far over the ground. (B, T, P, 2) metres -> (B, T, P, DOFS)"""
         pull = FOLLOWS / float(self.scale[0])
         offset = ground.new_zeros(*ground.shape[:3], DOFS)
         offset[..., [0, 2]] = pull * (self.inverse(pull) @ ground.transpose(1, 2)).transpose(1, 2)
         return offset
 
     def __call__(self, offset: Tensor) -> Tensor:
-        """(B, T, P, DOFS) -> same"""
+        """The cost's matrix times an offset. (B, T, P, DOFS) -> same"""
         return torch.einsum("st,btpd->bspd", self.cost[:, self.lead :], offset) * self.scale
 
     def slope(self, offset: Tensor) -> Tensor:
-        """The same, counted from the corrections of the past, and from `start`. (B, T, P, DOFS) -> same"""
+        """The gradient of the cost, the past's corrections included, with `start` free. (B, T, P, DOFS) -> same"""
         offset = offset - self.start
         whole = offset if self.past is None else torch.cat([self.past, offset], dim=1)
         return torch.einsum("st,btpd->bspd", self.cost, whole) * self.scale
 
     def undo(self, force: Tensor) -> Tensor:
-        """(B, T, P, DOFS) -> same"""
+        """The inverse of the cost's matrix times a force. (B, T, P, DOFS) -> same"""
         return (self.undone @ force.transpose(1, 2)).transpose(1, 2) / self.scale
 
 
 def solve(
-    rows: Rows, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, free: Tensor, inner: int
+    residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, free: Tensor, inner: int
 ) -> Tensor:
     """One Gauss-Newton step by preconditioned conjugate gradients. -> (B, T, P, DOFS)
 
     Args:
-        rows: what is wished.
-        first, second: (M, DOFS) its slopes at either end, times the square root of the weight.
+        residuals: M of them.
+        first, second: (M, DOFS) their slopes at either end, times the square root of the weight.
         offset: (B, T, P, DOFS) the correction so far.
-        free: (B, T, P) bool, whoever may move.
+        free: (B, T, P) bool, who may move.
     """
     shape, keep = offset.shape, free[..., None].to(offset)
-    a, b = rows.node, rows.other
+    a, b = residuals.node, residuals.other
 
     def across(x: Tensor) -> Tensor:
         flat = x.reshape(-1, DOFS)
@@ -203,10 +203,10 @@ def solve(
         return flat.view(shape)
 
     def product(x: Tensor, y: Tensor) -> Tensor:
-        """Of each scene by itself, so that scenes do not depend on those beside them. -> (B, 1, 1, 1)"""
+        """Scene by scene, so that scenes do not depend on each other. -> (B, 1, 1, 1)"""
         return (x * y).sum(dim=(1, 2, 3), keepdim=True)
 
-    residual = -(back(rows.root_weight * rows.residual) + smooth.slope(offset)) * keep
+    residual = -(back(residuals.root_weight * residuals.value) + smooth.slope(offset)) * keep
     step = torch.zeros_like(offset)
     z = smooth.undo(residual) * keep
     direction, rz = z, product(residual, z)
@@ -235,18 +235,15 @@ def correction(
     past: Tensor | None = None,
     toward: Tensor | None = None,
 ) -> Tensor:
-    """The correction of a scene's poses that meets wishes, for `corrected`. -> (B, T, P, DOFS)
+    """The correction of a scene's poses that meets the wishes, for `corrected`. -> (B, T, P, DOFS)
 
     Args:
-        scene: (B, T, P) the poses.
-        body: that its shapes belong to.
-        wishes: what is wished; see `Wishes.of`.
+        scene: (B, T, P), with shapes of `body`.
+        wishes: see `Wishes.of`.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
-        settle: how.
-        begun: the motion goes on from a past that stays where it is, so that corrections grow from 0.
-        past: (B, 2, P, DOFS) corrections of the two frames before, which this one goes on from; None: `begun` says.
-        toward: (B, T, P, 2) metres over the ground that people are moved before anything else, which decides on which
-            side of each other they end.
+        begun: the motion continues a past that stays, so corrections grow from 0.
+        past: (B, 2, P, DOFS) corrections of the two frames before, which are continued; None: see `begun`.
+        toward: (B, T, P, 2) metres that people are first moved over the ground: decides who ends on which side.
     """
     T = scene.frames
     if T > WINDOW + AHEAD:
@@ -272,7 +269,7 @@ def correct_window(
     past: Tensor | None,
     toward: Tensor | None,
 ) -> Tensor:
-    """Arguments as for `correction`, of frames that are corrected together."""
+    """`correction` of frames that are corrected together."""
     B, T, P = scene.T_world_root.shape[:3]
     free = scene.present[:, None].expand(B, T, P).clone()
     if fixed is not None:
@@ -295,16 +292,19 @@ def correct_window(
         now = corrected(scene, offset)
         R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)
-        rows = all_rows(seen, capsules, wishes, free)
-        if not len(rows.node):
+        residuals = all_residuals(seen, capsules, wishes, free)
+        if not len(residuals.node):
             break
         if ramp:
-            grown = ((rows.node // P % T + 1) / RAMP).clamp(max=1.0)
-            rows = replace(rows, root_weight=rows.root_weight * grown)
-        first = jacobian(seen, rows.node, rows.bone, rows.point, rows.along) * rows.root_weight[:, None]
-        second = jacobian(seen, rows.other, rows.other_bone, rows.other_point, rows.along)
-        second = second * (rows.root_weight * rows.two)[:, None]
-        step = solve(rows, first, second, smooth, offset, free, settle.inner)
+            grown = ((residuals.node // P % T + 1) / RAMP).clamp(max=1.0)
+            residuals = replace(residuals, root_weight=residuals.root_weight * grown)
+        first = (
+            jacobian(seen, residuals.node, residuals.bone, residuals.point, residuals.along)
+            * residuals.root_weight[:, None]
+        )
+        second = jacobian(seen, residuals.other, residuals.other_bone, residuals.other_point, residuals.along)
+        second = second * (residuals.root_weight * residuals.two)[:, None]
+        step = solve(residuals, first, second, smooth, offset, free, settle.inner)
         size = step.abs().amax(dim=(1, 2, 3), keepdim=True)
         offset = offset + step * (settle.most / size.clamp_min(settle.most))
     return offset

@@ -1,4 +1,4 @@
-"""What a correction of poses is to reach, read off the motion: who holds hands, which toes stand, who floats."""
+"""Goals of a correction, taken from the motion itself: who holds hands, which toes stand, who floats."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from magnet.body.base import Body
 from magnet.body.energy import CONTACT, GRAVITY, Contact, hand_points
 from magnet.body.fit import clearance
 from magnet.body.joints import FEET, TOES
+from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
 
 HELD = 0.20
-"""Metres between the middles of two hands that hold, as the metric has it."""
+"""Metres between the middles of two hands that hold each other, as in the metric."""
 LOW = 0.05
-"""Height in metres of a toe that stands, as for the metric FS."""
+"""Height in metres below which a toe can stand, as in the metric FS."""
 SLIDES = 0.6
-"""Speed in m/s over which a low toe is taken to step."""
+"""Speed in m/s above which a low toe is stepping."""
 FLOATS = 0.045
-"""Metres between the sole of the lower foot and the floor over which somebody floats or jumps."""
+"""Metres between the lower sole and the floor above which somebody floats or jumps."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What poses are to be.
+    """What poses shall fulfil.
 
     Attributes:
         contact: depths that are no penetration.
         present: (B, P) bool, who is there.
         clearance: (B, P, 4) height of the feet's joints over the sole, metres.
-        stands: (B, T - 1, P, 2) bool, toes that are to stand still in that step.
-        heights: (B, T, P, 2) metres that low toes are to be over y = 0, NaN where they are not low.
-        floats: (B, T, P) bool, people whose lower foot is to come down to the floor.
-        held: (B, T, Q, 2, 2) bool, hands of each pair of people, in the order of `combinations`, that hold.
-        between: (B, T, Q, 2, 2, 3) from the second's hands to the first's, as they are to be.
+        stands: (B, T - 1, P, 2) bool, toes that shall not move from a frame to the next.
+        heights: (B, T, P, 2) metres over y = 0 of low toes, NaN for others.
+        floats: (B, T, P) bool, whose lower foot shall come down to the floor.
+        held: (B, T, Q, 2, 2) bool, hands that hold, of each pair of people in the order of `combinations`.
+        between: (B, T, Q, 2, 2, 3) metres from the second's hands to the first's.
         still: m/s at which a toe still stands.
         fps: frames a second.
     """
@@ -63,13 +64,13 @@ class Wishes:
         still: float = 0.04,
         begun: bool = False,
     ) -> Wishes:
-        """Read off the motion as it is: (B, T, P).
+        """The wishes that a motion (B, T, P) itself shows.
 
         Args:
             how: a name in `CONTACT`.
-            slides: m/s under which a low toe is to stand.
-            still: m/s at which a toe is let move.
-            begun: the motion's first frames go on from others; who is in the air then may have jumped.
+            slides: m/s below which a low toe is meant to stand.
+            still: m/s that a standing toe is allowed.
+            begun: the first frames continue others; who is in the air then may have jumped.
         """
         joints = body.joints(scene)
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
@@ -94,7 +95,7 @@ class Wishes:
         return self.present[:, None].expand(-1, frames, -1)
 
     def slice(self, start: int, stop: int) -> Wishes:
-        """Those of the frames [start, stop)."""
+        """The wishes of the frames [start, stop)."""
         frames = slice(start, stop)
         return replace(
             self,
@@ -107,9 +108,9 @@ class Wishes:
 
 
 def holds(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Which hands hold, and from where to where. (B, T, P, 22, 3), (B, P) -> (B, T, Q, 2, 2), (B, T, Q, 2, 2, 3)
+    """Which hands hold, and vectors between hands. (B, T, P, 22, 3), (B, P) -> (B, T, Q, 2, 2), (B, T, Q, 2, 2, 3)
 
-    Of the four pairs of hands of two people the nearest counts, and the other two hands where they hold as well.
+    Of two people the nearest pair of hands counts, and the pair of the other two hands.
     """
     P = joints.shape[2]
     pairs = list(combinations(range(P), 2))
@@ -127,7 +128,7 @@ def holds(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) -> Tensor:
-    """Toes that are to stand: low and slow from a frame to the next. -> (B, T - 1, P, 2) bool
+    """Toes that stand: low and slow from a frame to the next. -> (B, T - 1, P, 2) bool
 
     joints (B, T, P, 22, 3), above (B, P, 4) clearance of the feet's joints
     """
@@ -137,7 +138,7 @@ def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) 
 
 
 def low_toes(joints: Tensor, above: Tensor) -> Tensor:
-    """Toes that are on the floor, or in it with the rest of the foot. As for `standing` -> (B, T, P, 2) bool"""
+    """Toes on the floor, or under it together with the foot. As for `standing` -> (B, T, P, 2) bool"""
     lowest = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
     return joints[..., TOES, 1] - lowest < LOW
 
@@ -145,8 +146,8 @@ def low_toes(joints: Tensor, above: Tensor) -> Tensor:
 def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> Tensor:
     """Who is over the floor and does not jump. -> (B, T, P) bool
 
-    Both feet are over `FLOATS`. Whoever jumps falls: the centre of the body is then pulled down by about half of
-    gravity at least, on average over the time in the air, and nobody stays up for longer than 0.8 seconds.
+    Both feet are above `FLOATS`. A jump lasts at most 0.8 seconds, and during it the mean of the joints accelerates
+    downward by at least half of gravity on average.
     """
     height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)  # (B, T, P)
     up = height > FLOATS
@@ -157,18 +158,9 @@ def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> 
     result = torch.zeros_like(up)
     longest = round(0.8 * fps)
     for b, p in up.any(dim=1).nonzero().tolist():
-        row = up[b, :, p].tolist()
-        start = 0
-        while start < T:
-            if not row[start]:
-                start += 1
-                continue
-            stop = start
-            while stop < T and row[stop]:
-                stop += 1
+        for start, stop in true_runs(up[b, :, p].tolist()):
             cut = (start == 0 and begun) or stop == T  # it may have begun before, or end after
-            inner = fall[b, start:stop, p]
-            jumps = stop - start <= longest and float(inner.mean()) < -GRAVITY / 2
-            result[b, start:stop, p] = not jumps and not (cut and float(inner.mean()) < -GRAVITY / 4)
-            start = stop
+            pull = float(fall[b, start:stop, p].mean())
+            jumps = stop - start <= longest and pull < -GRAVITY / 2
+            result[b, start:stop, p] = not jumps and not (cut and pull < -GRAVITY / 4)
     return result

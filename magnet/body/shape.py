@@ -1,4 +1,4 @@
-"""Converts shape numbers of one body model to another."""
+"""Conversion of shape numbers from one body model to another."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from torch import Tensor
 from magnet.body.base import SHAPES, Body
 
 PULL = 3e-4
-"""Metres that a joint may be off to make a shape number smaller by one: shapes that joints hardly show stay small."""
+"""Metres of joint error that weigh as much as one shape number: shapes that joints hardly show stay small."""
 
 
 def reshaped(betas: Tensor, source: Body, target: Body) -> tuple[Tensor, Tensor]:
-    """Shape numbers of `target` whose joints at rest, seen from the pelvis, are nearest those of `source`.
+    """Shape numbers of `target` whose rest joints, seen from the pelvis, are nearest to those of `source`.
 
-    Least squares over the 22 joints; the same numbers where both bodies have the same joints at rest.
+    Least squares over the 22 joints; unchanged if both bodies have the same rest joints.
 
     Args:
         betas: (P, 10) of `source`.
-        source: the body that they belong to.
-        target: the body to express them in.
+        source: the body of these numbers.
+        target: the body of the result.
 
     Returns:
-        (P, 10) float64 shape numbers of `target`, and (P, 22) metres that its joints at rest are off.
+        (P, 10) float64 shape numbers of `target`, and (P, 22) metres of error of its rest joints.
     """
     betas = betas.double()
     if torch.equal(source.J_template, target.J_template) and torch.equal(source.J_shapedirs, target.J_shapedirs):

@@ -14,7 +14,7 @@ from magnet.body.energy import hand_points
 from magnet.body.joints import FEET, TOES
 from magnet.body.repair import repaired
 from magnet.body.settle import DOFS, corrected, jacobian
-from magnet.body.settle_rows import Seen
+from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.scene import Scene, cat_time
 from magnet.synthesis import synthesize

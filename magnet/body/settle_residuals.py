@@ -1,4 +1,4 @@
-"""Wishes as rows of a least-squares problem: a length in metres between two points, which direction, how heavy."""
+"""Wishes as residuals of a least-squares problem: lengths in metres along directions between two points, weighted."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from magnet.body.joints import FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
 
 WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
-"""Cost of a squared metre of each kind of row."""
+"""Cost of a squared metre of each kind of residual."""
 
 REACH = 1.6
-"""Metres between pelvises beyond which two bodies cannot touch, arms stretched out halfway."""
+"""Metres between pelvises beyond which bodies cannot touch, even with arms half stretched out."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Poses: nodes are people in frames, in the order (B, T, P)."""
+    """Poses; a node is one person in one frame, in the order (B, T, P)."""
 
     R_world: Tensor  # (nodes, 22, 3, 3)
     joints: Tensor  # (nodes, 22, 3)
     ends: Tensor  # (B, T, P, K, 2, 3) of capsules
-    by_frame: Tensor  # (B, T, P, 22, 3) the joints again
+    by_frame: Tensor  # (B, T, P, 22, 3) the same joints
 
     def node(self, b: Tensor, t: Tensor, p: Tensor | int) -> Tensor:
-        """(M,) int"""
+        """Numbers of nodes. (M,) int"""
         T, P = self.by_frame.shape[1:3]
         return (b * T + t) * P + p
 
 
 @dataclass(frozen=True)
-class Rows:
-    """M wishes: `residual` is to become 0 and changes by along . (d point - d other_point)."""
+class Residuals:
+    """M residuals: `value` is to become 0, and changes by along . (d point - d other_point)."""
 
     node: Tensor  # (M,) int
     bone: Tensor
@@ -47,54 +47,54 @@ class Rows:
     other_bone: Tensor
     other_point: Tensor
     along: Tensor  # (M, 3) of unit length
-    residual: Tensor  # (M,) metres
+    value: Tensor  # (M,) metres
     root_weight: Tensor  # (M,)
-    two: Tensor  # (M,) 1 where the other point moves too, 0 where it is the floor
+    two: Tensor  # (M,) 1: the other point moves, too; 0: it is the floor
 
-    def kept(self, keep: Tensor) -> Rows:
-        """Some of the rows. keep (M,) bool"""
-        return Rows(*(getattr(self, f.name)[keep] for f in fields(self)))
-
-
-def cat(parts: list[Rows]) -> Rows:
-    """All rows of several kinds."""
-    return Rows(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Rows)))
+    def kept(self, keep: Tensor) -> Residuals:
+        """Some of the residuals. keep (M,) bool"""
+        return Residuals(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
-def rows_of(
+def cat(parts: list[Residuals]) -> Residuals:
+    """Residuals of several kinds as one."""
+    return Residuals(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Residuals)))
+
+
+def residuals_of(
     kind: str,
     node: Tensor,
     bone: Tensor,
     point: Tensor,
     along: Tensor,
-    residual: Tensor,
+    value: Tensor,
     other: tuple[Tensor, Tensor, Tensor] | None = None,
-) -> Rows:
-    """Rows of one kind; `other` is (node, bone, point), None the floor."""
-    two = torch.full_like(residual, float(other is not None))
-    weight = torch.full_like(residual, WEIGHTS[kind] ** 0.5)
-    return Rows(node, bone, point, *(other or (node, bone, point)), along, residual, weight, two)
+) -> Residuals:
+    """Residuals of one kind; `other` is (node, bone, point), None the floor."""
+    two = torch.full_like(value, float(other is not None))
+    weight = torch.full_like(value, WEIGHTS[kind] ** 0.5)
+    return Residuals(node, bone, point, *(other or (node, bone, point)), along, value, weight, two)
 
 
-def all_rows(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Rows:
-    """All wishes that are not met, of whoever can do something about them. free (B, T, P) bool"""
+def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
+    """All unmet wishes of people who can move. free (B, T, P) bool"""
     parts = [
-        *between_rows(seen, capsules, wishes),
-        within_rows(seen, capsules, wishes),
-        *hold_rows(seen, wishes),
-        stand_rows(seen, wishes),
-        height_rows(seen, wishes),
-        floor_rows(seen, wishes),
-        float_rows(seen, wishes),
+        *between_residuals(seen, capsules, wishes),
+        within_residuals(seen, capsules, wishes),
+        *hold_residuals(seen, wishes),
+        stand_residuals(seen, wishes),
+        height_residuals(seen, wishes),
+        floor_residuals(seen, wishes),
+        float_residuals(seen, wishes),
     ]
-    rows, can = cat(parts), free.flatten()
-    return rows.kept(can[rows.node] | (can[rows.other] & (rows.two > 0)))
+    residuals, can = cat(parts), free.flatten()
+    return residuals.kept(can[residuals.node] | (can[residuals.other] & (residuals.two > 0)))
 
 
 def touching(
     seen: Seen, capsules: FittedCapsules, pairs: tuple[Tensor, Tensor, Tensor, Tensor], allowed: Tensor, kind: str
-) -> Rows:
-    """Rows of capsules that are deeper than allowed.
+) -> Residuals:
+    """Residuals of capsules deeper than allowed.
 
     pairs: (M,) b, t and the two people; allowed (K, K) metres.
     """
@@ -107,17 +107,17 @@ def touching(
     gap = apart.norm(dim=-1)
     depth = capsules.radius[b, p][:, i] + capsules.radius[b, q][:, j] - gap - allowed[i, j].to(gap)
     m, k = (depth > 0).nonzero(as_tuple=True)
-    # Axes that cross have no direction: people then leave each other over the ground, as their pelvises stand.
+    # Crossing axes have no direction between them: people then part along the line between their pelvises.
     pelvis = (seen.by_frame[b, t, p, 0] - seen.by_frame[b, t, q, 0])[m] * torch.tensor([1.0, 0.0, 1.0]).to(gap)
     pelvis = torch.nn.functional.normalize(pelvis + torch.tensor([1e-6, 0.0, 0.0]).to(gap), dim=-1)
     length = gap[m, k]
     away = torch.where((length > 0.005)[:, None], apart[m, k] / length.clamp_min(0.005)[:, None], pelvis)
     node, others = seen.node(b, t, p)[m], seen.node(b, t, q)[m]
-    # The residual is the depth; moving along `away` makes it smaller.
-    return rows_of(kind, node, bones[i[k]], first[m, k], -away, depth[m, k], (others, bones[j[k]], second[m, k]))
+    # The value is the depth; moving along `away` reduces it.
+    return residuals_of(kind, node, bones[i[k]], first[m, k], -away, depth[m, k], (others, bones[j[k]], second[m, k]))
 
 
-def between_rows(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> list[Rows]:
+def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> list[Residuals]:
     """Depth between people."""
     P, allowed = seen.by_frame.shape[2], allowed_between(wishes.contact).to(seen.joints.device)
     parts = []
@@ -129,20 +129,20 @@ def between_rows(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> list[R
     return parts
 
 
-def within_rows(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Rows:
-    """Depth of bodies with themselves."""
+def within_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Residuals:
+    """Depth of each body in itself."""
     b, t, p = wishes.everybody(seen.by_frame.shape[1]).nonzero(as_tuple=True)
     allowed = allowed_within(wishes.contact).to(seen.joints.device)
     return touching(seen, capsules, (b, t, p, p), allowed, "within")
 
 
 def axes(count: int, like: Tensor) -> Tensor:
-    """The world's three directions for each of so many wishes. -> (3 * count, 3)"""
+    """The world's axes, `count` times. -> (3 * count, 3)"""
     return torch.eye(3).to(like).repeat(count, 1)
 
 
-def hold_rows(seen: Seen, wishes: Wishes) -> list[Rows]:
-    """Hands that hold stay as they were to each other."""
+def hold_residuals(seen: Seen, wishes: Wishes) -> list[Residuals]:
+    """Hands that hold each other keep their distance vector."""
     parts = []
     wrists = torch.tensor(WRISTS, device=seen.joints.device)
     hands = hand_points(seen.by_frame)
@@ -153,12 +153,12 @@ def hold_rows(seen: Seen, wishes: Wishes) -> list[Rows]:
         node, bone, end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, p), wrists[i], point))
         others = [x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, q), wrists[j], other)]
         reach = (others[0], others[1], others[2])
-        parts.append(rows_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach))
+        parts.append(residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach))
     return parts
 
 
-def stand_rows(seen: Seen, wishes: Wishes) -> Rows:
-    """Toes that stand do not move over the floor, but for a rest of speed."""
+def stand_residuals(seen: Seen, wishes: Wishes) -> Residuals:
+    """Standing toes move over the floor no faster than `Wishes.still`."""
     b, t, p, i = wishes.stands.nonzero(as_tuple=True)
     toes = torch.tensor(TOES, device=b.device)[i]
     before, after = seen.by_frame[b, t, p, toes], seen.by_frame[b, t + 1, p, toes]
@@ -166,33 +166,35 @@ def stand_rows(seen: Seen, wishes: Wishes) -> Rows:
     length = moved.norm(dim=-1)
     over = length - wishes.still / wishes.fps
     along = moved / length.clamp_min(1e-6)[:, None]
-    rows = rows_of("stand", seen.node(b, t + 1, p), toes, after, along, over, (seen.node(b, t, p), toes, before))
-    return rows.kept(over > 0)
+    residuals = residuals_of(
+        "stand", seen.node(b, t + 1, p), toes, after, along, over, (seen.node(b, t, p), toes, before)
+    )
+    return residuals.kept(over > 0)
 
 
-def height_rows(seen: Seen, wishes: Wishes) -> Rows:
-    """Low toes stay as high as they were."""
+def height_residuals(seen: Seen, wishes: Wishes) -> Residuals:
+    """Low toes keep their height."""
     b, t, p, i = wishes.heights.isfinite().nonzero(as_tuple=True)
     toes = torch.tensor(TOES, device=b.device)[i]
     point = seen.by_frame[b, t, p, toes]
     up = axes(1, point)[1].expand(len(b), 3)
-    return rows_of("height", seen.node(b, t, p), toes, point, up, point[:, 1] - wishes.heights[b, t, p, i])
+    return residuals_of("height", seen.node(b, t, p), toes, point, up, point[:, 1] - wishes.heights[b, t, p, i])
 
 
-def floor_rows(seen: Seen, wishes: Wishes) -> Rows:
+def floor_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     """Soles are not under the floor."""
     feet = torch.tensor(FEET, device=seen.joints.device)
     depth = wishes.clearance[:, None] - seen.by_frame[..., FEET, 1]  # (B, T, P, 4)
     b, t, p, i = ((depth > 0) & wishes.everybody(depth.shape[1])[..., None]).nonzero(as_tuple=True)
     down = -axes(1, depth)[1].expand(len(b), 3)
-    return rows_of("floor", seen.node(b, t, p), feet[i], seen.by_frame[b, t, p, feet[i]], down, depth[b, t, p, i])
+    return residuals_of("floor", seen.node(b, t, p), feet[i], seen.by_frame[b, t, p, feet[i]], down, depth[b, t, p, i])
 
 
-def float_rows(seen: Seen, wishes: Wishes) -> Rows:
-    """The lower foot of whoever floats comes down to the floor."""
+def float_residuals(seen: Seen, wishes: Wishes) -> Residuals:
+    """The lower foot of a floating person comes down to the floor."""
     height = seen.by_frame[..., FEET, 1] - wishes.clearance[:, None]
     lowest, which = height.min(dim=-1)
     b, t, p = (wishes.floats & (lowest > 0)).nonzero(as_tuple=True)
     feet = torch.tensor(FEET, device=b.device)[which[b, t, p]]
     up = axes(1, height)[1].expand(len(b), 3)
-    return rows_of("float", seen.node(b, t, p), feet, seen.by_frame[b, t, p, feet], up, lowest[b, t, p])
+    return residuals_of("float", seen.node(b, t, p), feet, seen.by_frame[b, t, p, feet], up, lowest[b, t, p])
