@@ -25,7 +25,7 @@ from magnet.cli.parser import Parser
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request
 from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.token_model import TokenModel
 from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
 from magnet.motion.scene import Scene
@@ -239,7 +239,7 @@ class MagnetCLI(LightningCLI):
             if not any(isinstance(callback, ModelCheckpoint) for callback in callbacks):
                 callbacks += run_folder.checkpoints(self.folder, self.model)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
-            sampling = self.command in SAMPLING and isinstance(self.model, Denoiser)
+            sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
             callbacks.append(run_folder.progress_bar(sampling))
         logger = config.get("logger")
         if logger is None or logger is True:
@@ -294,8 +294,8 @@ class MagnetCLI(LightningCLI):
     # -- running -------------------------------------------------------------------------------
 
     def _evaluate(self) -> None:
-        """Put an evaluator around a denoiser, whose checkpoint is read here: the Trainer's model is the evaluator."""
-        if self.request.task is None or not isinstance(self.model, Denoiser):
+        """Put an evaluator around a model, whose checkpoint is read here: the Trainer's model is the evaluator."""
+        if self.request.task is None or not isinstance(self.model, TokenModel):
             return
         if self.checkpoint is not None:
             stored = checkpoints.read(self.checkpoint)
@@ -312,7 +312,7 @@ class MagnetCLI(LightningCLI):
         optimizers.choose_optimizer(self.model, self.config_init[self.command])
         if self.checkpoint is not None and not getattr(self.model, "built", True):
             self.model.on_load_checkpoint(checkpoints.read(self.checkpoint))
-        if isinstance(self.model, Denoiser):  # now, and not once data are made and files are written
+        if isinstance(self.model, TokenModel):  # now, and not once data are made and files are written
             self.model.require_tokenizer()
 
     before_test = _evaluate

@@ -35,6 +35,7 @@ class TokenModel(L.LightningModule):
     tokenizer: PoseTokenizer
     layout: TokenLayout
     normalizer: Normalizer
+    window: int  # token steps that the network sees at once
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""`Evaluator`: what `magnet test` and `magnet predict` do with a trained denoiser and a task."""
+"""`Evaluator`: what `magnet test` and `magnet predict` do with a trained model and a task."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from magnet.baselines.predictor import Generators, joints_of
 from magnet.checks import require_whole
 from magnet.datamodules.base import MotionDataModule
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.token_model import TokenModel
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import CONFIDENCE, TRAINING, TRUTH, UNALIGNED, Scoring, Sight, generators_of, planned
 from magnet.evaluation.worlds import aligned, in_slots, shared_world
@@ -21,6 +22,7 @@ from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.metrics.interval import Unit
 from magnet.motion.scene import Scene
+from magnet.peers import Peer
 from magnet.precision import require_float32_scenes
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
@@ -34,10 +36,10 @@ MODEL = "magnet"
 
 
 class Evaluator(L.LightningModule):
-    """Samples a task with a trained denoiser and measures it; what `trainer.test` and `trainer.predict` are given.
+    """Samples a task with a trained model and measures it; what `trainer.test` and `trainer.predict` are given.
 
     Args:
-        denoiser: the trained model.
+        denoiser: the trained model; a peer answers in its own way, whatever the sampler, under its own name.
         task: what is sampled.
         sampler: how it is sampled.
         samples: scenes drawn for each test scene (paper 4: 10).
@@ -60,7 +62,7 @@ class Evaluator(L.LightningModule):
 
     def __init__(
         self,
-        denoiser: Denoiser,
+        denoiser: TokenModel,
         task: Task | None = None,
         sampler: SamplerOptions | None = None,
         samples: int = 10,
@@ -79,6 +81,7 @@ class Evaluator(L.LightningModule):
         self.progress: Callable[[int], None] | None = None
         self.stats, self.scenes = SamplingStats(), 0
         self.scoring: Scoring | None = None
+        self.row = type(denoiser).__name__ if isinstance(denoiser, Peer) else MODEL
 
     # -- what the Trainer calls ----------------------------------------------------------------
 
@@ -118,7 +121,7 @@ class Evaluator(L.LightningModule):
         self.stats, self.scenes = SamplingStats(), 0
         self.scoring = Scoring(
             datamodule,
-            {MODEL: self.predict_joints},
+            {self.row: self.predict_joints},
             self.sees,
             samples=self.samples,
             baselines=self.baselines,
@@ -138,7 +141,7 @@ class Evaluator(L.LightningModule):
         """Finish the run and put the table into `results`. Returns what to log, the model's metrics first."""
         assert self.scoring is not None
         self.results = self.scoring.finish(self.facts())
-        return {f"test/{name}": torch.tensor(value) for name, value in self.results.rows[MODEL].items()}
+        return {f"test/{name}": torch.tensor(value) for name, value in self.results.rows[self.row].items()}
 
     def schedule(self, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
         """The task's plan for scenes of so many frames, of people in the first `slots` slots; by default in all."""
@@ -170,6 +173,10 @@ class Evaluator(L.LightningModule):
             return aligned(whole, max(self.context - 1, 0))
 
     def _sampled(self, scene: Scene, samples: int, generators: Generators) -> Scene:
+        if isinstance(self.denoiser, Peer):
+            known = self.denoiser.known_by(self.task, self.context, self.horizon)
+            return self.denoiser.sample(scene, known, self.context + self.horizon, samples, generators)
+        assert isinstance(self.denoiser, Denoiser)
         return generate(
             self.denoiser,
             in_slots(scene, min(scene.agents, max(occupied(scene), self.denoiser.layout.agents))),
