@@ -203,7 +203,8 @@ def _read_folder(folder: Path) -> dict[str, Any]:
             raise ValueError(f"{file} is missing: fetch the release again")
         if file_hash(file) != digest:
             raise ValueError(f"{file} is damaged: its hash is not the one in config.json: fetch the release again")
-        state |= {name: _widen(value) for name, value in load_file(file).items()}
+        for name, value in load_file(file).items():
+            state[name] = value.float() if value.dtype == torch.float16 else value
     return {
         "state_dict": state,
         "pytorch-lightning_version": "2.6.4",
@@ -217,10 +218,6 @@ def _config_hash(config: dict[str, Any]) -> str:
     """Of all that a config.json says but this hash itself."""
     said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
-
-
-def _widen(value: Tensor) -> Tensor:
-    return value.float() if value.dtype == torch.float16 else value
 
 
 def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
@@ -254,7 +251,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     exact = ("statistics", "mean", "std")
     state = {
         name: value.half()
-        if half and value.is_floating_point() and value.dim() > 1 and not _any(exact, name)
+        if half and value.is_floating_point() and value.dim() > 1 and not any(part in name for part in exact)
         else value
         for name, value in checkpoint["state_dict"].items()
     }
@@ -282,10 +279,6 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     config = json.loads(json.dumps(config, default=str))  # as it will be read
     (folder / "config.json").write_text(json.dumps(config | {"sha256": _config_hash(config)}, indent=1) + "\n")
     return folder
-
-
-def _any(parts: tuple[str, ...], name: str) -> bool:
-    return any(part in name for part in parts)
 
 
 class CheckpointIO(TorchCheckpointIO):

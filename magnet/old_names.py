@@ -16,9 +16,7 @@ from torch import Tensor
 
 Options = dict[str, Any]
 
-CLASSES: dict[str, str] = {
-    "magnet.denoiser.averaging.WeightEMA": "magnet.training.ema.WeightEMA",
-}
+CLASSES: dict[str, str] = {"magnet.denoiser.averaging.WeightEMA": "magnet.training.ema.WeightEMA"}
 """Dotted paths of classes that have moved or changed their name."""
 
 OPTIMIZER: dict[str, str | None] = {

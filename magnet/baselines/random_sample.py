@@ -19,10 +19,7 @@ class RandomSample(Retrieval):
         chosen = []
         for people in context.present.sum(dim=1).tolist():
             among = self.candidates(people)
-            drawn = torch.randint(len(among), (samples,), generator=generator, device=_device(generator))
+            device = torch.device("cpu") if generator is None else generator.device
+            drawn = torch.randint(len(among), (samples,), generator=generator, device=device)
             chosen.append(among[drawn.to(among.device)])
         return self.answer(context.repeat(samples), horizon, torch.cat(chosen))
-
-
-def _device(generator: torch.Generator | None) -> torch.device:
-    return torch.device("cpu") if generator is None else generator.device

@@ -60,10 +60,7 @@ class Apart:
     rounds: int = 2
 
 
-APART: dict[str, Apart] = {
-    "light": Apart(body=0.06, arms=0.08, speed=0.2),
-    "firm": Apart(),
-}
+APART: dict[str, Apart] = {"light": Apart(body=0.06, arms=0.08, speed=0.2), "firm": Apart()}
 """By name: `light` lets people lean on each other, `firm` lets them touch."""
 
 

@@ -112,24 +112,16 @@ def add_info(one: argparse.ArgumentParser) -> None:
 
 
 def add_work(one: argparse.ArgumentParser) -> None:
-    one.add_argument(
-        "--body", default="open", help="SMPL-X's or SMPL's file, npz or pkl (register at https://smpl-x.is.tue.mpg.de)"
-    )
-    one.add_argument(
-        "--bodies",
-        nargs="+",
-        default=(),
-        help="folder or files of gendered bodies (SMPLX_FEMALE.npz ...) that the shape numbers belong to; people are "
-        "expressed in the one --body",
-    )
-    one.add_argument(
-        "--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)"
-    )
-    one.add_argument("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
-    one.add_argument("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
-    one.add_argument("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
-    one.add_argument("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
-    one.add_argument("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
+    add = one.add_argument
+    add("--body", default="open", help="SMPL-X's or SMPL's file, npz or pkl (register at https://smpl-x.is.tue.mpg.de)")
+    bodies = "folder or files of gendered bodies (SMPLX_FEMALE.npz ...) that the shape numbers belong to; people are "
+    add("--bodies", nargs="+", default=(), help=f"{bodies}expressed in the one --body")
+    add("--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)")
+    add("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
+    add("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
+    add("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
+    add("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
+    add("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
 
 
 def add_check(one: argparse.ArgumentParser) -> None:
@@ -161,9 +153,8 @@ def add_download(one: argparse.ArgumentParser) -> None:
     one.add_argument("out", nargs="?", help="folder to write to; run again to go on")
     one.add_argument("--subjects", default="60,61", help="numbers with commas (default: %(default)s, salsa couples)")
     one.add_argument("--base_url", default=None, help="another copy of the site")
-    one.add_argument(
-        "--any_version", action="store_true", help="take files, too, whose SHA-256 is known to be another: issued anew"
-    )
+    anew = "take files, too, whose SHA-256 is known to be another: issued anew"
+    one.add_argument("--any_version", action="store_true", help=anew)
 
 
 def needed(given: argparse.Namespace, *names: str) -> list[str]:

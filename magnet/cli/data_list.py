@@ -13,10 +13,7 @@ if TYPE_CHECKING:
     from magnet.datamodules.reading.recording import Reader
     from magnet.plugins import Registered
 
-BODIES = {
-    "smplx": "--body SMPLX_NEUTRAL.npz",
-    "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL",
-}
+BODIES = {"smplx": "--body SMPLX_NEUTRAL.npz", "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL"}
 """The body that shape numbers need, by family: SMPL's are expressed in SMPL-X's."""
 WHERE = {
     "smplx": "SMPL-X's file, npz or pkl, is from https://smpl-x.is.tue.mpg.de (register)",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -83,14 +83,10 @@ def show_persons(groups: list[tuple[list[str], int]]) -> None:
         print(f"  ... and {len(groups) - PERSONS_SHOWN} more groups, all of them in the store's manifest.json")
 
 
-@contextmanager
-def file_bars() -> Iterator[Callable[[str, int, int | None], None]]:
+def file_bars() -> AbstractContextManager[Callable[[str, int, int | None], None]]:
     """A progress bar of the file that is being fetched."""
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+    from rich.progress import DownloadColumn, TransferSpeedColumn
 
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TextColumn("{task.description}"))
-    from magnet.datamodules.preparing.progress import on_a_terminal
+    from magnet.datamodules.preparing.progress import bar_with
 
-    with Progress(*columns, **on_a_terminal()) as progress:
-        task = progress.add_task("", total=None)
-        yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)
+    return bar_with(DownloadColumn(), TransferSpeedColumn())

@@ -94,9 +94,7 @@ def run(options: argparse.Namespace) -> int:
         f"{HORIZON / FPS:.0f} seconds go for everybody in them. All numbers below are computed now."
     )
     data = Synthetic(
-        test_clips=options.scenes,
-        train_clips=60,
-        test=HeldOutScenes(limit=options.scenes, batch_size=options.scenes),
+        test_clips=options.scenes, train_clips=60, test=HeldOutScenes(limit=options.scenes, batch_size=options.scenes)
     )
     sampler = SamplerOptions.preset(options.sampler, **({} if options.steps is None else {"steps": options.steps}))
     results = measure(model, data, sampler, options.samples)

@@ -36,58 +36,29 @@ def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("export", __doc__, EPILOG)
     options.add_argument("out", **scene_files.OUT)
     scene_files.add_body(options)
-    options.add_argument("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
-    options.add_argument(
-        "--person", type=int, action="append", default=[], metavar="N", help="only this person, from 0; may be repeated"
-    )
-    options.add_argument("--fps", type=float, help="frames a second of OUT (default: as in IN)")
-    options.add_argument(
-        "--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it"
-    )
-    options.add_argument("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
-    options.add_argument("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
-    bones = options.add_argument_group("bones of .glb, .fbx and .usd")
-    bones.add_argument(
-        "--names",
-        choices=("smplx", "vrm", "mixamo"),
-        default="smplx",
-        help="SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's (default: %(default)s)",
-    )
-    bones.add_argument(
-        "--root",
-        choices=("floor", "none"),
-        default="floor",
-        help="a bone on the floor that carries where somebody walks, or none (default: %(default)s)",
-    )
-    bones.add_argument(
-        "--clips",
-        choices=("scene", "person"),
-        default="scene",
-        help="one animation of a .glb for all, or one for each person (default: %(default)s)",
-    )
+    add = options.add_argument
+    add("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
+    add("--person", **scene_files.PEOPLE, help="only this person, from 0; may be repeated")
+    add("--fps", type=float, help="frames a second of OUT (default: as in IN)")
+    add("--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it")
+    add("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
+    add("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
+    add = options.add_argument_group("bones of .glb, .fbx and .usd (defaults: smplx, floor, scene)").add_argument
+    names = "SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's"
+    add("--names", choices=("smplx", "vrm", "mixamo"), default="smplx", help=names)
+    root = "a bone on the floor that carries where somebody walks, or none"
+    add("--root", choices=("floor", "none"), default="floor", help=root)
+    clips = "one animation of a .glb for all, or one for each person"
+    add("--clips", choices=("scene", "person"), default="scene", help=clips)
     pictures = options.add_argument_group("pictures, films and pages")
-    pictures.add_argument(
-        "--context",
-        type=int,
-        default=0,
-        metavar="FRAMES",
-        help="first frames that a model was given, in files that do not say",
-    )
-    pictures.add_argument(
-        "--style",
-        choices=("body", "light", "capsules", "skeleton"),
-        default="body",
-        help="how people look; light is a body of few triangles",
-    )
+    context = "first frames that a model was given, in files that do not say"
+    pictures.add_argument("--context", type=int, default=0, metavar="FRAMES", help=context)
+    scene_files.add_look(pictures)
     pictures.add_argument("--title", help="written above")
-    pictures.add_argument(
-        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels of a film's panel"
-    )
     bvh = options.add_argument_group("reading .bvh and .npz of other programs")
     scene_files.add_origin(bvh)
-    bvh.add_argument(
-        "--joint", action="append", default=[], metavar="OURS=THEIRS", help="left_hip=Thigh_L, where names say nothing"
-    )
+    theirs = "left_hip=Thigh_L, where names say nothing"
+    bvh.add_argument("--joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
     return options
 
 

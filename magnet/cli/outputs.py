@@ -73,12 +73,7 @@ def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
 
 
 def write_scenes(
-    predicted: list[Scene],
-    evaluator: Evaluator,
-    data: Any,
-    folder: Path,
-    picture: str,
-    pictures: int,
+    predicted: list[Scene], evaluator: Evaluator, data: Any, folder: Path, picture: str, pictures: int
 ) -> None:
     """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames.
 

@@ -56,35 +56,23 @@ def meant(arguments: Sequence[str]) -> bool:
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("predict", __doc__, EPILOG, inputs="*")
     options.add_argument("--out", nargs="+", **scene_files.OUT)
-    what = options.add_argument_group("what is sampled")
-    what.add_argument("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
-    what.add_argument("--task.FIELD", metavar="VALUE", help="an option of the task")
-    what.add_argument(
+    add = options.add_argument_group("what is sampled").add_argument
+    add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
+    add("--task.FIELD", metavar="VALUE", help="an option of the task")
+    add(
         "--people", type=int, metavar="P", help="how many in all, up to 200; those without a file are made from nothing"
     )
-    what.add_argument(
-        "--spacing", type=float, default=3.0, metavar="M", help="metres between the groups of a crowd (default: 3)"
-    )
-    what.add_argument(
-        "--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)"
-    )
-    what.add_argument(
-        "--frames",
-        type=int,
-        metavar="T",
-        help=f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})",
-    )
-    what.add_argument("--samples", type=int, default=1, metavar="S", help="so many answers (default: %(default)s)")
-    how = options.add_argument_group("how")
-    how.add_argument("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
-    how.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
-    how.add_argument("--sampler", metavar="PRESET", help="default, steady (that of crowds) or paper")
-    how.add_argument("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
-    films = options.add_argument_group("films")
-    films.add_argument("--style", choices=("body", "light", "capsules", "skeleton"), default="body", help="of people")
-    films.add_argument(
-        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels of a panel (640 480)"
-    )
+    add("--spacing", type=float, default=3.0, metavar="M", help="metres between the groups of a crowd (default: 3)")
+    add("--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)")
+    frames = f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})"
+    add("--frames", type=int, metavar="T", help=frames)
+    add("--samples", type=int, default=1, metavar="S", help="so many answers (default: %(default)s)")
+    add = options.add_argument_group("how").add_argument
+    add("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
+    add("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
+    add("--sampler", metavar="PRESET", help="default, steady (that of crowds) or paper")
+    add("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
+    scene_files.add_look(options.add_argument_group("films"))
     files = options.add_argument_group("files")
     scene_files.add_body(files)
     scene_files.add_origin(files)
@@ -114,13 +102,7 @@ def main(arguments: Sequence[str]) -> int:
     context, frames = lengths(options, task, scene, added, model)
     began = time.perf_counter()
     made = model.predict(
-        scene,
-        task.name,
-        context=context,
-        frames=frames,
-        seed=options.seed,
-        samples=options.samples,
-        **task.fields,
+        scene, task.name, context=context, frames=frames, seed=options.seed, samples=options.samples, **task.fields
     )
     took = time.perf_counter() - began
     print(f"{task.name}: {made.scenes * made.frames} frames in {took:.1f} s, seed {options.seed}")

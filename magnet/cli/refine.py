@@ -31,29 +31,15 @@ def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("refine", __doc__, EPILOG)
     options.add_argument("out", **scene_files.OUT)
     scene_files.add_body(options)
-    options.add_argument(
-        "--apart",
-        choices=("light", "firm"),
-        default="firm",
-        help="light lets people lean on each other, firm leaves them touch (default: %(default)s)",
-    )
-    options.add_argument(
-        "--keep", type=int, action="append", default=[], metavar="N", help="this person does not move; may be repeated"
-    )
-    options.add_argument(
-        "--poses",
-        choices=("correct", "keep"),
-        default="correct",
-        help="keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)",
-    )
-    options.add_argument(
-        "--slides",
-        type=float,
-        default=0.6,
-        metavar="SPEED",
-        help="low toes slower than so many m/s are to stand still; 0: feet may slide (default: %(default)s)",
-    )
-    options.add_argument("--plot", metavar="SVG", help="draw depths, feet and hands over time, before and after")
+    add = options.add_argument
+    apart = "light lets people lean on each other, firm lets them touch (default: %(default)s)"
+    add("--apart", choices=("light", "firm"), default="firm", help=apart)
+    add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
+    poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
+    add("--poses", choices=("correct", "keep"), default="correct", help=poses)
+    slides = "low toes slower than so many m/s are to stand still; 0: feet may slide (default: %(default)s)"
+    add("--slides", type=float, default=0.6, metavar="SPEED", help=slides)
+    add("--plot", metavar="SVG", help="draw depths, feet and hands over time, before and after")
     return options
 
 

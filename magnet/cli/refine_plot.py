@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from magnet.export.page.palette import COLLIDES, STANDS
+from magnet.export.page.palette import COLLIDES, STANDS, hexed
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,7 +63,7 @@ def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float)
     bottom = GAP + len(before) * (HEIGHT + GAP)
     seconds = len(next(iter(before.values()))) / fps
     parts.append(f'<text x="{LEFT}" y="{bottom - 16}">0 to {seconds:.1f} s; red: before, green: after</text>')
-    red, green = ("#{:02x}{:02x}{:02x}".format(*colour) for colour in (COLLIDES, STANDS))
+    red, green = hexed(COLLIDES), hexed(STANDS)
     style = (
         "text{font:13px sans-serif;fill:#333} .frame{fill:#fafafa;stroke:#ccc} polyline{fill:none;stroke-width:1.6}"
         f" .before{{stroke:{red}}} .after{{stroke:{green}}}"

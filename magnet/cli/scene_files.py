@@ -35,6 +35,16 @@ def add_origin(options: Options) -> None:
     options.add_argument("--keep_floor", action="store_true", help="leave people at the height they were recorded at")
 
 
+def add_look(options: Options) -> None:
+    """--style and --size, of films and other pictures."""
+    styles = ("body", "light", "capsules", "skeleton")
+    options.add_argument("--style", choices=styles, default="body", help="of people; light: a body of few triangles")
+    size = "pixels of a film's panel (640 480)"
+    options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
+
+
+PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
+"""An option that names a person, and may be repeated."""
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 

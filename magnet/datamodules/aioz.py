@@ -41,7 +41,7 @@ class AIOZReader(Reader):
     title: ClassVar[str] = "AIOZ-GDANCE"
     source: ClassVar[str] = "https://github.com/aioz-ai/AIOZ-GDANCE"
     licence: ClassVar[str] = "non-commercial scientific research only"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.aioz:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.aioz"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions_smpl/NAME.pkl", "one file a sequence"),

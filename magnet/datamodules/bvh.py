@@ -111,7 +111,7 @@ class BVHReader(OwnReader[BvhTrack]):
 
     name: ClassVar[str] = "bvh"
     title: ClassVar[str] = "BVH files"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.bvh:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.bvh"
     family: ClassVar[Family] = "positions"
     suffixes: ClassVar[tuple[str, ...]] = (".bvh",)
     layout: ClassVar[tuple[tuple[str, str], ...]] = (

@@ -42,7 +42,7 @@ class CHI3DReader(Reader):
     title: ClassVar[str] = "CHI3D"
     source: ClassVar[str] = "http://vision.imar.ro/ci3d"
     licence: ClassVar[str] = "non-commercial research only, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.chi3d:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.chi3d"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("chi3d/train/sXX/smplx/ACTION.json", "both people; train may lie in --root itself"),

@@ -64,7 +64,7 @@ class CMUReader(Reader):
     title: ClassVar[str] = "CMU Graphics Lab Motion Capture Database"
     source: ClassVar[str] = "http://mocap.cs.cmu.edu"
     licence: ClassVar[str] = "free for research and products; not to be sold or passed on, converted or not"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.cmu:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.cmu"
     family: ClassVar[Family] = "positions"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("NN.asf", "a subject's skeleton, such as 60.asf, in any folder"),

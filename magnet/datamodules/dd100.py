@@ -53,7 +53,7 @@ class DD100Reader(Reader):
     title: ClassVar[str] = "DD100"
     source: ClassVar[str] = "https://github.com/lisiyao21/Duolando"
     licence: ClassVar[str] = "NTU S-Lab License 1.0: non-commercial"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.dd100:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.dd100"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         (
@@ -64,10 +64,7 @@ class DD100Reader(Reader):
     version: ClassVar[int] = 2  # genders are read
 
     def __init__(
-        self,
-        root: str | Path,
-        validation: bool = True,
-        orient: Literal["same", "global_orient", "poses"] = "same",
+        self, root: str | Path, validation: bool = True, orient: Literal["same", "global_orient", "poses"] = "same"
     ) -> None:
         super().__init__(root)
         if orient not in ("same", "global_orient", "poses"):

@@ -67,7 +67,7 @@ class DuoBoxReader(Reader):
     title: ClassVar[str] = "DuoBox"
     source: ClassVar[str] = "https://github.com/zju3dv/ready_to_react"
     licence: ClassVar[str] = "by request form, no licence published: research only, no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.duobox:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.duobox"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("fbx_fit_smpl/TAKE.npy", "SMPL-X fits of both people"),

@@ -77,7 +77,7 @@ class Embody3DReader(Reader):
     title: ClassVar[str] = "Embody 3D"
     source: ClassVar[str] = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
     licence: ClassVar[str] = "Meta's XRCIA research licence, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.embody3d:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.embody3d"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("datasets/SECTION/CAPTURE/SUBJECT/FEATURE/CAPTURE.npy", "features smplx_mesh_* and missing"),
@@ -85,11 +85,7 @@ class Embody3DReader(Reader):
     )
 
     def __init__(
-        self,
-        root: str | Path,
-        sections: Sequence[str] | None = None,
-        people: Sequence[int] = (2, 3, 4),
-        good: int = 1,
+        self, root: str | Path, sections: Sequence[str] | None = None, people: Sequence[int] = (2, 3, 4), good: int = 1
     ) -> None:
         super().__init__(root)
         if good not in (0, 1):

@@ -39,7 +39,7 @@ class Hi4DReader(Reader):
     title: ClassVar[str] = "Hi4D"
     source: ClassVar[str] = "https://yifeiyin04.github.io/Hi4D"
     licence: ClassVar[str] = "non-commercial scientific research only, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.hi4d:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.hi4d"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("pairXX/ACTION/meta.npz", "first and last frame, genders"),

@@ -39,7 +39,7 @@ class InterHumanReader(Reader):
     title: ClassVar[str] = "InterHuman"
     source: ClassVar[str] = "https://github.com/tr3e/InterGen"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.interhuman:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.interhuman"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions/ID.pkl", "the raw motions, not motions_processed"),

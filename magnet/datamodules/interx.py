@@ -45,7 +45,7 @@ class InterXReader(Reader):
     title: ClassVar[str] = "Inter-X"
     source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
     licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.interx:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.interx"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("motions/CLIP/{P1,P2}.npz", "such as G001T000A000R000/P1.npz"),

@@ -51,7 +51,7 @@ class ReMoCapReader(Reader):
     title: ClassVar[str] = "ReMoCap"
     source: ClassVar[str] = "https://github.com/anindita127/ReMoS"
     licence: ClassVar[str] = "research only, no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.remocap:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.remocap"
     family: ClassVar[Literal["smplx", "smpl", "positions"]] = "positions"
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion.bvh", "the skeleton"),

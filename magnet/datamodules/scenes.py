@@ -95,7 +95,7 @@ class ScenesReader(OwnReader[PosedTrack]):
 
     name: ClassVar[str] = "scenes"
     title: ClassVar[str] = "Scenes of SMPL's family"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.scenes:write"
+    fake: ClassVar[str] = "magnet.datamodules.fakes.scenes"
     family: ClassVar[Family] = "any"
     suffixes: ClassVar[tuple[str, ...]] = (".npz", ".pkl")
     layout: ClassVar[tuple[tuple[str, str], ...]] = (

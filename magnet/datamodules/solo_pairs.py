@@ -21,49 +21,24 @@ SHORTEST = 48
 TRIES = 8
 """How often another distance is tried where the two come too close, before a clip is left out."""
 
-Place = Callable[[Scene, Tensor, Tensor, Tensor], Scene]
-"""solo (1, T, 1), its T_world_mid (4, 4) in the middle frame, distance in metres, side -1 or 1 -> the partner"""
+Place = Callable[[Tensor, float], Tensor]
+"""distance in metres, side -1 or 1 -> T_mid_copy (4, 4), from the person's frame in the middle of the motion"""
 
 
 def _ground(x: Tensor | float, z: Tensor | float, yaw: float = 0.0) -> Tensor:
     return from_planar(torch.tensor(yaw), torch.stack([torch.as_tensor(x), torch.as_tensor(z)]))
 
 
-def _mirror(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
-    """The mirror image, seen in a wall half the distance ahead."""
-    # mirror_scene reflects x: the wall's frame has its x axis along the person's heading.
-    T_world_wall = T_world_mid @ _ground(0.0, distance / 2, torch.pi / 2)
-    return mirror_scene(solo.transformed(inverse(T_world_wall))).transformed(T_world_wall)
-
-
-def _opposite(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
-    """The same motion turned by half a turn about a point ahead: both circle it."""
-    return solo.transformed(T_world_mid @ _ground(0.0, distance, torch.pi) @ inverse(T_world_mid))
-
-
-def _pass(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
-    """The same motion the other way, passing at the distance."""
-    return solo.transformed(T_world_mid @ _ground(side * distance, 0.0, torch.pi) @ inverse(T_world_mid))
-
-
-def _beside(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
-    """The same motion side by side."""
-    return solo.transformed(T_world_mid @ _ground(side * distance, 0.0) @ inverse(T_world_mid))
-
-
-def _behind(solo: Scene, T_world_mid: Tensor, distance: Tensor, side: Tensor) -> Scene:
-    """The same motion straight behind."""
-    return solo.transformed(T_world_mid @ _ground(0.0, -distance) @ inverse(T_world_mid))
-
-
 PAIRINGS: dict[str, tuple[Place, float, float]] = {
-    "mirror": (_mirror, 0.6, 2.0),
-    "opposite": (_opposite, 0.6, 2.0),
-    "pass": (_pass, 0.5, 1.2),
-    "beside": (_beside, 0.5, 1.2),
-    "behind": (_behind, 0.5, 1.5),
+    # The mirror image, seen in a wall half the distance ahead; mirror_scene reflects x, which is the wall's normal.
+    "mirror": (lambda distance, side: _ground(0.0, distance / 2, torch.pi / 2), 0.6, 2.0),
+    # Turned by half a turn about a point ahead: both circle it.
+    "opposite": (lambda distance, side: _ground(0.0, distance, torch.pi), 0.6, 2.0),
+    "pass": (lambda distance, side: _ground(side * distance, 0.0, torch.pi), 0.5, 1.2),
+    "beside": (lambda distance, side: _ground(side * distance, 0.0), 0.5, 1.2),
+    "behind": (lambda distance, side: _ground(0.0, -distance), 0.5, 1.5),
 }
-"""How a solo's copy is placed, and between which distances in metres."""
+"""Where a solo's copy is placed, and between which distances in metres."""
 
 
 @register_data(combines=True)
@@ -139,7 +114,11 @@ def paired(solo: Scene, name: str, delay: int, clearance: float, generator: torc
     side = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
     for attempt in range(TRIES):
         distance = least + (most - least) * torch.rand((), generator=generator) + 0.25 * attempt
-        copy = place(follower, T_world_mid, distance, torch.tensor(side))
+        T_world_copy = T_world_mid @ place(distance, side)
+        if name == "mirror":
+            copy = mirror_scene(follower.transformed(inverse(T_world_copy))).transformed(T_world_copy)
+        else:
+            copy = follower.transformed(T_world_copy @ inverse(T_world_mid))
         apart = (leader.T_world_root - copy.T_world_root)[..., [0, 2], 3].norm(dim=-1)
         if float(apart.min()) >= clearance:
             valid = None if leader.valid is None or copy.valid is None else leader.valid & copy.valid

@@ -37,10 +37,7 @@ def token_losses(
     if weights is not None:
         error = error * layout.spread(weights)
     latent, deltas, pairs = layout.unpack(error)
-    losses = {
-        "latent": masked_mean(latent, there[..., :1]),
-        "delta": masked_mean(deltas.flatten(-2), there[..., :1]),
-    }
+    losses = {"latent": masked_mean(latent, there[..., :1]), "delta": masked_mean(deltas.flatten(-2), there[..., :1])}
     if layout.slots:
         losses["pairwise"] = masked_mean(pairs.flatten(-2), there[..., 1:, None])
     return losses

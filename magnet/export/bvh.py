@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
-from magnet.motion.scene import BODY_JOINTS, Scene, require_one
+from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 
 Unit = Literal["m", "cm"]
 PER_METRE: dict[str, float] = {"m": 1.0, "cm": 100.0}
@@ -59,8 +59,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m")
     ['rest_0.bvh', 'rest_1.bvh']
     """
     require_one(scene)
-    if scene.body != body.id:
-        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
+    require_body(scene, body.id)
     if unit not in PER_METRE:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(PER_METRE)}")
     people = scene.people()
@@ -84,8 +83,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m")
 
 def offsets_of(rest: Tensor) -> Tensor:
     """Joints relative to their parents at rest, the pelvis's zero. (..., 22, 3) -> same"""
-    offsets = rest - rest[..., [0, *PARENTS[1:]], :]
-    return offsets
+    return rest - rest[..., [0, *PARENTS[1:]], :]
 
 
 def _hierarchy(offsets: NDArray[np.float64], per_metre: float) -> Iterator[str]:

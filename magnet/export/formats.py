@@ -85,16 +85,7 @@ def read(
         raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind")
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
     if suffixes == {".bvh"}:
-        imported = load_bvh(
-            files,
-            body,
-            fps=options.fps,
-            trim=options.trim,
-            unit=options.unit,
-            up=options.up,
-            joints=options.joints,
-            keep_floor=options.keep_floor,
-        )
+        imported = load_bvh(files, body, **vars(options))
         notes = [str(source) for source in imported.sources]
         if imported.floor:
             way = "lowered" if imported.floor > 0 else "raised"

@@ -17,7 +17,7 @@ from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.motion.frames import canonical_frame, inverse
-from magnet.motion.scene import BODY_JOINTS, Scene, require_one
+from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 from magnet.version import __version__
 
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
@@ -54,12 +54,7 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions =
     Raises:
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
-    require_one(scene)
-    if scene.body != body.id:
-        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
-    slots = scene.present[0].nonzero()[:, 0].tolist()
-    if not slots or not scene.frames:
-        raise ValueError(f"{len(slots)} people and {scene.frames} frames: there is nothing to write")
+    slots = slots_to_write(scene, body)
     gltf = _Gltf()
     skin = gltf.skin_of(body)
     times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
@@ -87,6 +82,20 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions =
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(gltf.packed())
     return path
+
+
+def slots_to_write(scene: Scene, body: Skinned) -> list[int]:
+    """Slots of the people in a scene.
+
+    Raises:
+        ValueError: more than one scene, nobody present, no frames, or another body's.
+    """
+    require_one(scene)
+    require_body(scene, body.id)
+    slots = scene.present[0].nonzero()[:, 0].tolist()
+    if not slots or not scene.frames:
+        raise ValueError(f"{len(slots)} people and {scene.frames} frames: there is nothing to write")
+    return slots
 
 
 def _animation(name: str) -> dict[str, Any]:

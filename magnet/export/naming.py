@@ -113,15 +113,11 @@ def _matched(words: Sequence[tuple[str, set[str]]], roles: Mapping[str, tuple[st
     for role, known in roles.items():
         sides = (("left", SIDED[role]), ("right", SIDED[role] + 1)) if role in SIDED else (("", MIDDLE[role]),)
         for side, joint in sides:
-            for name in known:
-                numbers = [k for k, (its, rests) in enumerate(words) if its in (side, "?") and _is(side, rests, name)]
+            for word in (f"{side}:{name}" if side else name for name in known):
+                numbers = [k for k, (its, rests) in enumerate(words) if its in (side, "?") and word in rests]
                 if numbers and joint not in found:
                     found[joint] = numbers[0]
     return found
-
-
-def _is(side: str, rests: set[str], name: str) -> bool:
-    return name in rests if not side else f"{side}:{name}" in rests
 
 
 def plain(names: Sequence[str]) -> list[str]:

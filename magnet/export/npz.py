@@ -13,7 +13,7 @@ from torch import Tensor
 
 from magnet.files import load_npz
 from magnet.motion.frames import rigid
-from magnet.motion.scene import BODY_JOINTS, Scene, require_one
+from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 
 SMPLX_JOINTS = 55
 
@@ -44,8 +44,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
         ValueError: more than one scene, or another body's.
     """
     require_one(scene)
-    if scene.body != body.id:
-        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
+    require_body(scene, body.id)
     scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
     rotations = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)

@@ -15,9 +15,18 @@ from torch import Tensor
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
-from magnet.export.glb import INFLUENCES, Skinned, influences, linear, standing, standing_vertices, unbroken
+from magnet.export.glb import (
+    INFLUENCES,
+    Skinned,
+    influences,
+    linear,
+    slots_to_write,
+    standing,
+    standing_vertices,
+    unbroken,
+)
 from magnet.motion.frames import canonical_frame, inverse
-from magnet.motion.scene import Scene, require_one
+from magnet.motion.scene import Scene
 
 NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
 ROOT = "root"
@@ -44,12 +53,7 @@ def save_usd(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions =
         from pxr import Usd, UsdGeom, UsdSkel, UsdUtils
     except ImportError as error:
         raise ImportError(NEEDS) from error
-    require_one(scene)
-    if scene.body != body.id:
-        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body.id!r} was given")
-    slots = scene.present[0].nonzero()[:, 0].tolist()
-    if not slots or not scene.frames:
-        raise ValueError(f"{len(slots)} people and {scene.frames} frames: there is nothing to write")
+    slots = slots_to_write(scene, body)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     packed = path.suffix.lower() == ".usdz"

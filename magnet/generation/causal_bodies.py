@@ -136,12 +136,7 @@ def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Sce
 
 
 def decode_bodies(
-    world: World,
-    tokens: Tensor,
-    first: int,
-    stop: int,
-    near: int,
-    expected: tuple[Tensor, Tensor] | None = None,
+    world: World, tokens: Tensor, first: int, stop: int, near: int, expected: tuple[Tensor, Tensor] | None = None
 ) -> Scene:
     """Token steps [first, stop) decoded from the tokens before `near` alone, continuing from finalized bodies."""
     model, options = world.model, world.options

@@ -224,13 +224,7 @@ class WorldState:
         return torch.cat([own, own | moved[:, self.model.layout.partners()]], dim=-1)
 
     def _place_all(
-        self,
-        deltas: Tensor,
-        pairs: Tensor | None,
-        finished: Tensor,
-        first: int,
-        stop: int,
-        placement: Placement,
+        self, deltas: Tensor, pairs: Tensor | None, finished: Tensor, first: int, stop: int, placement: Placement
     ) -> Tensor:
         """Place the new tokens of a stage in the world, gap by gap. -> (N, P) bool, who moved"""
         moved = finished.clone()

@@ -22,11 +22,7 @@ class Futures:
 
     @staticmethod
     def of(
-        generated: Tensor,
-        truth: Tensor,
-        present: Tensor,
-        agents: Tensor | None = None,
-        units: Tensor | None = None,
+        generated: Tensor, truth: Tensor, present: Tensor, agents: Tensor | None = None, units: Tensor | None = None
     ) -> Futures:
         """Check the input and cut both futures to the shorter one.
 

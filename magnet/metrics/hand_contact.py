@@ -74,12 +74,7 @@ class HandContact(ClipMeans):
     }
 
     def __init__(
-        self,
-        fps: float = FPS,
-        within: float = WITHIN,
-        beyond: float = BEYOND,
-        of: Of = "generated",
-        **kwargs: Any,
+        self, fps: float = FPS, within: float = WITHIN, beyond: float = BEYOND, of: Of = "generated", **kwargs: Any
     ) -> None:
         compared = ["hand_contact_precision", "hand_contact_recall"] if of == "generated" else []
         super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of=of, **kwargs)

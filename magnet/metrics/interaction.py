@@ -132,9 +132,4 @@ class MotionInteraction(MotionMetric):
         if not bool(both.any()):
             return {"mi_left_out": left_out}
         generated, truth = values.mean(dim=0)
-        return {
-            "mi": (truth - generated).abs(),
-            "mi_generated": generated,
-            "mi_truth": truth,
-            "mi_left_out": left_out,
-        }
+        return {"mi": (truth - generated).abs(), "mi_generated": generated, "mi_truth": truth, "mi_left_out": left_out}

@@ -76,11 +76,7 @@ class FootSkating(ClipMeans):
         speed, stands = toe_steps(futures.generated, self.fps, self.height)
         scored = futures.spans(2)[..., None].expand_as(speed)
         slides = stands & (speed > self.speed) & scored
-        return [
-            clip_sums(speed, slides),
-            clip_sums(slides.double(), scored),
-            clip_sums(stands.double(), scored),
-        ]
+        return [clip_sums(speed, slides), clip_sums(slides.double(), scored), clip_sums(stands.double(), scored)]
 
     def compute(self) -> dict[str, Tensor]:
         return {"fs": torch.zeros_like(self.total[0]), **super().compute(), "fs_contacts": self.total[2].clone()}

@@ -333,6 +333,16 @@ def require_rate(scene: Scene, label: str = "the scene") -> None:
         )
 
 
+def require_body(scene: Scene, body: str) -> None:
+    """Refuse a scene whose shape numbers belong to another body.
+
+    Raises:
+        ValueError: they do; names both.
+    """
+    if scene.body != body:
+        raise ValueError(f"the scene belongs to body {scene.body!r}, but {body!r} was given")
+
+
 def require_one(scene: Scene) -> None:
     """Refuse a batch of several scenes, or of none.
 

@@ -138,13 +138,7 @@ class ResidualVQ(Float32):
 
     @torch.no_grad()
     def ema_update(
-        self,
-        vectors: Tensor,
-        chosen: Tensor,
-        keep: Tensor,
-        book: int,
-        generator: torch.Generator | None,
-        update: bool,
+        self, vectors: Tensor, chosen: Tensor, keep: Tensor, book: int, generator: torch.Generator | None, update: bool
     ) -> Tensor:
         """Count the vectors of each code, (codes,); in training also update the codes."""
         onto = F.one_hot(chosen, self.size).to(vectors.dtype) * keep[:, None]

@@ -14,19 +14,14 @@ from magnet.training.options import OptimizerOptions
 
 
 def adamw_cosine(
-    module: LightningModule,
-    parameters: Iterable[nn.Parameter],
-    options: OptimizerOptions,
+    module: LightningModule, parameters: Iterable[nn.Parameter], options: OptimizerOptions
 ) -> dict[str, Any]:
     """AdamW whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
 
     In a run without an end the rate is constant after the warm-up.
     """
     optimizer = torch.optim.AdamW(
-        parameters,
-        lr=options.learning_rate,
-        weight_decay=options.weight_decay,
-        fused=module.device.type == "cuda",
+        parameters, lr=options.learning_rate, weight_decay=options.weight_decay, fused=module.device.type == "cuda"
     )
     total, warmup = module.trainer.estimated_stepping_batches, options.warmup_steps
 

@@ -55,7 +55,9 @@ class StepRate(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.rate = matmul_rate(pl_module.device)
-        rank_zero_info(f"matrix products in bfloat16: {self.rate / 1e12:.2f} TFLOP/s on {_name(pl_module.device)}")
+        gpu, device = pl_module.device.type == "cuda", pl_module.device
+        name = torch.cuda.get_device_name(device) if gpu else f"{torch.get_num_threads()} CPU threads"
+        rank_zero_info(f"matrix products in bfloat16: {self.rate / 1e12:.2f} TFLOP/s on {name}")
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         self._begun = now(pl_module.device) if self.timed(trainer.global_step, trainer.max_steps) else None
@@ -91,7 +93,3 @@ def now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
-
-
-def _name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} CPU threads"

@@ -56,7 +56,7 @@ class SceneView:
         label: bool = True,
     ) -> None:
         self.server, self.body, self.take, self.truth, self.render = server, body, take, truth, render
-        self.name = f"{parent}/{_node(take.label)}"
+        self.name = f"{parent}/take_{''.join(c if c.isalnum() else '_' for c in take.label)}"
         self.offset = offset
         self.root = server.scene.add_frame(self.name, show_axes=False, position=tuple(float(x) for x in offset))
         self.own = agent_colours(take.slots)
@@ -152,7 +152,3 @@ def light_up(server: Any, plain: bool) -> None:
     """Light from an environment map, or ambient light, which is much cheaper without a GPU."""
     server.scene.configure_environment_map(None if plain else "city")  # viser's own choice, which it sends whole
     server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)
-
-
-def _node(label: str) -> str:
-    return "take_" + "".join(c if c.isalnum() else "_" for c in label)

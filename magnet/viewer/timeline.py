@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.page.palette import Colours, pale
+from magnet.export.page.palette import Colours, hexed, pale
 from magnet.motion.runs import true_runs
 
 EDGE = 10
@@ -56,7 +55,7 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
         bar(0, frames, top, TRACK, "#e8ebf1")
         for given, colours in ((True, faint), (False, tracks.colours)):
             for start, stop in true_runs((tracks.known[:, p] == given).tolist()):
-                bar(start, stop, top, TRACK, _hex(colours[p]))
+                bar(start, stop, top, TRACK, hexed(colours[p]))
         for person, frame in tracks.keys:
             if person == p:
                 parts.append(
@@ -76,10 +75,6 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
 def _every(seconds: float) -> int:
     """Seconds between two marks, so that some ten fit."""
     return next((step for step in (1, 2, 5, 10, 30, 60, 300) if seconds / step <= 12), 600)
-
-
-def _hex(colour: Sequence[int] | NDArray[Any]) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*(int(c) for c in colour))
 
 
 class Timeline:

@@ -40,7 +40,7 @@ def named_and_told(error: Exception, root: Path) -> None:
 
 def fake_of(name: str) -> ModuleType:
     """The module that writes a data set's fake."""
-    return importlib.import_module(registry.reader(name).fake.split(":")[0])
+    return importlib.import_module(registry.reader(name).fake)
 
 
 def world_joints(recording: Recording, family: str) -> NDArray:

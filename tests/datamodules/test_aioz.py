@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.aioz import AIOZ, AIOZReader
-from magnet.datamodules.fakes.aioz import write
 from magnet.datamodules.reading.recording import DataError
 from tests.datamodules.readers import Foreign, check_damaged, cut, rewritten
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 2, 12)
+    AIOZReader.write_fake(tmp_path, 2, 12)
     return tmp_path
 
 

@@ -11,19 +11,18 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.chi3d import CHI3DReader
-from magnet.datamodules.fakes.chi3d import write
 from magnet.datamodules.reading.recording import DataError
 from tests.datamodules.readers import check_damaged, cut
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 2, 6)
+    CHI3DReader.write_fake(tmp_path, 2, 6)
     return tmp_path
 
 
 def test_a_pair_is_held_out_because_the_official_test_is_not_given_out(tmp_path: Path) -> None:
-    write(tmp_path, 6, 2)
+    CHI3DReader.write_fake(tmp_path, 6, 2)
     takes = CHI3DReader(tmp_path).takes()
     assert {take.name.split("_")[0] for take in takes if take.split == "test"} == {"s03"}
     mine = CHI3DReader(tmp_path, test_pairs=("s02",)).takes()

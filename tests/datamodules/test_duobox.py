@@ -102,7 +102,7 @@ def test_fits_as_pickles_are_read_alike(copy: Path) -> None:
 
 
 def test_a_short_take_is_refused(tmp_path: Path) -> None:
-    fake.write(tmp_path, takes=1, frames=1)
+    DuoBoxReader.write_fake(tmp_path, takes=1, frames=1)
     with pytest.raises(DataError, match="24 frames are too few"):
         read(tmp_path, "va0")
 

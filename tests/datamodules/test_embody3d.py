@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.embody3d import Embody3D, Embody3DReader
-from magnet.datamodules.fakes.embody3d import write
 from magnet.datamodules.preparing.check import recognise
 from magnet.datamodules.reading.recording import DataError, Take
 from tests.cases import some_slow
@@ -24,7 +23,7 @@ from tests.datamodules.readers import Foreign, cut, refused
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 4, 12)
+    Embody3DReader.write_fake(tmp_path, 4, 12)
     return tmp_path
 
 
@@ -46,7 +45,7 @@ def test_bad_tracking_is_marked(root: Path) -> None:
 
 
 def test_people_chooses_scenes_and_leaves_their_splits(tmp_path: Path) -> None:
-    write(tmp_path, 12, 2)
+    Embody3DReader.write_fake(tmp_path, 12, 2)
     takes = Embody3DReader(tmp_path).takes()
     both = Embody3DReader(tmp_path, people=(2,)).takes() + Embody3DReader(tmp_path, people=[3, 4]).takes()
     assert sorted(both, key=lambda take: take.name) == sorted(takes, key=lambda take: take.name)

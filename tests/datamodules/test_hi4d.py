@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.fakes.hi4d import write
 from magnet.datamodules.hi4d import Hi4DReader
 from magnet.datamodules.reading.recording import DataError
 from tests.datamodules.readers import Foreign, check_damaged, cut
@@ -17,12 +16,12 @@ from tests.datamodules.readers import Foreign, check_damaged, cut
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 2, 6)
+    Hi4DReader.write_fake(tmp_path, 2, 6)
     return tmp_path
 
 
 def test_whole_pairs_are_held_out(tmp_path: Path) -> None:
-    write(tmp_path, 6, 2)
+    Hi4DReader.write_fake(tmp_path, 6, 2)
     takes = Hi4DReader(tmp_path).takes()
     assert {take.name.split("_")[0] for take in takes if take.split == "test"} == {"pair28"}
     mine = Hi4DReader(tmp_path, test_pairs=(0,), val_pairs=(1,)).takes()

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnet.datamodules.fakes.interhuman import write
 from magnet.datamodules.interhuman import InterHumanReader
 from magnet.datamodules.reading.recording import DataError
 from tests.datamodules.readers import Foreign, check_damaged, cut, rewritten
@@ -17,7 +16,7 @@ from tests.datamodules.readers import Foreign, check_damaged, cut, rewritten
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, 3, 6)
+    InterHumanReader.write_fake(tmp_path, 3, 6)
     return tmp_path
 
 
@@ -28,7 +27,7 @@ def test_people_are_known(root: Path) -> None:
 
 
 def test_splits_are_the_lists(tmp_path: Path) -> None:
-    write(tmp_path, 12, 2)
+    InterHumanReader.write_fake(tmp_path, 12, 2)
     takes = InterHumanReader(tmp_path).takes()
     assert [take.name for take in takes] == [str(k + 1) for k in range(12)]
     (tmp_path / "split" / "ignore_list.txt").write_text("1\n\n")

@@ -177,9 +177,7 @@ def test_shapes_of_another_body_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_body_file_beside_the_scenes_is_no_scene(tmp_path: Path) -> None:
-    from magnet.datamodules.fakes.scenes import write as fake
-
-    fake(tmp_path, takes=3, frames=8)
+    ScenesReader.write_fake(tmp_path, takes=3, frames=8)
     assert [take.name for take in ScenesReader(tmp_path).found()] == ["amass1", "magnet3", "pickle2"]
 
 

@@ -38,13 +38,8 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return {f"walk{number + 1}": turned(people(long, 2, RATE, seed + number), AXIS) for number in range(takes)}
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz, which nobody needs."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by take."""
+    """Any motions by take, and body.npz, which nobody needs."""
     write_body(out / "body.npz")
     for name, shown in scenes.items():
         for person in range(shown.poses.shape[1]):

@@ -21,13 +21,8 @@ ACTIONS = ("Grab", "Handshake", "Hit", "HoldingHands", "Hug", "Kick", "Posing", 
 HANDS = {"left_hand_pose": 15, "right_hand_pose": 15, "jaw_pose": 1, "leye_pose": 1, "reye_pose": 1}
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Actions of pairs s02, s03 and s04; of the test pair s01 only the folder, as its motion is not given out."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by pair and action."""
+    """Any motions by pair and action; of the test pair s01 only the folder, as its motion is not given out."""
     write_body(out / "body.npz")
     (out / "chi3d" / "test" / "s01").mkdir(parents=True, exist_ok=True)
     for name, motion in scenes.items():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,23 +40,28 @@ MIDDLE = (
 )
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Takes of the couple 60 and 61, the first to test, the second to validate on, and one of somebody alone.
+def scenes(takes: int, frames: int, seed: int) -> dict[str, dict[str, Any]]:
+    """Files of the couple 60 and 61, the first to test, the second to validate on, and one of somebody alone.
 
-    Args:
-        out: root of the fake.
-        takes: of the couple.
-        frames: of each at 30 fps; files have 60 a second, of the one alone 120.
-        seed: of the motion.
+    -> arguments of `write_amc` by file; of the couple 60 frames a second, of the one alone 120.
     """
     numbers = [TEST, VAL, *islice((n for n in count(1) if n not in (TEST, VAL) and n % 5), max(takes - 2, 0))][:takes]
-    for folder, subjects in (("salsa", {60: 0.0, 61: 0.8}), ("singles", {2: 0.0})):
-        (out / folder).mkdir(parents=True, exist_ok=True)
-        for subject, x in subjects.items():
-            write_asf(out / folder / f"{subject:02}.asf")
-            for take in numbers if len(subjects) > 1 else [1]:
-                amc, rate = out / folder / f"{subject:02}_{take:02}.amc", 60.0 if len(subjects) > 1 else 120.0
-                write_amc(amc, round(frames * rate / FPS), x, 1000 * seed + 10 * subject + take, rate=rate)
+    files = [("salsa", subject, take, x, 60.0) for subject, x in ((60, 0.0), (61, 0.8)) for take in numbers]
+    return {
+        f"{folder}/{subject:02}_{take:02}": {
+            "frames": round(frames * rate / FPS), "x": x, "seed": 1000 * seed + 10 * subject + take, "rate": rate,
+        }
+        for folder, subject, take, x, rate in [*files, ("singles", 2, 1, 0.0, 120.0)]
+    }  # fmt: skip
+
+
+def write_scenes(out: Path, scenes: Mapping[str, dict[str, Any]]) -> None:
+    """Motion files, and the skeleton of each subject."""
+    for name, motion in scenes.items():
+        path = out / f"{name}.amc"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_asf(path.with_name(f"{path.stem[:2]}.asf"))
+        write_amc(path, **motion)
 
 
 def bones() -> list[tuple[str, str, tuple[float, float, float], float, str, str]]:

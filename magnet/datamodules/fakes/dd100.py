@@ -33,28 +33,21 @@ def name(number: int) -> str:
     return f"{genre}_{choreography}_{int(take) + 100 * (number // len(NAMES)):03}"
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz: the first take trains, the second validates, the next two test."""
-    write_scenes(out, scenes(takes, frames, seed), seed)
-
-
-def write_scenes(out: Path, scenes: Mapping[str, FakeMotion], seed: int = 0) -> None:
-    """Any motions by take; the seed is of the fingers."""
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by take; the first trains, the second validates, the next two test."""
     folder = out / "data/motion/smplx/all"
     folder.mkdir(parents=True, exist_ok=True)
     write_body(out / "body.npz")
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     for name, shown in scenes.items():
-        frames = shown.frames
         for person, gender in enumerate(GENDERS):
-            face = np.zeros((frames, 9))
-            hands = generator.normal(0.0, 0.1, (frames, 90))
-            poses = np.concatenate([shown.poses[:, person].reshape(frames, 66), face, hands], axis=1)
+            one = shown.person(person)
+            face, hands = np.zeros((shown.frames, 9)), generator.normal(0.0, 0.1, (shown.frames, 90))
             held = {
-                "poses": poses.astype(np.float32),
-                "global_orient": poses[:, :3].astype(np.float32),
-                "transl": shown.transl[:, person].astype(np.float32),
-                "betas": np.tile(shown.betas[person], (frames, 1)).astype(np.float32),
+                "poses": np.concatenate([one["orient"], one["body"], face, hands], axis=1).astype(np.float32),
+                "global_orient": one["orient"],
+                "transl": one["transl"],
+                "betas": np.tile(one["betas"], (shown.frames, 1)),
                 "meta": {"gender": gender},
             }
             np.save(folder / f"{name}_{person:02}.npy", held, allow_pickle=True)  # type: ignore[arg-type]

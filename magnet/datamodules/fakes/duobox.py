@@ -59,24 +59,20 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return {name(number): motion(number, frames, seed) for number in range(takes)}
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; every take has all three splits."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by take."""
+    """Any motions by take; every take has all three splits."""
     for folder in (FITS, SKELETONS):
         (out / folder).mkdir(parents=True, exist_ok=True)
     write_body(out / "body.npz")
     for name, shown in scenes.items():
         fits, skeletons = {}, {}
         for person, subject in enumerate(subjects(name)):
+            one = shown.person(person)
             fits[subject] = {
-                "transl": shown.transl[:, person].astype(np.float32),
-                "global_orient": shown.poses[:, person, 0].astype(np.float32),
-                "body_pose": shown.poses[:, person, 1:].reshape(-1, 63).astype(np.float32),
-                "betas": np.tile(shown.betas[person], (shown.frames, 1)).astype(np.float32),
+                "transl": one["transl"],
+                "global_orient": one["orient"],
+                "body_pose": one["body"],
+                "betas": np.tile(one["betas"], (shown.frames, 1)),
             }
             skeletons[f"{subject}_position"] = shown.positions[:, person, list(SOURCE)].astype(np.float32)
             skeletons[f"{subject}_rotation"] = _local(shown.poses[:, person]).astype(np.float32)

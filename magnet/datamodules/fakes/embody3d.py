@@ -19,18 +19,13 @@ LOST = 3
 """Frames at the end of every fourth scene whose tracking is marked as bad."""
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Scenes of 2, 3 and 4 people in acting and daylife, each with a cast and a session of its own."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by capture, whose name says the section and the people."""
+    """Any motions by capture, whose name says the section and the people; each has a cast and a session of its own."""
     write_body(out / "body.npz")
     listed: dict[str, dict[str, dict[str, Any]]] = {section: {} for section in LABELS}
     for index, (capture, motion) in enumerate(scenes.items()):
-        section = section_of(capture)
-        ids = ids_of(capture)
+        section = next(section for section, label in LABELS.items() if label in capture)
+        ids = capture.split("--pilot")[0].split("--")[3:]
         for p, person in enumerate(ids):
             folder = out / "datasets" / section / capture / person
             for feature, array in _features(motion, p, lost=LOST if index % 4 == 1 and p == 0 else 0).items():
@@ -66,29 +61,17 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return written
 
 
-def section_of(capture: str) -> str:
-    """The section whose label a capture's name has."""
-    return next(section for section, label in LABELS.items() if label in capture)
-
-
-def ids_of(capture: str) -> list[str]:
-    """Subjects in a capture's name."""
-    return capture.split("--pilot")[0].split("--")[3:]
-
-
 def _features(motion: FakeMotion, p: int, lost: int) -> dict[str, np.ndarray]:
-    T = motion.frames
-    betas = np.zeros((T, 300))
-    betas[:, :10] = motion.betas[p]
-    missing = np.ones(T)
+    T, one = motion.frames, motion.person(p)
+    hand = np.zeros((T, 45), dtype=np.float32)
+    missing = np.ones(T, dtype=np.float32)
     missing[T - min(lost, T // 4) :] = 0
-    arrays = {
-        "smplx_mesh_betas": betas,
-        "smplx_mesh_body_pose": motion.poses[:, p, 1:].reshape(T, 63),
-        "smplx_mesh_global_orient": motion.poses[:, p, 0],
-        "smplx_mesh_left_hand_pose": np.zeros((T, 45)),
-        "smplx_mesh_right_hand_pose": np.zeros((T, 45)),
-        "smplx_mesh_transl": motion.transl[:, p],
+    return {
+        "smplx_mesh_betas": np.tile(np.pad(one["betas"], (0, 290)), (T, 1)),
+        "smplx_mesh_body_pose": one["body"],
+        "smplx_mesh_global_orient": one["orient"],
+        "smplx_mesh_left_hand_pose": hand,
+        "smplx_mesh_right_hand_pose": hand,
+        "smplx_mesh_transl": one["transl"],
         "missing": missing,
     }
-    return {feature: array.astype(np.float32) for feature, array in arrays.items()}

@@ -15,13 +15,8 @@ ACTIONS = ("dance", "hug", "talk")
 START = 11
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Actions of pairs, each with meta.npz and smpl/000XXX.npz."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by pair and action."""
+    """Any motions by pair and action, each with meta.npz and smpl/000XXX.npz."""
     write_body(out / "body.npz", "smpl")
     for name, motion in scenes.items():
         folder = out / Path(*name.split("_"))

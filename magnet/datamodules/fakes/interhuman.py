@@ -17,13 +17,8 @@ RATE = 59.94
 SPLITS = ("train", "val", "test", "train")
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Takes 1, 2 and so on, with split lists and a line of text each."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by take."""
+    """Any motions by take, with split lists and a line of text each."""
     write_body(out / "body.npz", "smpl")
     for folder in ("motions", "annots", "split"):
         (out / folder).mkdir(parents=True, exist_ok=True)
@@ -46,10 +41,5 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
 
 
 def _person(motion: FakeMotion, p: int) -> dict[str, np.ndarray | str]:
-    return {
-        "trans": motion.transl[:, p].astype(np.float32),
-        "root_orient": motion.poses[:, p, 0].astype(np.float32),
-        "pose_body": motion.poses[:, p, 1:].reshape(-1, 63).astype(np.float32),
-        "betas": motion.betas[p].astype(np.float32),
-        "gender": "male",
-    }
+    names = {"transl": "trans", "orient": "root_orient", "body": "pose_body", "betas": "betas"}
+    return {names[key]: array for key, array in motion.person(p).items()} | {"gender": "male"}

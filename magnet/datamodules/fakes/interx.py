@@ -37,13 +37,8 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return {name(number): motion(number, frames, seed) for number in range(takes)}
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; clips are in training, validation and test in turn."""
-    write_scenes(out, scenes(takes, frames, seed), seed)
-
-
-def write_scenes(out: Path, scenes: Mapping[str, FakeMotion], seed: int = 0) -> None:
-    """Any motions by clip; the seed is of the hands."""
+def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
+    """Any motions by clip, in training, validation and test in turn."""
     write_body(out / "body.npz")
     for part in ("splits", "annots"):
         (out / part).mkdir(parents=True, exist_ok=True)
@@ -52,19 +47,19 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion], seed: int = 0) -> 
         (out / "splits" / f"{split}.txt").write_text("".join(f"{clip}\n" for clip in listed[k::3]))
     (out / "splits" / "all.txt").write_text("".join(f"{clip}\n" for clip in listed))
     (out / "annots" / "interaction_order.pkl").write_bytes(pickle.dumps({c: k % 2 for k, c in enumerate(listed)}))
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     for clip, shown in scenes.items():
         folder = out / "motions" / clip
         folder.mkdir(parents=True, exist_ok=True)
         for person, gender in enumerate(GENDERS):
-            hands = generator.normal(0.0, 0.1, (2, shown.frames, 15, 3)).astype(np.float32)
+            one, hands = shown.person(person), generator.normal(0.0, 0.1, (2, shown.frames, 15, 3)).astype(np.float32)
             np.savez(
                 folder / f"P{person + 1}.npz",
-                pose_body=shown.poses[:, person, 1:].astype(np.float32),
+                pose_body=one["body"].reshape(-1, 21, 3),
                 pose_lhand=hands[0],
                 pose_rhand=hands[1],
-                root_orient=shown.poses[:, person, 0].astype(np.float32),
-                trans=shown.transl[:, person].astype(np.float32),
-                betas=shown.betas[person : person + 1].astype(np.float32),
+                root_orient=one["orient"],
+                trans=one["transl"],
+                betas=one["betas"][None],
                 gender=np.array(gender),
             )

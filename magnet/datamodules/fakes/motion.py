@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from magnet.body import Body, load_body
 from magnet.datamodules.fakes.body import Kind, write_body
 from magnet.datamodules.reading.recording import Axis
+from magnet.motion.frames import rigid
 from magnet.motion.resample import slerp_quat
 from magnet.motion.scene import FPS, Scene
 from magnet.synthesis import synthesize
@@ -54,6 +55,12 @@ class FakeMotion:
     def pelvis(self) -> Array:
         """(P, 3) rest pelvis J0(beta)."""
         return rest_joints(self.betas, self.kind)[:, 0]
+
+    def person(self, p: int) -> dict[str, NDArray[np.float32]]:
+        """What files hold of a person: orient (T, 3), body (T, 63), transl (T, 3), betas (10,)."""
+        poses = self.poses[:, p].reshape(self.frames, 66)
+        arrays = {"orient": poses[:, :3], "body": poses[:, 3:], "transl": self.transl[:, p], "betas": self.betas[p]}
+        return {key: array.astype(np.float32) for key, array in arrays.items()}
 
 
 @lru_cache(maxsize=2)
@@ -94,16 +101,8 @@ def people(frames: int, persons: int, fps: float = FPS, seed: int = 0, kind: Kin
     root = scene.T_world_root[0, :, :, :3, 3].double()
     pelvis = torch.lerp(root[before], root[before + 1], share[:, None, None])
     betas = scene.betas[0].double().numpy()
-    motion = FakeMotion(
-        fps=float(fps),
-        up="+y",
-        poses=roma.unitquat_to_rotvec(between).numpy(),
-        transl=pelvis.numpy() - rest_joints(betas, kind)[:, 0],
-        betas=betas,
-        positions=np.zeros((frames, persons, 22, 3)),
-        kind=kind,
-    )
-    return _with_positions(motion)
+    poses, transl = roma.unitquat_to_rotvec(between).numpy(), pelvis.numpy() - rest_joints(betas, kind)[:, 0]
+    return with_positions(FakeMotion(float(fps), "+y", poses, transl, betas, np.zeros((frames, persons, 22, 3)), kind))
 
 
 def turned(motion: FakeMotion, up: Axis) -> FakeMotion:
@@ -115,16 +114,8 @@ def turned(motion: FakeMotion, up: Axis) -> FakeMotion:
     first = roma.rotvec_to_rotmat(torch.from_numpy(motion.poses[:, :, 0]))
     poses = motion.poses.copy()
     poses[:, :, 0] = roma.rotmat_to_rotvec(torch.from_numpy(R_new_old) @ first).numpy()
-    J0 = motion.pelvis
-    return FakeMotion(
-        fps=motion.fps,
-        up=up,
-        poses=poses,
-        transl=(motion.transl + J0) @ R_new_old.T - J0,
-        betas=motion.betas,
-        positions=motion.positions @ R_new_old.T,
-        kind=motion.kind,
-    )
+    transl = (motion.transl + motion.pelvis) @ R_new_old.T - motion.pelvis
+    return replace(motion, up=up, poses=poses, transl=transl, positions=motion.positions @ R_new_old.T)
 
 
 @lru_cache(maxsize=32)
@@ -134,12 +125,9 @@ def _scene(frames: int, persons: int, seed: int, kind: Kind) -> Scene:
     return synthesize(coupling, persons, frames, generator, made_up_body(kind)).scene
 
 
-def _with_positions(motion: FakeMotion) -> FakeMotion:
-    body = made_up_body(motion.kind)
+def with_positions(motion: FakeMotion) -> FakeMotion:
+    """The motion with the world joints of its poses and shapes."""
     rotations = roma.rotvec_to_rotmat(torch.from_numpy(motion.poses))
-    T_world_root = torch.zeros(*rotations.shape[:2], 4, 4, dtype=torch.float64)
-    T_world_root[..., :3, :3] = rotations[:, :, 0]
-    T_world_root[..., :3, 3] = torch.from_numpy(motion.transl + motion.pelvis)
-    T_world_root[..., 3, 3] = 1.0
-    joints = body.forward_kinematics(rotations[:, :, 1:], T_world_root, torch.from_numpy(motion.betas))
-    return FakeMotion(**{**motion.__dict__, "positions": joints.numpy()})
+    T_world_root = rigid(rotations[:, :, 0], torch.from_numpy(motion.transl + motion.pelvis))
+    body, betas = made_up_body(motion.kind), torch.from_numpy(motion.betas)
+    return replace(motion, positions=body.forward_kinematics(rotations[:, :, 1:], T_world_root, betas).numpy())

@@ -117,13 +117,8 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return {f"lindyhop_{sequence(number):03}": motion(number, frames, seed) for number in range(takes)}
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz; of four takes two train, one validates and one tests, by either split."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by take."""
+    """Any motions by take; of four, two train, one validates and one tests, by either split."""
     write_body(out / "body.npz")
     for name, shown in scenes.items():
         number = int(name.rpartition("_")[2])

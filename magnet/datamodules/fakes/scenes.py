@@ -30,13 +30,8 @@ def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:
     return found
 
 
-def write(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write the fake, and out/body.npz, the body that all shape numbers are of."""
-    write_scenes(out, scenes(takes, frames, seed))
-
-
 def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
-    """Any motions by take; its name says in which form."""
+    """Any motions by take, whose name says in which form, and body.npz, whose the shape numbers are."""
     write_body(out / "body.npz")
     for name, shown in scenes.items():
         form = next(form for form, _, _ in FORMS if name.startswith(form))

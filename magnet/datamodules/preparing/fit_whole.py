@@ -57,10 +57,7 @@ def fit_recordings(
 
 
 def fit_whole(
-    recording: Recording,
-    glitches: tuple[Glitches, ...],
-    body: Body,
-    progress: Callable[[int, int], None] | None = None,
+    recording: Recording, glitches: tuple[Glitches, ...], body: Body, progress: Callable[[int, int], None] | None = None
 ) -> Fitted:
     """A whole take as bodies in one scene at 30 fps, standing on y = 0; what was mended too long ago is masked.
 

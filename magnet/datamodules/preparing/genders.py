@@ -111,10 +111,6 @@ def one_body(recording: Recording, bodies: Mapping[Gender, Body], body: Body) ->
         transl[:, p] += (own.rest_joints(shape)[0, 0] - body.rest_joints(found)[0, 0]).numpy()
         betas[p] = found[0].numpy()
         if worst:
-            notes.append(f"{gender} shapes expressed in body {body.id}: joints at rest within {_whole_mm(worst)} mm")
+            whole = max(1, math.ceil(1000 * worst))  # rounded up, so that takes alike share a note
+            notes.append(f"{gender} shapes expressed in body {body.id}: joints at rest within {whole} mm")
     return replace(recording, transl=transl, betas=betas, notes=tuple(dict.fromkeys(notes)), genders=(), shapes_of="")
-
-
-def _whole_mm(metres: float) -> int:
-    """Rounded up, so that takes alike share a note."""
-    return max(1, math.ceil(1000 * metres))

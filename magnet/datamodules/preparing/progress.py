@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-
-def on_a_terminal() -> dict[str, Any]:
-    """Options that show a progress bar on a terminal only: in a file it would leave an empty line."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    return {"console": console, "transient": True, "disable": not console.is_terminal}
+Tell = Callable[[str, int, int | None], None]
+"""Shows what is being done, the amount done, and the total where it is known."""
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Yields a function that shows (what is being done, amount done, total)."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+def bar_with(*columns: Any) -> Iterator[Tell]:
+    """Yields what moves a bar with these columns of rich; on a terminal only, for a file would keep an empty line."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, **on_a_terminal()) as progress:
+    console = Console(stderr=True)
+    shown = (BarColumn(), *columns, TextColumn("{task.description}"))
+    with Progress(*shown, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("", total=None)
         yield lambda what, done, total: progress.update(task, description=what, completed=done, total=total)
+
+
+def progress_bar() -> AbstractContextManager[Tell]:
+    """A bar with the share that is done and the time left."""
+    from rich.progress import TaskProgressColumn, TimeRemainingColumn
+
+    return bar_with(TaskProgressColumn(), TimeRemainingColumn())

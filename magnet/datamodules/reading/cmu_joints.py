@@ -10,8 +10,8 @@ import numpy as np
 import roma
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
+from magnet.body.apart import widened
 from magnet.body.fit import swing
 from magnet.datamodules.reading.asf import AsfSkeleton, euler
 from magnet.datamodules.reading.asf_amc import AmcRecording, together
@@ -108,16 +108,11 @@ def hints(recording: AmcRecording, rest: Tensor) -> Tensor:
         # Written so that a joint whose parent is not known is not known either.
         wrong = ~(geodesic(known[:, PARENTS[joint]], known[:, joint]) <= np.radians(limit))
         if joint in ANKLES:
-            wrong = _widened(wrong, FLIP_MARGIN)
+            wrong = widened(wrong[None], FLIP_MARGIN)[0]
         known[wrong, joint] = torch.nan
         if joint in ANKLES:
             known[wrong, TOES[ANKLES.index(joint)]] = torch.nan  # the toes went with the foot
     return known
-
-
-def _widened(mask: Tensor, by: int) -> Tensor:
-    """(T,) bool, True also up to `by` frames before and after."""
-    return F.max_pool1d(mask.float()[None], 2 * by + 1, stride=1, padding=by)[0] > 0
 
 
 def _half_roll(hand: Tensor) -> tuple[Tensor, Tensor]:

@@ -163,7 +163,9 @@ class Reader(ABC):
     family: ClassVar[Family] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = ()  # what must lie where in `root`: pattern, what it is
     shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
-    fake: ClassVar[str] = ""  # "module:function(out, takes, frames, seed)" that writes a made-up download
+    fake: ClassVar[str] = (
+        ""  # module of `scenes(takes, frames, seed)` and `write_scenes(out, scenes)`, a made-up download
+    )
     own: ClassVar[bool] = False  # recordings of a user's own, which any folder of such files may be
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
 
@@ -179,10 +181,10 @@ class Reader(ABC):
         Raises:
             ValueError: the data set brings no fake.
         """
-        module, _, name = cls.fake.partition(":")
-        if not name:
+        if not cls.fake:
             raise ValueError(f"{cls.title} brings no made-up download; ask for the data at {cls.source}")
-        getattr(importlib.import_module(module), name)(out, takes, frames, seed)
+        fake = importlib.import_module(cls.fake)
+        fake.write_scenes(out, fake.scenes(takes, frames, seed))
 
     @abstractmethod
     def found(self) -> list[Take]:

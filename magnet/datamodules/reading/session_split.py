@@ -46,16 +46,13 @@ def split_sessions(sessions: Mapping[str, Amounts], fixed: Mapping[str, Split] |
     splits: dict[str, Split] = {name: fixed.get(name) or hashed_split(name) for name in names}
     quotas = _Quotas(sessions, splits)
     while True:
-        gain, change = quotas.best(_moves(free, splits))
+        moves = ({name: split} for name in free for split in ORDER if split != splits[name])
+        gain, change = quotas.best(moves)
         if gain <= 0:
             gain, change = quotas.best(_swaps(free, splits))
         if gain <= 0:
             return splits
         quotas.change(change)
-
-
-def _moves(free: list[str], splits: Mapping[str, Split]) -> Iterable[Change]:
-    return ({name: split} for name in free for split in ORDER if split != splits[name])
 
 
 def _swaps(free: list[str], splits: Mapping[str, Split]) -> Iterable[Change]:

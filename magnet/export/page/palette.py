@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,11 @@ Colours = NDArray[np.uint8]
 def agent_colours(slots: list[int] | tuple[int, ...]) -> Colours:
     """One colour a slot, as in the pictures. -> (P, 3)"""
     return np.array([AGENTS[slot % len(AGENTS)] for slot in slots], dtype=np.uint8)
+
+
+def hexed(colour: Sequence[int] | Colours) -> str:
+    """A colour as pages and SVG have it: #rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*(int(c) for c in colour))
 
 
 def pale(colours: Colours, share: float = PALENESS) -> Colours:

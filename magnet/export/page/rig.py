@@ -132,7 +132,9 @@ def limb_skin(rest: Array, table: tuple[Limb, ...]) -> Skin:
     for limb, a, b, r in zip(table, start, end, radii, strict=True):
         points, quads, far = capsule(float(np.linalg.norm(b - a)), float(r[0]), float(r[1]))
         pieces.append(points @ turn_to(b - a).T + a)
-        first, last = bone_at_start(limb[0]), bone_at_end(limb[1])
+        # The second end must not turn with what hangs on it.
+        end = max(PARENTS[limb[1]], 0) if limb[1] < BODY_JOINTS else 0
+        first, last = FOLLOWS.get(limb[0], limb[0]), FOLLOWS.get(limb[1], end)
         bones.append(np.where(far, last, first))
         faces.append(quads + count)
         count += len(points)
@@ -144,16 +146,6 @@ def limb_skin(rest: Array, table: tuple[Limb, ...]) -> Skin:
         np.concatenate([own, nobody], axis=1).astype(np.uint8),
         np.concatenate([np.ones((count, 1)), nobody], axis=1).astype(np.float32),
     )
-
-
-def bone_at_start(point: int) -> int:
-    """The bone whose turning moves a limb's first end with the limb."""
-    return FOLLOWS.get(point, point)
-
-
-def bone_at_end(point: int) -> int:
-    """The same for the second end, which must not turn with what hangs on it."""
-    return FOLLOWS.get(point, max(PARENTS[point], 0) if point < BODY_JOINTS else 0)
 
 
 def capsule(length: float, near: float, far: float, sectors: int = 14, rings: int = 6) -> tuple[Array, Index, Index]:
