@@ -185,8 +185,8 @@ class BodyGuidance:
         slid = F.pad(slide(joints, stands).square().sum(dim=-1), (0, 0, 1, 0))
         turned = limit_excess(body_rot).square().sum(dim=-1)
         own = torch.where(there, FEET * (feet + slid) + TURNS * turned, 0.0)
-        rows = moves.any(dim=1).repeat_interleave(TOKEN_FRAMES)
-        return torch.where(rows, total + own.sum(dim=-1), 0.0)
+        moving = moves.any(dim=1).repeat_interleave(TOKEN_FRAMES)
+        return torch.where(moving, total + own.sum(dim=-1), 0.0)
 
     def _steps(
         self, latent: Tensor, by_latent: Tensor, by_place: Tensor, energy: Tensor, moves: Tensor

@@ -82,7 +82,7 @@ class Expected:
 
 
 def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
-    """Each agent's prediction in its own view, without guidance. (rows, W, P, D) -> (B, W, P, D)
+    """Each agent's prediction in its own view, without guidance. (B V K, W, P, D) -> (B, W, P, D)
 
     A step's views and the branches of guidance run as one batch, scenes first, then views; the first branch is the
     unguided one.

@@ -236,9 +236,9 @@ class CrowdRollout(Rollout):
         there = self.views.present.expand(R, -1, -1).flatten(0, 1)
         cond = None if cond is None else cond.repeat_interleave(V, dim=0)
         parts = []
-        for rows in torch.arange(R * V, device=noisy.device).split(BATCH):
-            extra = None if cond is None else cond[rows]
-            parts.append(self.viewer.denoise(shown[rows], each[rows], there[rows], extra, network))
+        for some in torch.arange(R * V, device=noisy.device).split(BATCH):
+            extra = None if cond is None else cond[some]
+            parts.append(self.viewer.denoise(shown[some], each[some], there[some], extra, network))
         clean = self._read(torch.cat(parts).float().unflatten(0, (R, V)))
         if self.crowd:
             self._guess, self._guess_at = clean[0].detach(), self._begins

@@ -62,24 +62,24 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
         b, agent = unshaped.nonzero()[0].tolist()
         raise ValueError(f"{label(scene, b)}, agent {agent}: betas are not finite; zeros are an average body")
     keep = known.repeat_interleave(TOKEN_FRAMES, dim=0)[: scene.frames].to(scene.device)
-    rows = keep.any(dim=1).nonzero()[:, 0]
-    if not len(rows):
+    frames = keep.any(dim=1).nonzero()[:, 0]
+    if not len(frames):
         return
-    part = scene.frames_at(rows)
-    counts = keep[rows] & scene.present[:, None]  # (B, F, P)
+    part = scene.frames_at(frames)
+    counts = keep[frames] & scene.present[:, None]  # (B, F, P)
     if not bool(counts.any()):
         return
-    _refuse(~_finite(part) & counts, rows, scene, "is not finite: leave such frames out, or fill them in")
+    _refuse(~_finite(part) & counts, frames, scene, "is not finite: leave such frames out, or fill them in")
     _refuse(
         ~_rigid(part) & counts,
-        rows,
+        frames,
         scene,
         "is no rotation, or no rigid transform: expected body_rot of orthonormal columns, T_world_root with these and "
         "0 0 0 1 below them",
     )
     if any_floor:
         return
-    few = torch.linspace(0, len(rows) - 1, min(len(rows), MOMENTS), device=scene.device).long()
+    few = torch.linspace(0, len(frames) - 1, min(len(frames), MOMENTS), device=scene.device).long()
     off = off_floor(lowest(part.frames_at(few)), counts[:, few], counts.sum(dim=1))
     if bool((off != 0).any()):
         b = int(off.abs().argmax())
@@ -107,10 +107,10 @@ def _rigid(scene: Scene) -> Tensor:
     return off.abs().amax(dim=-1) < ROUNDED
 
 
-def _refuse(bad: Tensor, rows: Tensor, scene: Scene, what: str) -> None:
-    """bad (B, F, P) bool of the frames `rows`"""
+def _refuse(bad: Tensor, frames: Tensor, scene: Scene, what: str) -> None:
+    """bad (B, F, P) bool of some `frames`"""
     if bool(bad.any()):
         b, frame, agent = bad.nonzero()[0].tolist()
         count = int(bad[b].any(dim=-1).sum())
         also = f" (and {count - 1} more frames of that scene)" if count > 1 else ""
-        raise ValueError(f"{label(scene, b)}, agent {agent}: frame {int(rows[frame])}{also} {what}")
+        raise ValueError(f"{label(scene, b)}, agent {agent}: frame {int(frames[frame])}{also} {what}")

@@ -183,7 +183,7 @@ class Rollout:
         self.cond = None if cond is None else cond.to(model.device).repeat_interleave(samples, dim=0)
         if self.cond is not None and len(self.cond) != B:
             raise ValueError(
-                f"cond: got {len(self.cond) // samples} rows, expected one for each of {scene.scenes} scenes"
+                f"cond: got {len(self.cond) // samples} conditions, expected one for each of {scene.scenes} scenes"
             )
         if self.cond is None and o.guidance.cond_weight:
             raise ValueError(
@@ -321,7 +321,7 @@ class Rollout:
         self._clean = clean.detach()
         return clean[:, :width]
 
-    def _condition(self, rows: int, width: int) -> Tensor | None:
+    def _condition(self, batch: int, width: int) -> Tensor | None:
         """The condition of a window, for all views and branches of guidance of each scene."""
         cond = self.cond
         if cond is None:
@@ -329,7 +329,7 @@ class Rollout:
         if cond.ndim == 3:
             cond = cond[:, self._begins : self._begins + width]
             cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
-        cond = cond.repeat_interleave(rows // len(cond), dim=0)
+        cond = cond.repeat_interleave(batch // len(cond), dim=0)
         if self.options.guidance.cond_weight:
             cond[1::2] = torch.nan
         return cond

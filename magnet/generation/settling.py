@@ -36,8 +36,8 @@ def open_body_on(device: torch.device) -> Body:
 
 def frozen(scene: Scene, agents: Tensor, frame: int) -> Scene:
     """The scene with some agents standing still from a frame on. agents (P,) bool"""
-    rows = torch.arange(scene.frames, device=scene.device).clamp(max=frame)
-    still = scene.frames_at(rows)
+    frames = torch.arange(scene.frames, device=scene.device).clamp(max=frame)
+    still = scene.frames_at(frames)
     return scene.replace(
         body_rot=torch.where(agents[:, None, None, None], still.body_rot, scene.body_rot),
         T_world_root=torch.where(agents[:, None, None], still.T_world_root, scene.T_world_root),
@@ -102,8 +102,8 @@ def settled_block(
         body_rot=torch.where(there[..., None, None, None], given.body_rot, made.body_rot),
         T_world_root=torch.where(there[..., None, None], given.T_world_root, made.T_world_root),
     )
-    rows = new.repeat_interleave(TOKEN_FRAMES, dim=0)
-    return made, corrected_in_views(made, rows, unseen, how, lead * TOKEN_FRAMES, decentralized)
+    moving = new.repeat_interleave(TOKEN_FRAMES, dim=0)
+    return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
 @torch.no_grad()

@@ -80,23 +80,23 @@ def bootstrap_interval(
         Lower and upper end; None with fewer than two units, which say nothing of others.
     """
     counts = torch.ones_like(totals) if counts is None else counts
-    rows = torch.stack([totals, counts], dim=-1).double().cpu()
+    sums = torch.stack([totals, counts], dim=-1).double().cpu()
     if units is not None:
         units = units.cpu()
         own = torch.arange(len(units)) + int(units.max().clamp_min(-1)) + 1 if len(units) else units
         _, place = torch.where(units < 0, own, units).unique(return_inverse=True)
-        rows = torch.zeros(int(place.max()) + 1 if len(place) else 0, 2, dtype=rows.dtype).index_add_(0, place, rows)
-    rows = rows[rows[:, 1] > 0]
-    if len(rows) < 2:
+        sums = torch.zeros(int(place.max()) + 1 if len(place) else 0, 2, dtype=sums.dtype).index_add_(0, place, sums)
+    sums = sums[sums[:, 1] > 0]
+    if len(sums) < 2:
         return None
-    rows = rows[rows[:, 1].argsort(stable=True)]
-    rows = rows[rows[:, 0].argsort(stable=True)]
+    sums = sums[sums[:, 1].argsort(stable=True)]
+    sums = sums[sums[:, 0].argsort(stable=True)]
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     means = []
-    for several in torch.arange(resamples).split(max(1, AT_ONCE // len(rows))):
-        drawn = torch.randint(len(rows), (len(several), len(rows)), generator=generator)
-        means.append(rows[drawn].sum(dim=1))
+    for several in torch.arange(resamples).split(max(1, AT_ONCE // len(sums))):
+        drawn = torch.randint(len(sums), (len(several), len(sums)), generator=generator)
+        means.append(sums[drawn].sum(dim=1))
     total, count = torch.cat(means).unbind(-1)
     tail = (1 - level) / 2
     ends = torch.quantile(total / count, torch.tensor([tail, 1 - tail], dtype=torch.float64))

@@ -61,10 +61,10 @@ def levels_at(levels: Tensor, turn: Tensor, start: int, stop: int) -> Tensor:
     return own.gather(0, turn.clamp(0, len(levels) - 1).expand(-1, *own.shape[1:]))
 
 
-def changing(rows: Tensor) -> Tensor:
-    """The rows of a plan without denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
-    changes = (rows.diff(dim=0) != 0).flatten(1).any(dim=1)
-    return torch.cat([rows[:1], rows[1:][changes]])
+def changing(levels: Tensor) -> Tensor:
+    """The levels of a plan without denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
+    changes = (levels.diff(dim=0) != 0).flatten(1).any(dim=1)
+    return torch.cat([levels[:1], levels[1:][changes]])
 
 
 def blocks(target: Tensor, block: int) -> Iterator[tuple[int, int]]:

@@ -110,15 +110,15 @@ class MaskSchedule:
             raise ValueError(f"known: got {tuple(self.known.shape)}, expected {(self.tokens, self.agents)}")
         level = initial_levels(self.known)
         for number, stage in enumerate(self.stages):
-            rows = stage.levels
-            if rows.dim() != 3 or rows.shape[2] != self.agents or not 0 <= stage.start <= stage.stop <= self.tokens:
+            levels = stage.levels
+            if levels.dim() != 3 or levels.shape[2] != self.agents or not 0 <= stage.start <= stage.stop <= self.tokens:
                 raise ValueError(
-                    f"stage {number}: levels {tuple(rows.shape)} at token {stage.start} do not fit "
+                    f"stage {number}: levels {tuple(levels.shape)} at token {stage.start} do not fit "
                     f"{self.tokens} token steps of {self.agents} agents"
                 )
-            if int(rows.min()) < 0 or int(rows.max()) > LEVELS:
-                raise ValueError(f"stage {number}: levels {int(rows.min())}..{int(rows.max())} outside 0..{LEVELS}")
-            history = torch.cat([level[stage.start : stage.stop][None], rows])
+            if int(levels.min()) < 0 or int(levels.max()) > LEVELS:
+                raise ValueError(f"stage {number}: levels {int(levels.min())}..{int(levels.max())} outside 0..{LEVELS}")
+            history = torch.cat([level[stage.start : stage.stop][None], levels])
             rises = history.diff(dim=0) > 0
             if rises.any():
                 step, token, agent = rises.nonzero()[0].tolist()
@@ -133,10 +133,10 @@ class MaskSchedule:
                     f"stage {number}: token {stage.start + token} of agent {agent} begins at level "
                     f"{int(history[1, token, agent])} but was left at {int(history[0, token, agent])}"
                 )
-            idle = (rows.diff(dim=0) == 0).flatten(1).all(dim=1)
+            idle = (levels.diff(dim=0) == 0).flatten(1).all(dim=1)
             if idle.any():
                 raise ValueError(f"stage {number}: denoising step {int(idle.nonzero()[0])} changes nothing")
-            level[stage.start : stage.stop] = rows[-1]
+            level[stage.start : stage.stop] = levels[-1]
 
     def padded(self, agents: int) -> MaskSchedule:
         """The same plan with free slots added, of which nothing is known and nothing is generated."""
@@ -205,9 +205,9 @@ class MaskSchedule:
                 continue
             turn = torch.arange(grid.steps + slope * (last - first - 1) + 1)[:, None]
             turn = turn - slope * (torch.arange(start, stop) - first)
-            rows = changing(torch.where(active, levels_at(plan, turn[..., None], start, stop), level[start:stop]))
-            stages.append(Stage(start, rows.short()))
-            level[start:stop] = rows[-1]
+            levels = changing(torch.where(active, levels_at(plan, turn[..., None], start, stop), level[start:stop]))
+            stages.append(Stage(start, levels.short()))
+            level[start:stop] = levels[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
     @staticmethod
@@ -228,9 +228,9 @@ class MaskSchedule:
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
         if wanted and wanted[0] < grid.window // 2:
             done = min(grid.window, grid.tokens)
-            rows = changing(torch.where(target[:done], plan[:, :done], level[:done]))
-            stages.append(Stage(0, rows.short()))
-            level[:done] = rows[-1]
+            levels = changing(torch.where(target[:done], plan[:, :done], level[:done]))
+            stages.append(Stage(0, levels.short()))
+            level[:done] = levels[-1]
         sliding = target & (torch.arange(grid.tokens) >= done)[:, None]
         wanted = [token for token in wanted if token >= done]
         first = wanted[0] if wanted else 0
@@ -240,11 +240,11 @@ class MaskSchedule:
             start = max(0, min(token + grid.tokens_in_flight, grid.tokens) - grid.window)
             stop = min(start + grid.window, grid.tokens)
             behind = grid.token_offset * (torch.arange(start, stop) - first)
-            turn = torch.arange(begins, ended + 1)[:, None] - behind  # (rows, W)
+            turn = torch.arange(begins, ended + 1)[:, None] - behind  # (steps, W)
             now = levels_at(plan, turn[..., None], start, stop)
-            rows = changing(torch.where(sliding[start:stop], now, level[start:stop]))
-            stages.append(Stage(start, rows.short()))
-            level[start:stop] = rows[-1]
+            levels = changing(torch.where(sliding[start:stop], now, level[start:stop]))
+            stages.append(Stage(start, levels.short()))
+            level[start:stop] = levels[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
 
     @staticmethod
@@ -300,16 +300,16 @@ class MaskSchedule:
             active = torch.zeros(stop - start, grid.agents, dtype=torch.bool)
             active[now] = target[first:last]
             for begins, ends in pairwise(starts):
-                turns = torch.arange(begins, ends + 1)[:, None] - delay  # (rows, P)
-                rows = changing(torch.where(active, levels_at(plan, turns[:, None], start, stop), level[start:stop]))
-                if len(rows) == 1:  # the agents that start here have no targets in this block
+                turns = torch.arange(begins, ends + 1)[:, None] - delay  # (steps, P)
+                levels = changing(torch.where(active, levels_at(plan, turns[:, None], start, stop), level[start:stop]))
+                if len(levels) == 1:  # the agents that start here have no targets in this block
                     continue
                 hidden = torch.zeros(grid.agents, stop - start, grid.agents, dtype=torch.bool)
                 if unseen is not None:
                     hidden[:, now] = unseen[:, None]
-                hidden &= (rows[0] < LEVELS) | (rows[-1] < LEVELS)
-                hidden |= active & (rows[-1] == LEVELS)
+                hidden &= (levels[0] < LEVELS) | (levels[-1] < LEVELS)
+                hidden |= active & (levels[-1] == LEVELS)
                 ahead = start + grid.window - stop
-                stages.append(Stage(start, rows.short(), ~hidden if hidden.any() else None, ahead))
-                level[start:stop] = rows[-1]
+                stages.append(Stage(start, levels.short(), ~hidden if hidden.any() else None, ahead))
+                level[start:stop] = levels[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known, lookahead, causal)

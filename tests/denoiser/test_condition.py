@@ -155,7 +155,7 @@ def test_a_model_without_one_refuses_it_and_one_with_one_checks_its_size(taught,
         generate(tiny_denoiser(), scene, JointFuture(), 16, 16, 1, options, cond=cond)
     with pytest.raises(ValueError, match=r"cond: got \(2, 3\), expected \(2, 1\) or \(2, 8, 1\)"):
         generate(taught[0], taught[1], JointFuture(), 16, 16, 1, options, cond=cond)
-    with pytest.raises(ValueError, match="cond: got 1 rows, expected one for each of 2 scenes"):
+    with pytest.raises(ValueError, match="cond: got 1 conditions, expected one for each of 2 scenes"):
         generate(taught[0], taught[1], JointFuture(), 16, 16, 1, options, cond=torch.ones(1, 1))
 
 
