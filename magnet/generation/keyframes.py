@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from magnet.body.base import Body
+from magnet.body.reach import LIMBS, reach
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -54,6 +56,10 @@ class Keyframe:
     body_rot: Tensor
     T_key_root: Tensor
 
+    def T_world_root(self) -> Tensor:
+        """(4, 4, 4)"""
+        return self.goal.frame() @ self.T_key_root
+
 
 def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held: bool = False) -> Keyframe:
     """A keyframe from an agent's motion in a scene (B = 1): the token that holds `frame`, at its place there.
@@ -83,13 +89,33 @@ def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held
     )
 
 
+def limb_places(key: Keyframe, limb: str, body: Body, betas: Tensor) -> Tensor:
+    """Where a hand (the wrist) or a foot (the ankle) is in a keyframe's four frames. -> (4, 3) metres in the world
+
+    Args:
+        limb: a name in `magnet.body.reach.LIMBS`.
+        betas: the person's shape (10,).
+    """
+    return body.forward_kinematics(key.body_rot, key.T_world_root(), betas)[:, LIMBS[limb][2]]
+
+
+def with_limb(key: Keyframe, limb: str, place: Tensor, body: Body, betas: Tensor) -> Keyframe:
+    """A keyframe in which a hand or a foot is at a place, in metres in the world, as far as it can be brought there.
+
+    The first of the four frames is there; in the others the limb moves from there as it did before. place (3,)
+    """
+    places = limb_places(key, limb, body, betas)
+    body_rot = reach(body, key.body_rot, key.T_world_root(), betas, limb, places + (place - places[0]))
+    return replace(key, body_rot=body_rot)
+
+
 def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
     """A scene (B = 1) in which people are as their keyframes say, marked as given there."""
     roots, body_rot = scene.T_world_root.clone(), scene.body_rot.clone()
     given = torch.zeros(roots.shape[:3], dtype=torch.bool) if scene.given is None else scene.given.clone()
     for key in keys:
         frames = slice(key.frame, key.frame + TOKEN_FRAMES)
-        roots[0, frames, key.agent] = key.goal.frame() @ key.T_key_root
+        roots[0, frames, key.agent] = key.T_world_root()
         body_rot[0, frames, key.agent] = key.body_rot
         given[0, frames, key.agent] = True
     return scene.replace(T_world_root=roots, body_rot=body_rot, given=given)

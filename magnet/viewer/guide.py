@@ -19,8 +19,8 @@ people*.
 goes there and the others answer; with `inbetweening` the arrows are that person's next keyframe, a second ahead.
 
 **Keyframes.** Go to a moment, choose a person, *Add keyframe here*. Drag its arrows and ring; take the *pose of*
-another frame; give it a time, also later than all there is. *Generate between* makes everything anew from a second
-before the first keyframe to the last.
+another frame; *drag its* hand or foot by arrows of their own; give it a time, also later than all there is. *Generate
+between* makes everything anew from a second before the first keyframe to the last.
 
 **Keep.** *Save* downloads the scene: npz, glb for Blender, bvh, a page that plays by itself.
 """

@@ -16,6 +16,7 @@ from magnet.generation.keyframes import Goal, Keyframe, keyframe, speeds, with_k
 from magnet.generation.live import Live
 from magnet.motion.frames import canonical_frame
 from magnet.viewer.clock import Clock
+from magnet.viewer.limb_handle import LimbHandle
 from magnet.viewer.people import PeopleView, add_people
 from magnet.viewer.worker import Worker
 
@@ -134,6 +135,7 @@ class KeyframePanel:
             add = gui.add_button("Add keyframe here", icon="plus")
             self.which = gui.add_dropdown("keyframe", (NO_KEYS,))
             self.at = gui.add_number("at frame", 0, min=0, step=4, hint="later than the last frame there is, too")
+            self.limb = LimbHandle(app.server, app.body, self._chosen_key, self._bent)
             remove = gui.add_button("Remove this keyframe", icon="minus")
             self.list = gui.add_markdown("")
             self.go = gui.add_button("Generate between", icon="route")
@@ -220,10 +222,21 @@ class KeyframePanel:
     def _chosen(self) -> KeyframeRow | None:
         return next((row for row in self.rows if row.label == self.which.value), None)
 
+    def _chosen_key(self) -> tuple[Keyframe, Any] | None:
+        row = self._chosen()
+        return None if row is None else (row.key, self.live.scene.betas[0, row.key.agent].cpu())
+
+    def _bent(self, key: Keyframe) -> None:
+        row = self._chosen()
+        if row is not None and (row.key.agent, row.key.frame) == (key.agent, key.frame):
+            self._change(row, body_rot=key.body_rot)
+
     def _change(self, row: KeyframeRow, **changes: Any) -> None:
         row.key = dataclasses.replace(row.key, **changes)
         self._pose(row)
         self._tell()
+        if row is self._chosen() and "body_rot" not in changes:  # its limbs go with it
+            self.limb.show()
 
     def _pose(self, row: KeyframeRow) -> None:
         """Put the preview where the keyframe is."""
@@ -245,6 +258,7 @@ class KeyframePanel:
     def _shown(self) -> None:
         row = self._chosen()
         self.at.value = 0 if row is None else row.key.frame
+        self.limb.show()
 
     def _tell(self) -> None:
         """Hand the keyframes to the engine, and say how fast people must go to reach them."""

@@ -8,6 +8,13 @@ import socket
 import sys
 from typing import Any
 
+AT_ONCE = "Object.defineProperty(document, 'hidden', {configurable: true, get: () => true})"
+TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
+"""Lets viser's page (1.1) take up what it is sent at once, as it does in tabs that are out of sight.
+
+Else it moves the bones of bodies in the picture that is about to be drawn, and colours and marks in the one after it:
+where no GPU draws, bodies were ahead of their colours and marks by a tenth of a second and more.
+"""
 NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
@@ -26,6 +33,7 @@ def start(host: str, port: int, title: str) -> Any:
     if server.get_port() != port:
         server.stop()
         raise OSError(taken(host, port))
+    server.gui.add_html(TOGETHER)
     return server
 
 
