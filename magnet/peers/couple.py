@@ -44,7 +44,7 @@ class Couple:
         self.model, self.scene, self.known = model, scene, known
         self.T_world_can = canonical_frame(scene.T_world_root)
         self.latent = torch.zeros(scene.scenes, self.steps, 2, model.layout.latent, device=scene.device)
-        self.features: list[Tensor] = []
+        self.shown = scene.replace(body_rot=scene.body_rot.clone(), T_world_root=scene.T_world_root.clone())
         for agent, stop in enumerate([min(self.begins)] * 2 if online else self.begins):
             self._encode(agent, 0, stop)
 
@@ -106,6 +106,18 @@ class Couple:
         keep = self.known.repeat_interleave(TOKEN_FRAMES, dim=0).to(features.device)
         made = posed(features, self.T_world_can, self.scene)
         return spring_from_given(made, self.scene, self.T_world_can, keep, BLEND)
+
+    def show(self, first: int, step: int) -> None:
+        """Decode one step as it looks now, from those since `first`, and go on from the bodies before it in `shown`."""
+        begin, stop = step * TOKEN_FRAMES, (step + 1) * TOKEN_FRAMES
+        near, way = self.shown.slice(first * TOKEN_FRAMES, stop), self.T_world_can[:, first * TOKEN_FRAMES : stop]
+        keep = self.known[first : step + 1].clone()
+        keep[:-1] = True
+        keep = keep.repeat_interleave(TOKEN_FRAMES, dim=0).to(way.device)
+        made = posed(self.decode(first, step + 1, held=True), way, near)
+        made = spring_from_given(made, near, way, keep, BLEND)
+        self.shown.body_rot[:, begin:stop] = made.body_rot[:, -TOKEN_FRAMES:]
+        self.shown.T_world_root[:, begin:stop] = made.T_world_root[:, -TOKEN_FRAMES:]
 
 
 def drawn(generators: Sequence[torch.Generator], *shape: int) -> Tensor:

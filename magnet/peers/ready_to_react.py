@@ -77,9 +77,7 @@ class ReadyToReact(Peer):
 
     def generate(self, scene: Scene, known: Tensor, generators: Sequence[torch.Generator]) -> Scene:
         couple, C, K = Couple(self, scene, known, online=True), self.layout.latent, self.own_width
-        begins = min(couple.begins)
-        features = [couple.decode(0, begins, held=True)]
-        for step in range(begins, couple.steps):
+        for step in range(min(couple.begins), couple.steps):
             first = max(step + 1 - self.window, 0)
             couple.listen(first, step)
             told = self.told(*both_ways(couple.tokens(first, step)))[:, -1]
@@ -94,5 +92,5 @@ class ReadyToReact(Peer):
                 if step >= known_steps:
                     couple.latent[:, step, agent] = latent[:, agent]
                     couple.place(agent, step, deltas[:, None, agent], None)
-            features.append(couple.decode(first, step + 1, held=True)[:, -TOKEN_FRAMES:])
-        return couple.bodies(torch.cat(features, dim=1))
+            couple.show(first, step)
+        return couple.shown
