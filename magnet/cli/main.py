@@ -26,6 +26,7 @@ LIGHT_COMMANDS = {
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
     "score": "measure submissions to the open benchmark, of any method",
+    "report": "the paper's tables, run here beside the printed numbers",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
     "export-model": "write a model as ONNX files, for programs without torch",
     "doctor": "what is installed, what is missing and what to do about it",

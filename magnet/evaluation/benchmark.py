@@ -118,7 +118,7 @@ class BenchmarkTakes(CMU):
     """
 
     def __init__(self, benchmark: Benchmark, **kwargs: Any) -> None:
-        super().__init__(singles=False, test=benchmark.test, max_agents=benchmark.people, **kwargs)
+        super().__init__(**{"singles": False, "test": benchmark.test, "max_agents": benchmark.people, **kwargs})
         self.takes = benchmark.takes
 
     def clips(self, split: Split) -> list[Clip]:

@@ -1,0 +1,91 @@
+"""`magnet report TABLE`: the paper's tables, run here, beside the printed numbers, and what holds of its claims."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from magnet.cli.flags import PlainParser
+
+EPILOG = """\
+TABLE is 2, 3, 4, 5, A.3, A.4, A.5, A.6, Fig.7, own (choices of ours), leak (what partner tasks gain by the reference's
+reading) or all; several may be named. A table is made of cells: a measurement with one seed, or a training. Those that
+are done are kept in OUT/cells, one file each, so a run that was stopped goes on where it was, a training from its last
+checkpoint.
+
+for example:
+  magnet report 3 --dry_run            the cells of Table 3, and how long they may take
+  magnet report 4 A.4 leak --shipped   what needs no training
+  magnet report all                    a day on two cores, trainings included
+  magnet report 5 --data configs/paper/data/duobox.yaml --budget paper
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    options = PlainParser("report", __doc__, EPILOG)
+    add = options.add_argument
+    add("tables", nargs="+", metavar="TABLE", help="which")
+    add(
+        "--out",
+        type=Path,
+        default=Path("runs/report"),
+        metavar="FOLDER",
+        help="of cells and page (default: %(default)s)",
+    )
+    add("--budget", choices=("tiny", "small", "paper"), default="small", help="of every cell (default: %(default)s)")
+    add("--ckpt_path", default="duet", metavar="MODEL", help="our row's weights (default: %(default)s)")
+    add("--data", default="salsa", help="scenes of two people: salsa, synthetic2, or a file (default: %(default)s)")
+    add("--configs", type=Path, default=Path("configs/report"), help="of trainings (default: %(default)s)")
+    add("--shipped", action="store_true", help="leave out rows that would have to be trained")
+    add("--dry_run", action="store_true", help="list the cells and what they may take, and stop")
+    add("--only", default="", metavar="TEXT", help="run only cells whose name holds this, and what these need")
+    add("--page_only", action="store_true", help="write the page from what is done")
+    return options
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """Run the command. Returns the exit code: 1 where a cell could not be done.
+
+    Raises:
+        ValueError: no such table.
+    """
+    given = parser().parse_args(list(arguments))
+    from magnet.cli import run_folder
+    from magnet.cli.train import quiet, run_trainer
+    from magnet.evaluation.results import machine
+    from magnet.report.cells import BUDGETS, Store
+    from magnet.report.page import page
+    from magnet.report.run import Runner, clock
+    from magnet.report.tables import TABLES, ReportOptions, cells_of, named
+
+    quiet()
+    names = list(TABLES) if "all" in given.tables else [named(table) for table in given.tables]
+    plan = ReportOptions(BUDGETS[given.budget], given.data, given.ckpt_path, given.shipped, given.configs)
+    blocks = {name: TABLES[name](plan) for name in names}
+    cells = cells_of(block for each in blocks.values() for block in each)
+    store = Store(given.out)
+    own_data = Path(given.data) if given.data.endswith((".yaml", ".yml")) else None
+    runner = Runner(
+        store,
+        lambda words: run_trainer("fit", words),
+        given.configs,
+        given.ckpt_path,
+        plan.budget.speed_rounds,
+        own_data,
+    )
+    wanted = [cell for cell in cells if given.only in cell.name]
+    wanted = [cell for cell in cells if cell in wanted or cell in {each.needs for each in wanted}]
+    todo = runner.missing(wanted)
+    if given.dry_run:
+        for cell in todo:
+            print(f"{runner.seconds(cell):6.0f} s  {cell.name}")
+        total = clock(sum(map(runner.seconds, todo)))
+        print(f"{len(wanted)} cells, {len(wanted) - len(todo)} done; the other {len(todo)} may take {total}")
+        return 0
+    if not given.page_only:
+        runner.run(wanted)
+    facts = {"tables": ", ".join(names), "budget": f"{given.budget}: {plan.budget}", "data": given.data}
+    facts |= {"checkpoint": given.ckpt_path, **run_folder.provenance(), "machine": machine()}
+    print(f"written: {page(blocks, store, runner.failed, facts)} and report.json")
+    return int(bool(runner.failed))

@@ -1,0 +1,1 @@
+"""The paper's tables as jobs: what is missing is run, and a page says what holds here (`magnet report`)."""

@@ -1,0 +1,206 @@
+"""What a cell measures: rows of a task's numbers, frames a second, or a curve over a long generation."""
+
+from __future__ import annotations
+
+import importlib
+import statistics
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from magnet import checkpoints
+from magnet.baselines.predictor import Generators, Predictor
+from magnet.datamodules import registry
+from magnet.datamodules.base import MotionDataModule
+from magnet.datamodules.options import Augmentation, HeldOutScenes
+from magnet.datamodules.synthetic import Synthetic
+from magnet.evaluation.benchmark import Benchmark, BenchmarkTakes
+from magnet.evaluation.evaluator import Evaluator
+from magnet.evaluation.methods import sight_of
+from magnet.evaluation.scoring import generators_of
+from magnet.metrics import FrechetDistance, frechet_distance
+from magnet.metrics.frechet import moments
+from magnet.metrics.own_frame import joint_canonical_frame, seen_from
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TokenLayout
+from magnet.report.cells import Cell
+from magnet.report.folds import FoldScoring
+from magnet.sampling.options import SamplerOptions
+from magnet.tasks import registry as tasks
+from magnet.tasks.base import Task
+
+OURS = "ours"
+CONTEXT, PIECE = 4, 150
+"""Frames that a long generation is given (paper 4.2), and those of which each stretch is compared."""
+SPEED_FRAMES = 60
+
+
+def data_of(cell: Cell) -> MotionDataModule:
+    """The test scenes of a cell.
+
+    Raises:
+        ValueError: no such data set or file.
+    """
+    if cell.data == "salsa":
+        benchmark = Benchmark.read()
+        return BenchmarkTakes(benchmark, test=HeldOutScenes(limit=cell.scenes), max_agents=benchmark.people)
+    if cell.data.startswith("synthetic"):
+        people = int(cell.data.removeprefix("synthetic"))
+        held_out = HeldOutScenes(limit=cell.scenes)
+        return Synthetic(people=[people], max_agents=people, test_clips=min(cell.scenes, 24), test=held_out)
+    path = Path(cell.data)
+    if not path.is_file():
+        raise ValueError(
+            f"data: got {cell.data!r}, expected salsa, synthetic2 to synthetic4, or a file of data options"
+        )
+    spec = yaml.safe_load(path.read_text(encoding="utf-8"))["data"]
+    options = dict(spec.get("init_args") or {})
+    options["augment"] = Augmentation(**options.get("augment") or {})
+    options["test"] = HeldOutScenes(**{**(options.get("test") or {}), "limit": cell.scenes})
+    kinds = registry.classes()
+    if spec["class_path"] not in kinds:
+        raise ValueError(f"{path}: no data set {spec['class_path']}; there are {', '.join(kinds)}")
+    return kinds[spec["class_path"]](**options)  # type: ignore[return-value]
+
+
+def task_of(cell: Cell) -> Task:
+    """The task with its options."""
+    task: Task = tasks.get(cell.task)(**dict(cell.task_options))
+    return task
+
+
+def load(path: str) -> Any:
+    """A denoiser or a peer, whichever class a checkpoint is of.
+
+    Raises:
+        ValueError: a checkpoint of something that is not ours.
+    """
+    stored = checkpoints.read(checkpoints.resolve(path))
+    trained = stored.get("magnet_config", {}).get("model") or {}
+    kind = str(trained.get("class_path") or "magnet.Denoiser")
+    if not kind.startswith("magnet."):
+        raise ValueError(f"{path}: is of {kind}, expected a model of magnet")
+    module, _, name = kind.rpartition(".")
+    return getattr(importlib.import_module(module), name).load(path)
+
+
+def predictor(cell: Cell, data: MotionDataModule, checkpoint: str, horizon: int | None = None) -> Predictor:
+    """A cell's model as a predictor of its task, for so many frames after the context; by default the data's."""
+    model = load(checkpoint)
+    if cell.leak == "pairs":
+        layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.pairwise, "token")
+        model.layout = model.transformer.layout = layout
+    sampler = SamplerOptions.preset("default", **dict(cell.sampler))
+    evaluator = Evaluator(model, task_of(cell), sampler, max(cell.samples, 1), baselines=False)
+    evaluator.start(data)
+    evaluator.horizon = horizon or evaluator.horizon
+    return evaluator.predict_joints
+
+
+def measure(cell: Cell, checkpoint: str | None) -> dict[str, Any]:
+    """Numbers of all rows of a cell, with those of all scenes but one; without a model, of baselines and floors."""
+    data = data_of(cell)
+    data.prepare_data()
+    task = task_of(cell)
+    methods = {} if checkpoint is None else {OURS: predictor(cell, data, checkpoint)}
+    scoring = FoldScoring(
+        data,
+        methods,
+        lambda people: sight_of(task, data, people),
+        samples=cell.samples,
+        baselines=checkpoint is None,
+        seed=cell.seed,
+        interval="scene",
+    )
+    done = 0
+    for batch in data.test_dataloader():
+        scoring.step(batch, list(range(done, done + batch.scenes)))
+        done += batch.scenes
+    return {"rows": scoring.rows(), "scenes": done}
+
+
+def speed(cell: Cell, checkpoint: str, shipped: str, rounds: int) -> dict[str, Any]:
+    """Frames a second of one scene, and the shipped model's in turn with it, so that a busy machine slows both."""
+    data = data_of(cell)
+    data.prepare_data()
+    scene = next(iter(data.test_dataloader())).select([0])
+    both = {
+        OURS: predictor(cell, data, checkpoint, SPEED_FRAMES),
+        "shipped": predictor(cell, data, shipped, SPEED_FRAMES),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in both}
+    short = scene.slice(0, data.test.context_frames + SPEED_FRAMES)
+    for round_number in range(rounds + 1):  # the first one is not counted
+        for name, method in both.items():
+            began = time.perf_counter()
+            method(short, 1, generators_of(cell.seed, [round_number], 1))
+            seconds[name].append(time.perf_counter() - began)
+    took = {name: statistics.median(each[1:]) for name, each in seconds.items()}
+    value = {"fps": SPEED_FRAMES / took[OURS], "times_shipped": took["shipped"] / took[OURS]}
+    return {"rows": {OURS: {"value": value, "without": {}}}}
+
+
+def long(cell: Cell, checkpoint: str) -> dict[str, Any]:
+    """FD of all that was generated so far against recorded stretches, as it grows; scene by scene left out."""
+    data = data_of(cell)
+    data.test = HeldOutScenes(context_frames=CONTEXT, horizon_frames=PIECE, limit=cell.scenes)
+    data.prepare_data()
+    method = predictor(cell, data, checkpoint, cell.frames)
+    parts: list[Tensor] = []
+    recorded: list[Tensor] = []
+    done = 0
+    for batch in data.test_dataloader():
+        numbers = list(range(done, done + batch.scenes))
+        parts.append(_without_future(method, batch, cell.samples, generators_of(cell.seed, numbers, cell.samples)))
+        recorded.append(data.body.joints(batch.slice(CONTEXT)))
+        done += batch.scenes
+    made, real = torch.cat(parts, dim=1), torch.cat(recorded)
+    length = min(PIECE, cell.frames)
+    curve: dict[str, float] = {}
+    folds: dict[str, dict[str, float]] = {str(b): {} for b in range(done if done > 1 else 0)}
+    for end in range(length, cell.frames + 1, length):
+        pieces = torch.stack([_placed(made[:, :, k : k + length]) for k in range(0, end, length)])  # (K, S, B, T, ...)
+        name = f"fd@{end}"
+        curve[name] = _distance(pieces, _placed(real[:, :length]))
+        for b, row in folds.items():
+            kept = [other for other in range(done) if other != int(b)]
+            row[name] = _distance(pieces[:, :, kept], _placed(real[kept, :length]))
+    last = {"fd": curve[f"fd@{cell.frames // length * length}"]}
+    without = {b: {**row, "fd": row[f"fd@{cell.frames // length * length}"]} for b, row in folds.items()}
+    return {"rows": {OURS: {"value": {**curve, **last}, "without": without}}, "scenes": done}
+
+
+def _without_future(method: Predictor, batch: Scene, samples: int, generators: Generators) -> Tensor:
+    return method(batch.slice(0, CONTEXT), samples, generators)
+
+
+def _placed(joints: Tensor) -> Tensor:
+    """In a world of their own first frame: between the people, facing as the first does. (..., T, P, 22, 3)"""
+    first = joints[..., :1, :, :, :]
+    frame = joint_canonical_frame(first[..., :1, :, :]).clone()  # (..., 1, 1, 4, 4)
+    frame[..., [0, 2], 3] = first[..., 0, [0, 2]].mean(dim=-2, keepdim=True)
+    return seen_from(frame, joints)
+
+
+def _distance(made: Tensor, real: Tensor) -> float:
+    """FD of two sets of stretches, however many. (..., T, P, 22, 3)"""
+    there = []
+    for joints in (made, real):
+        flat = joints.flatten(0, -5)
+        metric = FrechetDistance()
+        metric.update(flat[None], flat, torch.ones(flat.shape[0], flat.shape[2], dtype=torch.bool))
+        there.append(moments(metric.count[1], metric.sum[1], metric.outer[1]))
+    return float(frechet_distance(*there[0], *there[1]))
+
+
+def run(cell: Cell, checkpoint: str | None, shipped: str, rounds: int) -> Mapping[str, Any]:
+    """What a cell other than a training gives."""
+    if cell.kind == "measure":
+        return measure(cell, checkpoint)
+    assert checkpoint is not None
+    return speed(cell, checkpoint, shipped, rounds) if cell.kind == "speed" else long(cell, checkpoint)

@@ -1,0 +1,196 @@
+"""The page of a report: ours beside the paper's printed numbers, floors, intervals, and which claims hold."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from magnet.evaluation.results import ARROWS, own_columns, three
+from magnet.files import write_whole
+from magnet.metrics import Column, column
+from magnet.report.cells import Cell, Store
+from magnet.report.plot import curves, dots
+from magnet.report.statistics import Estimate, difference, estimate, verdict
+from magnet.report.tables import PAPER, Block, Claim, Row
+
+SHOWN = {
+    "fps": Column("frames/s", "frames a second", "high", "frames a second of one scene, here"),
+    "times_shipped": Column("x ours", "", "high", "as many times as fast as the shipped model, in turn with it"),
+}
+WORDS = {
+    "leak": (
+        "Measured here, with our weights and our code, not with the reference's. A pairwise transform has two ends: "
+        "the given person's token tells where the generated one is, if it is as clean as its token. The reference's "
+        "evaluation also counts the given person, who is a copy of the recording. Each line says what one of these "
+        "readings gives on these scenes; what the paper's own numbers contain cannot be told from here."
+    ),
+    "own": "Trainings that differ from base.yaml in one choice of ours, which the paper does not have.",
+    "A.3": "Speeds of this machine, each taken in turn with the shipped model's: only the ratio can be compared.",
+}
+CLAIM = ("claim", "place", "verdict", "difference")
+FILMS = Path("docs/pictures")
+
+Runs = Sequence[Mapping[str, Any]]
+
+
+def runs_of(row: Row, store: Store) -> Runs:
+    """What was measured of a row, one a seed."""
+    found = [store.get(cell) for cell in row.cells]
+    return [content["rows"][row.inside] for content in found if content and row.inside in content["rows"]]
+
+
+def title(metric: str) -> str:
+    """Of a column, with its arrow."""
+    shown = column(metric, {**own_columns(), **SHOWN})
+    name = f"to {metric.partition('@')[2]}" if metric.startswith("fd@") else shown.title
+    return name + ARROWS[shown.better]
+
+
+def cell_text(found: Estimate | None) -> str:
+    """A number with its interval."""
+    if found is None:
+        return "-"
+    span = found.interval
+    return three(found.value) + (f" [{three(span[0])}, {three(span[1])}]" if span else "")
+
+
+def page(
+    blocks: Mapping[str, Sequence[Block]], store: Store, failed: Mapping[Cell, str], facts: Mapping[str, Any]
+) -> Path:
+    """Write the page, report.json and pictures. Returns the page's path.
+
+    Args:
+        blocks: of each table.
+        store: of the cells.
+        failed: what could not be done, and why.
+        facts: how it came about; the JSON has all of them.
+    """
+    lines = ["# Report", "", *_head(facts), ""]
+    content: dict[str, Any] = {"facts": dict(facts), "tables": {}}
+    for name, parts in blocks.items():
+        lines += [f"## {name if name in WORDS and name != 'A.3' else _table_name(name)}", ""]
+        lines += [WORDS[name], ""] if name in WORDS else []
+        content["tables"][name] = [
+            _block(block, store, failed, lines, f"{_safe(name)}-{k}") for k, block in enumerate(parts)
+        ]
+        lines += _printed(name)
+    path = (store.folder / "report").with_suffix(".md")
+    _write(store.folder / "report.json", json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n")
+    _write(path, "\n".join(lines).rstrip() + "\n")
+    return path
+
+
+def _head(facts: Mapping[str, Any]) -> list[str]:
+    told = [f"- {key}: {value}" for key, value in facts.items() if isinstance(value, str | int | float)]
+    return [
+        *told,
+        "- in brackets: 95 % intervals, by leaving out each scene in turn (scenes do not overlap) and by the spread of "
+        "seeds; an ordering holds, or does not, where the interval of the difference leaves out 0. Orderings are many "
+        "and each is judged by itself: of twenty that are equal, one seems not to be.",
+    ]
+
+
+def _block(block: Block, store: Store, failed: Mapping[Cell, str], lines: list[str], name: str) -> dict[str, Any]:
+    """A table, its picture and what holds, onto `lines`. Returns it for the JSON."""
+    runs = {row.title: runs_of(row, store) for row in block.rows}
+    found = {
+        row: {metric: each for metric in block.columns if (each := estimate(got, metric)) is not None}
+        for row, got in runs.items()
+    }
+    lines += [f"### {block.title}", "", "| method | seeds | " + " | ".join(map(title, block.columns)) + " |"]
+    lines += ["|---|---:|" + "---:|" * len(block.columns)]
+    for row in block.rows:
+        texts = [cell_text(found[row.title].get(metric)) for metric in block.columns]
+        lines.append(f"| {row.title} | {len(runs[row.title]) or '-'} | " + " | ".join(texts) + " |")
+    lines += ["", *_not_there(block, runs, failed)]
+    picture = store.folder / "pictures" / f"{name}.svg"
+    drawn = {row: values for row, values in found.items() if values}
+    if drawn:
+        ends = [int(metric[3:]) for metric in block.columns if metric.startswith("fd@")]
+        text = curves(drawn, ends) if ends else dots(drawn, {metric: title(metric) for metric in block.columns})
+        _write(picture, text)
+        lines += [f"![{block.title}](pictures/{picture.name})", ""]
+    lines += _film(block, store.folder)
+    judged = [_judged(claim, runs) for claim in block.claims]
+    if judged:
+        lines += ["| the paper says | where | here | difference |", "|---|---|---|---:|"]
+        lines += [
+            f"| {each['claim']} | {each['place']} | {each['verdict']} | {each['difference']} |" for each in judged
+        ]
+        lines += [""]
+    rows = {row: {metric: _plain(each) for metric, each in values.items()} for row, values in found.items()}
+    return {"title": block.title, "rows": rows, "claims": judged}
+
+
+def _plain(found: Estimate) -> dict[str, Any]:
+    span = found.interval
+    return {"value": found.value, "low": span[0] if span else None, "high": span[1] if span else None}
+
+
+def _judged(claim: Claim, runs: Mapping[str, Runs]) -> dict[str, str]:
+    a, b = runs.get(claim.better, ()), runs.get(claim.worse, ())
+    apart = difference(a, b, claim.metric)
+    shown = column(claim.metric, {**own_columns(), **SHOWN}).title
+    sign = "<" if claim.lower else ">"
+    return {
+        "claim": f"{shown}: {claim.better} {sign} {claim.worse}",
+        "place": claim.place,
+        "verdict": verdict(apart, claim.lower) if a and b else "not measured",
+        "difference": cell_text(apart),
+    }
+
+
+def _not_there(block: Block, runs: Mapping[str, Runs], failed: Mapping[Cell, str]) -> list[str]:
+    """Why rows are empty."""
+    lines = []
+    for row in block.rows:
+        why = next((failed[cell] for cell in row.cells if cell in failed), "")
+        if why:
+            lines.append(f"{row.title}: {why}  ")
+        elif not runs[row.title]:
+            lines.append(f"{row.title}: not measured.  ")
+    return [*lines, ""] if lines else []
+
+
+def _film(block: Block, folder: Path) -> list[str]:
+    """A link to the film of the task, where the repository has one."""
+    tasks = dict.fromkeys(cell.task for row in block.rows for cell in row.cells)
+    if Path.cwd() not in folder.resolve().parents:
+        return []
+    films = [film for task in tasks if (film := FILMS / f"{task}.webp").is_file()]
+    return (
+        [f"Films: {', '.join(f'[{each.stem}]({os.path.relpath(each, folder)})' for each in films)}", ""]
+        if films
+        else []
+    )
+
+
+def _printed(name: str) -> list[str]:
+    """What the paper prints, as it stands there."""
+    lines: list[str] = []
+    for place, rows in PAPER["tables"].get(name, {}).items():
+        width = max(map(len, rows.values()))
+        heads = [title(metric) for metric in PAPER["columns"][:width]] if width > 1 else ["printed"]
+        lines += [f"### The paper's own: {place}", "", "| method | " + " | ".join(heads) + " |"]
+        lines += ["|---|" + "---:|" * width]
+        for method, values in rows.items():
+            texts = ["-" if value is None else f"{value:.3f}" if width > 1 else f"{value:g}" for value in values]
+            lines.append(f"| {method} | " + " | ".join(texts) + " |")
+        lines += [""]
+    return lines
+
+
+def _table_name(name: str) -> str:
+    return name if name.startswith("Fig") else f"Table {name}"
+
+
+def _safe(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path.parent, lambda _: path.name, lambda file: file.write(text.encode()))

@@ -1,0 +1,119 @@
+"""Runs the cells that are missing, one after another; what is done stays done."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from magnet.report import measure
+from magnet.report.cells import Cell, Store
+
+GUESSED = {"train": 600.0, "measure": 45.0, "speed": 60.0, "long": 60.0}
+"""Seconds of a cell where none of its kind is done: two cores, small budget."""
+
+BAR = 24
+
+Fit = Callable[[list[str]], int]
+"""`magnet fit` with these arguments. -> its exit code"""
+
+
+@dataclass
+class Runner:
+    """What it takes to run cells.
+
+    Args:
+        store: of what is done.
+        fit: trains.
+        configs: folder of configurations to train.
+        shipped: checkpoint that speeds are compared with.
+        rounds: of a speed.
+        data: file of data options that trainings see in place of their own; None: their own.
+        say: is told each line of progress.
+    """
+
+    store: Store
+    fit: Fit
+    configs: Path
+    shipped: str
+    rounds: int = 3
+    data: Path | None = None
+    say: Callable[[str], None] = print
+    failed: dict[Cell, str] = field(default_factory=dict)
+
+    def missing(self, cells: Sequence[Cell]) -> list[Cell]:
+        """Those that are not done."""
+        return [cell for cell in cells if self.store.get(cell) is None]
+
+    def seconds(self, cell: Cell) -> float:
+        """How long a cell may take: as long as others of its kind did, here."""
+        took = self.store.of_kind(cell.kind)
+        return statistics.median(took) if took else GUESSED[cell.kind]
+
+    def run(self, cells: Sequence[Cell]) -> None:
+        """Run what is missing, in order. What cannot be done is in `failed` then, with the reason."""
+        todo = self.missing(cells)
+        for number, cell in enumerate(todo):
+            left = sum(self.seconds(each) for each in todo[number:])
+            full = BAR * number // max(len(todo), 1)
+            bar = "#" * full + "." * (BAR - full)
+            self.say(f"[{bar}] {number + 1}/{len(todo)} {cell.name}, about {clock(left)} left")
+            if cell.needs in self.failed:
+                self.failed[cell] = self.failed[cell.needs]
+                continue
+            try:
+                self._run(cell)
+            except (ValueError, OSError, ImportError, RuntimeError) as error:
+                self.failed[cell] = " ".join(str(error).split())
+                self.say(f"  not done: {self.failed[cell]}")
+
+    def _run(self, cell: Cell) -> None:
+        began = time.perf_counter()
+        if cell.kind == "train":
+            result = {"rows": {}, "checkpoint": str(self._train(cell).relative_to(self.store.folder))}
+        else:
+            result = dict(measure.run(cell, self._weights(cell), self.shipped, self.rounds))
+        self.store.put(cell, {**result, "seconds": round(time.perf_counter() - began, 1)})
+
+    def _weights(self, cell: Cell) -> str | None:
+        if cell.model is None:
+            return None
+        if cell.needs is None:
+            return cell.model.checkpoint
+        trained = self.store.get(cell.needs)
+        if trained is None:
+            raise ValueError(f"{cell.needs.name}: is not trained")
+        return str(self.store.folder / trained["checkpoint"])
+
+    def _train(self, cell: Cell) -> Path:
+        """Train, or go on from the last checkpoint. Returns the one at the end."""
+        assert cell.model is not None and cell.model.config is not None
+        config = self.configs / f"{cell.model.config}.yaml"
+        if not config.is_file():
+            raise FileNotFoundError(f"{config}: no such configuration to train")
+        folder = self.store.folder / "trainings" / cell.name
+        last = folder / "checkpoints" / "last.ckpt"
+        words = ["--config", str(config)]
+        words += ["--config", str(self.data)] if self.data is not None else []
+        words += ["--out", str(folder), "--seed_everything", str(cell.seed)]
+        words += ["--model.seed", str(cell.seed), "--data.seed", str(cell.seed)]
+        words += ["--trainer.max_steps", str(cell.model.steps)] if cell.model.steps is not None else []
+        if last.is_file():
+            words += ["--ckpt_path", str(last)]
+        elif folder.exists():
+            shutil.rmtree(folder)  # stopped before there was anything to go on from
+        code = self.fit(words)
+        if code == 130:
+            raise KeyboardInterrupt
+        if code or not last.is_file():
+            raise ValueError(f"{config.name}: the training ended with code {code}; its messages say why")
+        return last
+
+
+def clock(seconds: float) -> str:
+    """Seconds as h:mm."""
+    minutes = round(seconds / 60)
+    return f"{minutes // 60}:{minutes % 60:02} h" if minutes else "a minute"

@@ -1,0 +1,381 @@
+"""Which rows each table has, which cells they need, and what the paper claims of their order."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from magnet import checkpoints
+from magnet.files import file_hash
+from magnet.report.cells import Budget, Cell, Kind, Weights
+from magnet.report.folds import COPIED
+
+PAPER: dict[str, Any] = json.loads((Path(__file__).parent / "paper.json").read_text(encoding="utf-8"))
+COLUMNS: tuple[str, ...] = tuple(PAPER["columns"])
+FLOORS = ("RS", "NN", "zero velocity", "ridge", "training set", "ground truth")
+"""Rows of the cell without a model."""
+SHIPPED = "duet"
+OURS = "ours"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table.
+
+    Args:
+        title: as the page names it.
+        cells: one a seed.
+        inside: name of the row in these cells.
+    """
+
+    title: str
+    cells: tuple[Cell, ...]
+    inside: str = OURS
+
+
+@dataclass(frozen=True)
+class Claim:
+    """An ordering that the paper states.
+
+    Args:
+        metric: of which.
+        better: title of the row that is said to have the lower number; of DIV and frames a second the higher.
+        worse: title of the other.
+        place: where the paper says so.
+    """
+
+    metric: str
+    better: str
+    worse: str
+    place: str
+
+    @property
+    def lower(self) -> bool:
+        """Whether the better one is the lower."""
+        return self.metric not in ("div", "fps", "times_shipped")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A table's part on one task and data set.
+
+    Args:
+        title: what is measured.
+        rows: its lines.
+        claims: what the paper says of them.
+        columns: what is shown.
+    """
+
+    title: str
+    rows: tuple[Row, ...]
+    claims: tuple[Claim, ...] = ()
+    columns: tuple[str, ...] = COLUMNS
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What cells are made for.
+
+    Args:
+        budget: how much each costs.
+        data: name or file of test scenes of two people.
+        checkpoint: of our model.
+        only_shipped: leave out what has to be trained.
+    """
+
+    budget: Budget
+    data: str = "salsa"
+    checkpoint: str = SHIPPED
+    only_shipped: bool = False
+    configs: Path = Path("configs/report")
+
+    def row(self, title: str, task: str, config: str = "", kind: Kind = "measure", **options: Any) -> Row | None:
+        """A row of our checkpoint, or of a configuration that is trained; None where no training is wanted."""
+        if config and self.only_shipped:
+            return None
+        if config:
+            digest = digest_of_config(self.configs / f"{config}.yaml")
+            model = Weights(config=config, steps=self.budget.steps, digest=digest)
+        else:
+            model = Weights(self.checkpoint, digest=digest_of_weights(self.checkpoint))
+        return Row(title, tuple(self._cell(kind, seed, model, task, **options) for seed in range(self.budget.seeds)))
+
+    def floors(self, task: str, among: Iterable[str] = FLOORS, **options: Any) -> list[Row]:
+        """Rows without a model; all but RS are the same for every seed, so one is enough."""
+        cell = self._cell("measure", 0, None, task, **options)
+        return [Row(name, (cell,), name) for name in among]
+
+    def _cell(self, kind: Kind, seed: int, model: Weights | None, task: str, **options: Any) -> Cell:
+        task_options = tuple(sorted(options.pop("task_options", {}).items()))
+        sampler = tuple(sorted(options.pop("sampler", {}).items()))
+        cell = Cell(kind, seed, self.data, model, task, task_options, sampler)
+        if kind == "measure":
+            return replace(cell, scenes=self.budget.scenes, samples=self.budget.samples, **options)
+        if kind == "long":
+            return replace(cell, scenes=self.budget.scenes, samples=1, frames=self.budget.frames, **options)
+        return replace(cell, scenes=1, samples=1, **options)
+
+
+def digest_of_config(path: Path) -> str:
+    """Of a configuration and all that it extends; empty where there is none."""
+    if not path.is_file():
+        return ""
+    text = path.read_text(encoding="utf-8")
+    below = (yaml.safe_load(text) or {}).get("extends", [])
+    parts = [text, *(digest_of_config(path.parent / name) for name in ([below] if isinstance(below, str) else below))]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+@functools.cache
+def digest_of_weights(name: str) -> str:
+    """Of a checkpoint's file, or of the index of a shipped model's parts."""
+    path = checkpoints.resolve(name)
+    return file_hash(path / "config.json" if path.is_dir() else path)[:12]
+
+
+def _rows(*rows: Row | list[Row] | None) -> tuple[Row, ...]:
+    found: list[Row] = []
+    for row in rows:
+        found += row if isinstance(row, list) else [row] if row is not None else []
+    return tuple(found)
+
+
+def _claims(place: str, better: str, worse: str, metrics: str) -> list[Claim]:
+    return [Claim(metric, better, worse, place) for metric in metrics.split()]
+
+
+def table2(plan: ReportOptions) -> list[Block]:
+    task, past = "partner_inpainting", {"own_past": True}
+    claims = [
+        *_claims("Table 2, DD100", "Ours", "Duolando", "fd mi fs ip_ratio mpjpe mpjve"),
+        *_claims("Table 2, ReMoCap", "ReMoS", "Ours", "fd fs ip_ratio mpjpe"),
+        Claim("div", "Ours", "ReMoS", "Table 2, ReMoCap"),
+        *(claim for floor in ("RS", "NN") for claim in _claims("Table 2", "Ours", floor, "fd mi ip_ratio mpjpe mpjve")),
+        *(Claim("fs", floor, "Ours", "section 4.2, on foot sliding") for floor in ("RS", "NN")),
+    ]
+    rows = [
+        plan.floors(task, task_options=past),
+        plan.row("ReMoS", task, "peer_remos", task_options=past),
+        plan.row("Duolando", task, "peer_duolando", task_options=past),
+        plan.row("Ours", task, task_options=past),
+    ]
+    nothing = [
+        plan.floors(task, ("training set", "ground truth")),
+        plan.row("ReMoS", task, "peer_remos"),
+        plan.row("Duolando", task, "peer_duolando"),
+        plan.row("Ours", task),
+    ]
+    mine = tuple(
+        claim for claim in claims if "RS" not in (claim.better, claim.worse) and "NN" not in (claim.better, claim.worse)
+    )
+    return [
+        Block("partner inpainting, the past of both given", _rows(*rows), tuple(claims)),
+        Block("partner inpainting, nothing of the generated person given", _rows(*nothing), mine),
+    ]
+
+
+def table3(plan: ReportOptions) -> list[Block]:
+    partner = [
+        plan.floors("partner_prediction"),
+        plan.row("R2R", "partner_prediction", "peer_ready_to_react"),
+        plan.row("Ours", "partner_prediction"),
+    ]
+    turns = [
+        plan.row(f"Ours (TT: {100 * offset:.0f}%)", "agentic_async", task_options={"offset": offset})
+        for offset in (0.0, 0.5, 1.0)
+    ]
+    dyadic = [
+        plan.floors("joint_future"),
+        plan.row("R2R", "joint_future", "peer_ready_to_react"),
+        *turns,
+        plan.row("Ours", "joint_future"),
+    ]
+    zero, half, whole = (f"Ours (TT: {percent}%)" for percent in (0, 50, 100))
+    offsets = [
+        *_claims("Table 3: FD grows with the offset", zero, half, "fd div"),
+        *_claims("Table 3: FD grows with the offset", half, whole, "fd div"),
+        *_claims("section 4.2: larger offsets are smoother", half, zero, "fs mpjve"),
+        *_claims("section 4.2: larger offsets are smoother", whole, half, "fs mpjve"),
+    ]
+    return [
+        Block(
+            "partner prediction",
+            _rows(*partner),
+            (
+                *_claims("section 4.2, partner prediction", "Ours", "R2R", "fd mi ip_ratio mpjpe mpjve"),
+                *_claims("Table 3, left", "Ours", "NN", "fd mi ip_ratio mpjpe mpjve"),
+            ),
+        ),
+        Block(
+            "dyadic prediction",
+            _rows(*dyadic),
+            (
+                *_claims("section 4.2, dyadic prediction", "Ours", "R2R", "fd div ip_ratio"),
+                *_claims("section 4.2 says so, Table 3 prints the contrary", "Ours", "R2R", "fs"),
+                *_claims("Table 3, right", "Ours", "NN", "fd mi ip_ratio"),
+                *_claims("Table 3, right", "R2R", "Ours", "mpjpe mpjve"),
+                *offsets,
+            ),
+        ),
+    ]
+
+
+def table4(plan: ReportOptions) -> list[Block]:
+    blocks = []
+    for people in (2, 3, 4):
+        place = f"section 4.2, polyadic, Table 4, N = {people}"
+        data = f"synthetic{people}"
+        rows = _rows(plan.floors("joint_future", data=data), plan.row("Ours", "joint_future", data=data))
+        claims = [claim for floor in ("RS", "NN") for claim in _claims(place, "Ours", floor, "fd fs mpjpe")]
+        claims += [Claim("mpjve", "NN", "Ours", place), Claim("div", "RS", "Ours", place)]
+        blocks.append(Block(f"joint future of {people} people, synthetic scenes", rows, tuple(claims)))
+    return blocks
+
+
+def table_a4(plan: ReportOptions) -> list[Block]:
+    rows = [plan.row("two people, recorded", "joint_future")]
+    rows += [plan.row(f"{n} people", "joint_future", data=f"synthetic{n}") for n in (2, 3, 4)]
+    return [Block("joint future; one model for all", _rows(*rows))]
+
+
+def ablated(
+    title: str, rows: dict[str, str], claims: Sequence[tuple[str, str]], place: str, full: str = "Ours"
+) -> Callable[[ReportOptions], list[Block]]:
+    """A table of trainings that differ in one thing from base.yaml."""
+
+    def table(plan: ReportOptions) -> list[Block]:
+        floors = plan.floors("joint_future", ("NN", "training set", "ground truth"))
+        trained = [plan.row(name, "joint_future", config) for name, config in {**rows, full: "base"}.items()]
+        said = [claim for worse, metrics in claims for claim in _claims(place, full, worse, metrics)]
+        return [Block(title, _rows(floors, *trained), tuple(said))]
+
+    return table
+
+
+def table_a3(plan: ReportOptions) -> list[Block]:
+    tasks = {
+        "partner_inpainting": ("partner inpainting", {"Duolando": "peer_duolando", "ReMoS": "peer_remos"}),
+        "partner_prediction": ("partner prediction", {"R2R": "peer_ready_to_react"}),
+        "joint_future": ("dyadic prediction", {"R2R": "peer_ready_to_react"}),
+    }
+    blocks = []
+    for task, (title, peers) in tasks.items():
+        own = {"own_past": True} if task == "partner_inpainting" else {}
+        rows = [plan.row(name, task, config, "speed", task_options=own) for name, config in peers.items()]
+        rows.append(plan.row("Ours", task, "", "speed", task_options=own))
+        claims = tuple(Claim("times_shipped", "Ours", name, "Table A.3") for name in peers)
+        blocks.append(Block(f"{title}, frames a second of one scene", _rows(*rows), claims, ("fps", "times_shipped")))
+    return blocks
+
+
+def table_a6(plan: ReportOptions) -> list[Block]:
+    options = {"noise_sampling": "independent"}
+    blocks = []
+    for config, what in (("", "the shipped weights"), ("base", "base.yaml, trained here")):
+        rows = _rows(
+            plan.row("Independent (per-token)", "joint_future", config, sampler=options),
+            plan.row("Ours", "joint_future", config),
+        )
+        claims = (
+            *_claims("A.6.2, Table A.6", "Ours", "Independent (per-token)", "fd div mi ip_ratio"),
+            *_claims("A.6.2, Table A.6", "Independent (per-token)", "Ours", "fs mpjpe"),
+        )
+        if rows:
+            blocks.append(Block(f"dyadic prediction, {what}: noise of agents at a time step", rows, claims))
+    return blocks
+
+
+def figure7(plan: ReportOptions) -> list[Block]:
+    length = min(150, plan.budget.frames)
+    ends = tuple(f"fd@{end}" for end in range(length, plan.budget.frames + 1, length))
+    rows = _rows(
+        plan.row("R2R", "joint_future", "peer_ready_to_react", "long"),
+        plan.row("Ours", "joint_future", "", "long"),
+    )
+    claims = (Claim("fd", "Ours", "R2R", "section 4.2, ultra-long generation"),)
+    return [Block("FD of all that was generated so far, by frames", rows, claims, ends)]
+
+
+def leaks(plan: ReportOptions) -> list[Block]:
+    """What partner tasks gain by the reference's reading (docs/representation.md)."""
+    blocks = []
+    for task in ("partner_prediction", "motion_control", "partner_inpainting"):
+        rows = [
+            *plan.floors(task, ("training set", "ground truth")),
+            plan.row("ours: nothing unknown is read", task),
+            plan.row("pairs as clean as their token", task, leak="pairs"),
+            plan.row("trained and sampled so: base.yaml", task, "base"),
+            plan.row("trained and sampled so: pairs as clean as their token", task, "pairwise_token_noise"),
+        ]
+        listed = []
+        for row in _rows(*rows):
+            both = [row, replace(row, title=row.title + COPIED, inside=OURS + COPIED)]
+            listed += both if row.inside == OURS else [row]
+        blocks.append(Block(task, tuple(listed)))
+    return blocks
+
+
+_A5 = {"w/o Agent PE": "no_agent_encoding", "w/o Time PE": "no_time_encoding", "w/o Agent & Time PE": "no_encodings"}
+_OWN = {
+    "noise per timestep": "per_timestep_noise",
+    "noise per sequence": "per_sequence_noise",
+    "pairs as clean as their token": "pairwise_token_noise",
+    "skip": "skip",
+    "self-forcing": "self_forcing",
+    "causal": "causal",
+}
+TABLES: dict[str, Callable[[ReportOptions], list[Block]]] = {
+    "2": table2,
+    "3": table3,
+    "4": table4,
+    "5": ablated(
+        "dyadic prediction, ablations",
+        {"w/o VQ-VAE": "no_vqvae", "w/o T^self->partner": "no_pairwise"},
+        [("w/o VQ-VAE", "fd fs mi mpjpe mpjve"), ("w/o T^self->partner", "fd ip_ratio mpjpe")],
+        "section 4.2, Table 5",
+    ),
+    "A.3": table_a3,
+    "A.4": table_a4,
+    "A.5": ablated(
+        "dyadic prediction, encodings",
+        _A5,
+        [("w/o Agent PE", "fd fs ip_ratio"), ("w/o Time PE", "fd mpjve"), ("w/o Agent & Time PE", "fd fs mpjve")],
+        "A.6.1, Table A.5",
+    ),
+    "A.6": table_a6,
+    "Fig. 7": figure7,
+    "own": ablated("choices of ours", _OWN, [], ""),
+    "leak": leaks,
+}
+
+
+def named(table: str) -> str:
+    """A table by what a user may write: `3`, `a.3`, `A3`, `fig7`.
+
+    Raises:
+        ValueError: no such table.
+    """
+    plain = {name.lower().replace(".", "").replace(" ", ""): name for name in TABLES}
+    found = plain.get(table.lower().replace(".", "").replace(" ", "").removeprefix("table"))
+    if found is None:
+        raise ValueError(f"table: got {table!r}, expected one of {', '.join(TABLES)} or all")
+    return found
+
+
+def cells_of(blocks: Iterable[Block]) -> list[Cell]:
+    """Every cell once, each after the training that it needs."""
+    found: dict[Cell, None] = {}
+    for block in blocks:
+        for row in block.rows:
+            for cell in row.cells:
+                if cell.needs is not None:
+                    found.setdefault(cell.needs)
+                found.setdefault(cell)
+    return list(found)

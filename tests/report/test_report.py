@@ -1,0 +1,306 @@
+"""`magnet report`: numbers with their intervals, cells that are done once, and pages that a kill does not change."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from magnet import cli
+from magnet.body import load_body
+from magnet.evaluation.evaluator import Evaluator
+from magnet.metrics import FootSkating, FrechetDistance, MotionInteraction, PositionError
+from magnet.motion.tokens import TokenLayout
+from magnet.report import measure
+from magnet.report.cells import BUDGETS, Cell, Store, Weights
+from magnet.report.folds import Folds
+from magnet.report.page import page
+from magnet.report.run import Runner
+from magnet.report.statistics import difference, estimate, verdict
+from magnet.report.tables import PAPER, TABLES, ReportOptions, cells_of, named
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+from tests.evaluation.test_evaluator import FAST, data
+
+PLAN = ReportOptions(BUDGETS["tiny"], configs=Path(__file__).parents[2] / "configs" / "report")
+
+
+def run_of(values: list[float]) -> dict[str, Any]:
+    """A seed whose number is the mean over units of one value each."""
+    n = len(values)
+    without = {str(k): {"fd": (sum(values) - values[k]) / (n - 1)} for k in range(n)}
+    return {"value": {"fd": sum(values) / n}, "without": without}
+
+
+# -- statistics ------------------------------------------------------------------------------------
+
+
+def test_of_a_mean_the_interval_is_students() -> None:
+    """Of 1, 2, 4, 7, 11: mean 5, deviation 4.062, error 1.817; t of four degrees of freedom 2.776 (any table)."""
+    found = estimate([run_of([1.0, 2.0, 4.0, 7.0, 11.0])], "fd")
+    assert found is not None
+    assert found.interval == pytest.approx((5 - 2.776 * 1.8166, 5 + 2.776 * 1.8166), abs=1e-3)
+
+
+def test_seeds_that_differ_widen_the_interval() -> None:
+    same, apart = ([run_of([1.0 + s, 2.0 + s, 4.0 + s]) for s in (0.0, step, 2 * step)] for step in (0.0, 0.5))
+    narrow, wide = estimate(same, "fd"), estimate(apart, "fd")
+    assert narrow is not None and wide is not None
+    assert wide.error == pytest.approx(math.hypot(narrow.error, 0.5 / math.sqrt(3)))
+
+
+@pytest.mark.parametrize(
+    ("b", "said"),
+    [
+        ([1.1, 2.1, 4.2, 7.1], "holds"),
+        ([0.9, 1.9, 3.8, 6.9], "does not hold"),
+        ([3.0, 0.5, 6.0, 5.0], "cannot be told"),
+    ],
+)
+def test_an_ordering_is_judged_scene_by_scene(b: list[float], said: str) -> None:
+    """The numbers of scenes differ far more than the methods do: pairs tell what two intervals would hide."""
+    a = [run_of([1.0, 2.0, 4.0, 7.0])]
+    assert verdict(difference(a, [run_of(b)], "fd"), claimed_lower=True) == said
+    other = {"holds": "does not hold", "does not hold": "holds"}.get(said, said)
+    assert verdict(difference(a, [run_of(b)], "fd"), claimed_lower=False) == other
+
+
+def test_a_single_scene_tells_nothing() -> None:
+    one = [{"value": {"fd": 1.0}, "without": {}}]
+    found = estimate(one, "fd")
+    assert found is not None and found.interval is None
+    assert verdict(difference(one, one, "fd"), True) == "cannot be told"
+    assert estimate(one, "mi") is None
+
+
+def test_numbers_without_a_scene_are_those_of_the_other_scenes() -> None:
+    generator = torch.Generator().manual_seed(0)
+    future = load_body().joints(random_scene(3, 40, 2, generator))
+    joints = future + 0.1 * torch.randn(2, *future.shape, generator=generator)
+    present, agents = torch.ones(3, 2, dtype=torch.bool), torch.ones(1, 40, 2, dtype=torch.bool)
+    folds = Folds(30.0)
+    folds.update(joints[:, :2], future[:2], present[:2], agents=agents, units=torch.tensor([0, 1]))
+    folds.update(joints[:, 2:], future[2:], present[2:], agents=agents, units=torch.tensor([0]))
+    value, without = folds.rows()
+    for kept, row in (([0, 1, 2], value), ([1], without[0]), ([0, 2], without[1])):
+        for metric in (FrechetDistance(), MotionInteraction(), FootSkating(), PositionError()):
+            metric.update(joints[:, kept], future[kept], present[kept], agents=agents)
+            for name, number in metric.compute().items():
+                if name in row:
+                    assert row[name] == pytest.approx(float(number), rel=1e-9), (kept, name)
+    assert {"fd", "mi", "fs", "mpjpe", "div", "ip_ratio", "fd_pair"} <= value.keys()
+
+
+# -- tables ----------------------------------------------------------------------------------------
+
+
+def test_printed_numbers_are_those_that_the_text_quotes() -> None:
+    """Section 4.2 and A.6 quote ratios of them; and the paper contradicts itself as issue 21 says."""
+    tables = {
+        name: {row: v for rows in each.values() for row, v in rows.items()} for name, each in PAPER["tables"].items()
+    }
+    assert 1 - tables["Fig. 7"]["Ours"][0] / tables["Fig. 7"]["R2R"][0] == pytest.approx(0.89, abs=0.005)
+    fd, mpjve = (PAPER["columns"].index(name) for name in ("fd", "mpjve"))
+    full = tables["5"]["Ours"][fd]
+    assert tables["5"]["w/o VQ-VAE"][fd] / full == pytest.approx(86, abs=0.5)
+    assert tables["A.5"]["w/o Agent PE"][fd] / full == pytest.approx(11, abs=0.5)
+    assert tables["A.5"]["w/o Time PE"][fd] / full == pytest.approx(39, abs=0.5)
+    assert (tables["3"]["Ours"][fd], full) == (0.118, 0.052)
+    assert (tables["5"]["Ours"][mpjve], tables["A.6"]["Ours"][mpjve]) == (0.034, 0.006)
+    for name, rows in tables.items():
+        assert {len(row) for row in rows.values()} == {1 if name in ("A.3", "Fig. 7") else 7}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_claims_what_it_has_rows_for(name: str) -> None:
+    blocks = TABLES[name](PLAN)
+    assert blocks
+    for block in blocks:
+        titles = [row.title for row in block.rows]
+        assert len(titles) == len(set(titles))
+        assert {title for claim in block.claims for title in (claim.better, claim.worse)} <= set(titles)
+    cells = cells_of(blocks)
+    assert len({cell.name for cell in cells}) == len(cells)
+    for number, cell in enumerate(cells):
+        assert cell.needs is None or cell.needs in cells[:number]
+        if cell.kind == "train":
+            assert cell.model is not None and cell.model.digest, "no such configuration"
+    shipped = cells_of(TABLES[name](replace(PLAN, only_shipped=True)))
+    assert all(cell.kind != "train" and cell.needs is None for cell in shipped)
+
+
+@pytest.mark.parametrize(("said", "meant"), [("3", "3"), ("a3", "A.3"), ("Fig7", "Fig. 7"), ("table5", "5")])
+def test_tables_are_known_by_what_one_writes(said: str, meant: str) -> None:
+    assert named(said) == meant
+
+
+@pytest.mark.parametrize(
+    ("task", "leaks"), [("partner_prediction", False), ("partner_inpainting", True), ("motion_control", True)]
+)
+def test_pairs_as_clean_as_their_token_tell_of_who_is_unknown_where_a_partner_is_given(task: str, leaks: bool) -> None:
+    """Where all that the task does not give is noise, the samples are others: what the table calls a leak."""
+    made = []
+    for noisy in (False, True):
+        model = tiny_denoiser(max_agents=2)
+        layout = TokenLayout(model.layout.latent, 2, True, "token")
+        model.layout = model.transformer.layout = layout
+        datamodule = data(max_agents=2)
+        evaluation = Evaluator(model, registry.get(task)(), FAST, 1, baselines=False)
+        evaluation.start(datamodule)
+        batch = next(iter(datamodule.test_dataloader()))
+        if noisy:
+            plan = evaluation.schedule(evaluation.context, evaluation.horizon, 2)
+            known = plan.known.repeat_interleave(4, dim=0)[: batch.frames, :, None, None]
+            noise = random_scene(batch.scenes, batch.frames, 2, torch.Generator().manual_seed(5))
+            batch = batch.replace(
+                body_rot=torch.where(known[..., None], batch.body_rot, noise.body_rot),
+                T_world_root=torch.where(known, batch.T_world_root, noise.T_world_root),
+            )
+        made.append(evaluation.sample(batch, 1, evaluation.generators_of(batch.scenes)).T_world_root)
+    assert torch.equal(*made) != leaks
+
+
+# -- cells that are done once ----------------------------------------------------------------------
+
+CELL = Cell("measure", 0, "salsa", Weights("duet"), "joint_future", scenes=2, samples=2)
+
+
+def test_a_cell_is_whole_or_not_there(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with pytest.raises(ValueError):
+        store.put(CELL, {"rows": {"ours": math.nan}})
+    assert not list(tmp_path.rglob("*.json"))
+    store.put(CELL, {"rows": {"ours": 1.0}, "seconds": 2.0})
+    assert [path.name for path in (tmp_path / "cells").iterdir()] == [f"{CELL.name}.json"]
+    again = Store(tmp_path)
+    assert again.get(CELL) is not None
+    assert again.get(CELL) == store.get(CELL)
+    assert again.get(replace(CELL, samples=3)) is None
+    assert again.of_kind("measure") == [2.0]
+    store.path(CELL).write_text('{"settings": ')
+    assert Store(tmp_path).get(CELL) is None
+
+
+def made_up(cell: Cell, checkpoint: str | None, *_: Any) -> dict[str, Any]:
+    """Numbers that only a cell's name and the weights it is given decide."""
+    seed = sum(map(ord, f"{cell.name}{Path(checkpoint or '').name}"))
+    values = torch.rand(4, generator=torch.Generator().manual_seed(seed)).tolist()
+    rows = (
+        "ours",
+        "ours, the given scored too",
+        *("RS", "NN", "zero velocity", "ridge"),
+        "training set",
+        "ground truth",
+    )
+    return {"rows": {row: run_of(values) for row in rows}}
+
+
+class Killed:
+    """Stands for the process: ends it, as ctrl-c or a kill does, the n-th time that it works."""
+
+    def __init__(self, at: set[int]) -> None:
+        self.at, self.done = at, 0
+        self.words: list[list[str]] = []
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.done += 1
+        if self.done in self.at:
+            raise KeyboardInterrupt
+        return made_up(*arguments)
+
+    def fit(self, words: list[str]) -> int:
+        """A training that is stopped after its first checkpoint, if it is to be."""
+        self.words.append(words)
+        last = Path(words[words.index("--out") + 1]) / "checkpoints" / "last.ckpt"
+        last.parent.mkdir(parents=True, exist_ok=True)
+        last.write_text("some weights")
+        self.done += 1
+        return 130 if self.done in self.at else 0
+
+
+@pytest.mark.parametrize("name", ["5", "3"])
+def test_a_report_that_was_killed_twice_is_the_same(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = {name: TABLES[name](PLAN)}
+    pages, trainings = [], []
+    for number, at in enumerate([set(), {2, 8}]):
+        process = Killed(at)
+        monkeypatch.setattr(measure, "run", process)
+        folder = tmp_path / str(number)
+        for _ in range(3):
+            runner = Runner(Store(folder), process.fit, PLAN.configs, "duet", say=lambda _: None)
+            try:
+                runner.run(cells_of(blocks[name]))
+                break
+            except KeyboardInterrupt:
+                continue
+        assert not runner.failed and not runner.missing(cells_of(blocks[name]))
+        pages.append(page(blocks, Store(folder), {}, {"budget": "tiny"}).read_text())
+        trainings.append([words for words in process.words if "--ckpt_path" in words])
+    assert pages[0] == pages[1]
+    assert not trainings[0]
+    assert len(trainings[1]) == 1  # the second job is a training, which goes on from its last checkpoint
+    assert "| FD: Ours < " in pages[0]
+
+
+def test_what_cannot_be_done_is_said_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(cell: Cell, *arguments: Any) -> dict[str, Any]:
+        if cell.task == "partner_prediction":
+            raise ValueError("this peer fills in partners alone")
+        return made_up(cell, *arguments)
+
+    monkeypatch.setattr(measure, "run", run)
+    blocks = {"3": TABLES["3"](replace(PLAN, only_shipped=True))}
+    store = Store(tmp_path)
+    runner = Runner(store, lambda _: 1, PLAN.configs, "duet", say=lambda _: None)
+    runner.run(cells_of(blocks["3"]))
+    text = page(blocks, store, runner.failed, {}).read_text()
+    assert "Ours: this peer fills in partners alone" in text
+    assert "| FD: Ours < R2R | section 4.2, partner prediction | not measured | - |" in text
+    content = json.loads((tmp_path / "report.json").read_text())
+    assert content["tables"]["3"][1]["rows"]["Ours"]["fd"]["low"] is not None
+    assert (tmp_path / "pictures" / "3-1.svg").read_text().startswith("<svg ")
+
+
+def test_a_training_that_fails_is_told_at_every_cell_that_needs_it(tmp_path: Path) -> None:
+    blocks = TABLES["5"](PLAN)
+    trained = [cell for cell in cells_of(blocks) if cell.model is not None]
+    runner = Runner(Store(tmp_path), lambda _: 2, PLAN.configs, "duet", say=lambda _: None)
+    runner.run(trained)
+    assert set(runner.failed) == set(trained)
+    assert all("the training ended with code 2" in said for said in runner.failed.values())
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+def test_a_dry_run_lists_cells_and_runs_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measure, "run", Killed({1}))
+    out = str(tmp_path / "out")
+    assert cli.main(["report", "3", "--shipped", "--budget", "tiny", "--dry_run", "--out", out]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("12 cells, 0 done; the other 12 may take")
+    assert not Path(out).exists()
+    assert cli.main(["report", "9"]) == 2
+    assert "table: got '9', expected one of 2, 3, 4" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_small_report_is_made_from_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The shipped weights on two made-up scenes; run again there is nothing left to do."""
+    words = ["report", "4", "--shipped", "--budget", "tiny", "--only", "synthetic2", "--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    first = (tmp_path / "report.md").read_text()
+    assert "### joint future of 2 people, synthetic scenes" in first
+    rows = json.loads((tmp_path / "report.json").read_text())["tables"]["4"][0]["rows"]
+    assert rows["Ours"]["mpjpe"]["value"] > 0
+    assert rows["ground truth"].keys() == {"fs", "ip_ratio"}
+    capsys.readouterr()
+    assert cli.main(words) == 0
+    assert "/" not in capsys.readouterr().out.partition("written")[0]
