@@ -157,11 +157,12 @@ class RidgeRegression:
     def _error(self, sums: Sums, left_out: Tensor, people: int, frames: Tensor) -> Tensor:
         """Summed joint error of windows left out, by penalty and future frame. -> (penalties, F)"""
         spectrum = sums.spectrum()
-        weights = [spectrum.weights(torch.tensor(penalty, dtype=torch.float64)) for penalty in PENALTIES]
+        weights = [spectrum.own_weights(torch.tensor(penalty, dtype=torch.float64)) for penalty in PENALTIES]
         error = torch.zeros(len(weights), len(frames), dtype=torch.float64, device=left_out.device)
         for examples, truth in self._examples(left_out, people, frames):
+            features = (examples.features - sums.mean_x) @ spectrum.vectors
             for k, weight in enumerate(weights):
-                made = sums.mean_y + (examples.features - sums.mean_x) @ weight
+                made = sums.mean_y + features @ weight
                 error[k] += (made.view_as(truth) - truth).norm(dim=-1).sum(dim=(0, 2))
         return error
 
@@ -246,4 +247,8 @@ class Spectrum(NamedTuple):
 
     def weights(self, penalty: Tensor) -> Tensor:
         """With a penalty for all targets or one for each, as a multiple of `scale`. () or (E,) -> (D, E)"""
-        return self.vectors @ (self.xy / (self.values[:, None] + self.scale * penalty.to(self.values)))
+        return self.vectors @ self.own_weights(penalty)
+
+    def own_weights(self, penalty: Tensor) -> Tensor:
+        """The same for features in this basis. () or (E,) -> (D, E)"""
+        return self.xy / (self.values[:, None] + self.scale * penalty.to(self.values))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from magnet.baselines.retrieval import assignments
 from magnet.body import Body
 from magnet.body.mirror import mirror_scene
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
@@ -27,6 +28,7 @@ class Windows:
     fps: float
     recordings: tuple[str, ...]  # which recording each window is of
     mirrored: Tensor  # (M,) bool, left and right exchanged
+    _ordered: dict[tuple[int, int], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @staticmethod
     def of(scenes: Iterable[Scene], body: Body, context: int, mirror: bool = False) -> Windows:
@@ -96,6 +98,18 @@ class Windows:
             joints, T_world_can = joints[:, order], T_world_can[:, order]
         yaw, ground = to_planar(T_world_can)
         return moved_points(inverse(from_planar(yaw[:, 0], ground.mean(dim=1))), joints)
+
+    def futures_in_every_order(self, people: int, every: int) -> Tensor:
+        """Futures of windows with so many people in the world that scenes share, once for each order of the people.
+
+        Every so many frames. Worked out once and kept. -> (M * orders, F, n, 22, 3)
+        """
+        if (people, every) not in self._ordered:
+            chosen = self.of_people(people)
+            frames = torch.arange(self.context, self.joints.shape[1], every, device=chosen.device)
+            placed = [self.shared(chosen, people, frames, order) for order in assignments(people, chosen.device)]
+            self._ordered[people, every] = torch.cat(placed).transpose(1, 2)
+        return self._ordered[people, every]
 
 
 def recording(label: str) -> str:

@@ -56,16 +56,15 @@ class Futures:
             raise ValueError(f"units: got {tuple(units.shape)} {units.dtype}, expected {(B,)} int")
         lengths = (generated.shape[2], truth.shape[1])
         frames = min(lengths)
-        there = present[:, None, :, None, None]
         cut = Futures(
-            generated=torch.where(there, generated[:, :, :frames].double(), 0.0),
-            truth=torch.where(there, truth[:, :frames].double(), 0.0),
+            generated=_of_those_present(generated[:, :, :frames], present),
+            truth=_of_those_present(truth[:, :frames], present),
             present=present,
             scored=present[:, None] & _by_frame(agents, B, lengths, P).to(present.device),
             units=units,
         )
-        _demand_finite("generated", cut.generated.isfinite().all(dim=0))
-        _demand_finite("truth", cut.truth.isfinite())
+        _demand_finite("generated", cut.generated)
+        _demand_finite("truth", cut.truth[None])
         return cut
 
     @property
@@ -128,8 +127,18 @@ def _by_frame(agents: Tensor | None, B: int, lengths: tuple[int, int], P: int) -
     return agents[:, :frames]
 
 
-def _demand_finite(name: str, finite: Tensor) -> None:
-    """(B, T, P, J, 3) bool"""
+def _of_those_present(joints: Tensor, present: Tensor) -> Tensor:
+    """In float64, absent agents zeroed. joints (..., B, T, P, J, 3), present (B, P)"""
+    if bool(present.all()):
+        return joints.double()
+    return torch.where(present[:, None, :, None, None], joints.double(), 0.0)
+
+
+def _demand_finite(name: str, joints: Tensor) -> None:
+    """(S, B, T, P, J, 3) float64"""
+    if bool(joints.sum().isfinite()):  # one number tells of all, without a mask as large as the joints
+        return
+    finite = joints.isfinite().all(dim=0)
     if not bool(finite.all()):
         scene, frame, agent, joint, _ = (~finite).nonzero()[0].tolist()
         raise ValueError(

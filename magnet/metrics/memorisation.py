@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.baselines.retrieval import assignments
 from magnet.baselines.windows import Windows
 from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
@@ -27,7 +26,7 @@ class NearestTraining(ClipMeans):
     A distance is the mean over scored frames, agents and 21 joints, with both futures in the same world: origin
     between the people and facing as the first of them at the last context frame. What is measured is expected there
     (`magnet.evaluation.evaluator.shared_world`); windows are put there once for each order of their people
-    (`assignments`).
+    (`magnet.baselines.retrieval.assignments`).
     Only windows with as many people count; a scene that has none is not measured.
 
     Samples much nearer than recordings that training has not seen (the ground truth's row) repeat the training set.
@@ -57,7 +56,6 @@ class NearestTraining(ClipMeans):
     def __init__(self, windows: Windows, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.windows = windows
-        self._placed: dict[int, Tensor] = {}
 
     def measure(self, futures: Futures) -> Sequence[tuple[Tensor, Tensor]]:
         scored = futures.scored[:, ::EVERY]
@@ -68,20 +66,10 @@ class NearestTraining(ClipMeans):
             if not bool(scored[b].any()) or not len(self.windows.of_people(people)):
                 continue
             made = without_pelvis(futures.generated[:, b, ::EVERY, there])
-            nearest = nearest_distance(made, self._windows(people), scored[b][:, there])
+            windows = without_pelvis(self.windows.futures_in_every_order(people, EVERY))
+            nearest = nearest_distance(made, windows, scored[b][:, there])
             total[b], count[b] = nearest.double().sum(), len(nearest)
         return [(total, count)]
-
-    def _windows(self, people: int) -> Tensor:
-        """Futures of windows with so many people in the world that all share, in every order. (M, T, n, 21, 3)"""
-        if people not in self._placed:
-            windows = self.windows
-            chosen = windows.of_people(people)
-            frames = torch.arange(windows.context, windows.joints.shape[1], EVERY, device=chosen.device)
-            orders = assignments(people, chosen.device)
-            placed = [windows.shared(chosen, people, frames, order) for order in orders]
-            self._placed[people] = without_pelvis(torch.cat(placed)).transpose(1, 2)
-        return self._placed[people]
 
 
 def nearest_distance(futures: Tensor, windows: Tensor, scored: Tensor) -> Tensor:
@@ -91,9 +79,14 @@ def nearest_distance(futures: Tensor, windows: Tensor, scored: Tensor) -> Tensor
     """
     frames = min(futures.shape[1], windows.shape[1])
     scored = scored[:frames]
-    made = futures[:, :frames][:, scored].to(windows)  # (S, k, J, 3)
-    least = made.new_full((len(made),), torch.inf)
+    made = futures[:, :frames][:, scored].to(windows).movedim(-1, 0).contiguous()  # (3, S, k, J)
+    least = made.new_full((made.shape[1],), torch.inf)
     for part in windows[:, :frames].split(CHUNK):
-        away = (made[:, None] - part[:, scored]).norm(dim=-1).mean(dim=(-1, -2))  # (S, m)
+        # x, y and z apart: sums along an axis of three are slow.
+        seen = part[:, scored].movedim(-1, 0).contiguous()  # (3, m, k, J)
+        squares = (made[0][:, None] - seen[0]).square_()
+        for axis in (1, 2):
+            squares += (made[axis][:, None] - seen[axis]).square_()
+        away = squares.sqrt_().mean(dim=(-1, -2))  # (S, m)
         least = torch.minimum(least, away.nan_to_num(torch.inf).amin(dim=1))
     return least
