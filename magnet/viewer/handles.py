@@ -29,6 +29,7 @@ class App(Protocol):
     body: Body
     clock: Clock
     worker: Worker
+    shown: int
 
     def steered(self, agent: int) -> None: ...
 
@@ -264,6 +265,7 @@ class KeyframePanel:
         """Hand the keyframes to the engine, and say how fast people must go to reach them."""
         with self.live.lock:
             self.live.keys = [row.key for row in self.rows]
+            self.app.shown = -1  # the timeline has them too, also while the clock stands
             try:
                 start, scene = self.live.between_from(), self.live.scene
                 needed = speeds(self.live.keys, scene, start - 1)

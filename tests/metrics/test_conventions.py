@@ -44,12 +44,17 @@ def test_everybody_is_present_where_nothing_is_said(kind: type[Metric]) -> None:
     assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
 
 
-def test_what_was_measured_can_be_plotted() -> None:
+@pytest.mark.parametrize("kind", MADE)
+def test_what_was_measured_can_be_plotted(kind: type[Metric]) -> None:
     pytest.importorskip("matplotlib").use("Agg")
-    truth = standing_people(40, 2)
-    metric = metrics.PositionError()
+    from matplotlib import pyplot
+
+    truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None]
+    metric = kind()
     metric.update(truth[None] + 0.1, truth)
+    found = metric.compute()
     figure, axis = metric.plot()
-    assert figure is not None and {"mpjpe", "mpjpe_best"} <= set(axis.get_legend_handles_labels()[1])
-    later = {name: value / 2 for name, value in metric.compute().items()}
-    assert metric.plot([metric.compute(), later])[0] is not None
+    assert figure is not None and set(found) <= set(axis.get_legend_handles_labels()[1])
+    later = {name: value / 2 for name, value in found.items()}
+    assert metric.plot([found, later])[0] is not None
+    pyplot.close("all")

@@ -31,6 +31,8 @@ def app(body: Body, handshake: Scene):
 def test_a_limb_of_a_keyframe_isdragged_by_its_arrows_and_what_is_generated_has_it_there(app, body: Body) -> None:
     live, limb = app.live, app.keys.limb
     app.keys.add(keyframe(live.scene, 0, 48, held=True))
+    app.draw()
+    assert app.timeline.picture.content.count("<path") == 1  # its diamond, at once
     betas = live.scene.betas[0, 0]
     assert limb.handle is None
     limb.limb.value = "left hand"
