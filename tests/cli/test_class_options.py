@@ -8,6 +8,7 @@ import inspect
 import itertools
 import json
 import operator
+import pkgutil
 import re
 import shlex
 from collections.abc import Iterable, Sequence
@@ -196,7 +197,9 @@ def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsy
     said = told(config)
     got = printed(capsys, "fit", "--config", str(config))
     fields = said["model"].get("init_args", {})
-    model = merged(own(MODELS[said["model"]["class_path"]]), merged(taken_over(fields.get("start_from")), fields))
+    name = said["model"]["class_path"]
+    kind = MODELS[name] if name in MODELS else pkgutil.resolve_name(name)  # peers have no short names
+    model = merged(own(kind), merged(taken_over(fields.get("start_from")), fields))
     assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
 
     def resolved(spec: dict[str, Any]) -> dict[str, Any]:

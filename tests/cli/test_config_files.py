@@ -85,7 +85,7 @@ def test_what_is_printed_runs_again(toy: Path, capsys: pytest.CaptureFixture[str
 def test_a_preset_reaches_the_evaluator(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli.main(["fit", "--model", "ToyModel", "--trainer.max_epochs", "1", "--out", "trained", *CPU]) == 0
     words = ("--ckpt_path", "trained/checkpoints/last.ckpt", "--sampler", "paper", "--sampler.steps", "3")
-    monkeypatch.setattr(train, "Denoiser", ToyModel)
+    monkeypatch.setattr(train, "TokenModel", ToyModel)
     monkeypatch.setattr(train, "Evaluator", ToyEvaluator)
     assert cli.main(["test", *words, *CPU]) == 0
     assert ToyModel.seen["evaluator"].sampler == dataclasses.replace(PAPER, steps=3)

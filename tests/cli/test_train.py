@@ -40,7 +40,7 @@ def trained(toy: Path) -> Path:
 @pytest.fixture
 def sampling(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A trained toy that counts as a denoiser."""
-    monkeypatch.setattr(train, "Denoiser", ToyModel)
+    monkeypatch.setattr(train, "TokenModel", ToyModel)
     monkeypatch.setattr(train, "Evaluator", ToyEvaluator)
     return trained
 
