@@ -113,6 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"{stage}: has its {done} steps already")
             continue
         run(fit_command(stage, out, steps[stage], given.fit), f"{stage}, step {done} to {steps[stage]}")
+        if steps_done(out / stage) < steps[stage]:  # stopped by a signal, it ends without an error
+            raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
     release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(last_checkpoint(out / "denoiser"))]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(given.weights or out / "weights")]

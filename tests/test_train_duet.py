@@ -61,7 +61,18 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
 def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Path, monkeypatch, capsys) -> None:
     save(tmp_path / "tokenizer", 3)
     ran: list[list[str]] = []
-    monkeypatch.setattr(recipe, "run", lambda command, what: ran.append(command))
+
+    def whole(command: list[str], what: str) -> None:
+        ran.append(command)
+        if "--trainer.max_steps" in command:
+            save(Path(command[command.index("--out") + 1]), int(command[command.index("--trainer.max_steps") + 1]))
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr(recipe, "run", lambda command, what: None)
+        with pytest.raises(SystemExit, match="denoiser was stopped"):
+            recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "decoder=5"])
+    monkeypatch.setattr(recipe, "run", whole)
+    capsys.readouterr()
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "decoder=5"])
     configs = [command[command.index("--config") + 1] for command in ran[:-1]]
     assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_decoder"]
