@@ -30,7 +30,6 @@ from torch import Tensor, nn
 
 from magnet.denoiser.transformer import Transformer, block_causal, rotate
 from magnet.files import write_whole
-from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import FPS
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
@@ -148,11 +147,13 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
     """
     path = Path(path).with_suffix(".onnx")
     layout, N, P = denoiser.layout, denoiser.window, denoiser.layout.agents
-    B, T = 2, TOKEN_FRAMES * N
-    tokens, betas = torch.randn(B, N, P, layout.width), torch.zeros(B, P, 10)
-    levels, present = torch.randint(0, LEVELS + 1, (B, N, P)), torch.ones(B, P, dtype=torch.bool)
-    deltas, pairs = torch.randn(B, T, P, 9), torch.randn(B, T, P, layout.slots, 9)
-    pose = torch.randn(B, T, P, POSE_FEATURES)
+    generator = torch.Generator().manual_seed(0)
+    noisy = torch.randn(2, N, P, layout.width, generator=generator)
+    levels = torch.randint(0, LEVELS + 1, (2, N, P), generator=generator)
+    present, betas = torch.ones(2, P, dtype=torch.bool), torch.zeros(2, P, 10)
+    with torch.no_grad():  # the tokenizer is tried on what the model makes: random poses magnify rounding
+        tokens = denoiser.eval().predict_tokens(noisy, levels, present)
+        pose, deltas, pairs = PortableDecoder(denoiser)(tokens, betas)
     metadata = {
         "alpha_bar": json.dumps([round(share, 9) for share in alpha_bar(torch.arange(LEVELS + 1)).tolist()]),
         "groups": json.dumps(layout.groups().tolist()),
@@ -162,7 +163,7 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
     }
     of_poses = {"pose": pose, "betas": betas, "deltas": deltas, "pairs": pairs}
     parts: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
-        "": (PortableDenoiser(denoiser), {"noisy": tokens, "levels": levels, "present": present}, ["clean"]),
+        "": (PortableDenoiser(denoiser), {"noisy": noisy, "levels": levels, "present": present}, ["clean"]),
         "_decoder": (PortableDecoder(denoiser), {"tokens": tokens, "betas": betas}, ["pose", "deltas", "pairs"]),
         "_encoder": (PortableEncoder(denoiser), of_poses, ["tokens"]),
     }
