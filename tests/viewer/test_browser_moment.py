@@ -34,7 +34,7 @@ def test_bodies_colours_and_marks_are_of_one_frame_while_it_plays(page, handshak
             image = shot(page, f"moment_{number}")[STAGE]
             red = (image[..., 0] > 150) & (image[..., 1] < 90) & (image[..., 2] < 90)
             left = np.arange(image.shape[1]) < 200
-            # Marks are some 10 pixels where the camera still was far away when it was stopped, some 60 where it was near.
+            # Marks are some 10 pixels where the camera was far away when it was stopped, some 60 where it was near.
             apart, marked = bool((blue(image) & left).sum() > 100), bool(red.sum() > 5)
             found.add((apart, marked))
     assert found == {(True, False), (False, True)}
