@@ -300,14 +300,14 @@ class Model:
         if not targets:
             raise ValueError("agent: got none; name who is to be filled in")
         scene = self._with_room(scene, max(targets) + 1)
-        rows = list(targets)
+        slots = list(targets)
         present, betas = scene.present.clone(), torch.where(scene.present[..., None], scene.betas, 0.0)
         if shape is not None:
             numbers = torch.as_tensor(shape).to(betas)
             if numbers.shape != betas.shape[-1:]:
                 raise ValueError(f"shape: got {tuple(numbers.shape)}, expected ({betas.shape[-1]},) shape numbers")
-            betas[:, rows] = numbers
-        present[:, rows] = True
+            betas[:, slots] = numbers
+        present[:, slots] = True
         scene = scene.replace(present=present, betas=betas)
         return self.predict(scene, "partner_inpainting", context=0, seed=seed, samples=samples, target=targets)
 

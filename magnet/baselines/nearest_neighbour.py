@@ -30,8 +30,8 @@ class ContextFeatures(NamedTuple):
 
     def in_slots(self, slots: Tensor) -> ContextFeatures:
         """Of some agents only. slots: (M, n) int"""
-        rows = torch.arange(len(slots), device=slots.device)[:, None]
-        return ContextFeatures(self.own[rows, slots], self.pair[rows[..., None], slots[:, :, None], slots[:, None, :]])
+        each = torch.arange(len(slots), device=slots.device)[:, None]
+        return ContextFeatures(self.own[each, slots], self.pair[each[..., None], slots[:, :, None], slots[:, None, :]])
 
 
 class NearestNeighbour(Retrieval):
@@ -93,11 +93,11 @@ class NearestNeighbour(Retrieval):
                 pairs = pair[:, everyone[:, None], everyone, :, order[:, None], order].sum(dim=(0, 1))
                 cost[..., o] = own[:, everyone, :, order].sum(dim=0) + pairs / max(n - 1, 1)
             least, at = cost.flatten(1).min(dim=1)
-            row, order = at // len(orders), orders[at % len(orders)]
+            chosen, order = at // len(orders), orders[at % len(orders)]
             nearer = least < best
             best = torch.where(nearer, least, best)
-            stretch = torch.where(nearer, part[row], stretch)
-            slots = torch.where(nearer[:, None], seats[row].gather(1, order), slots)
+            stretch = torch.where(nearer, part[chosen], stretch)
+            slots = torch.where(nearer[:, None], seats[chosen].gather(1, order), slots)
         return stretch, slots
 
     def _prepare(self, frames: int) -> None:

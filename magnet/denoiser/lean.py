@@ -2,7 +2,7 @@
 
 `Transformer` is written to be read and trained. Here its weights are packed once for the processor's matrix products
 (oneDNN), tables take the place of sines, only people who are there are computed, and in the last block only tokens that
-are asked for. A row of a packed product does not depend on how many rows there are, so neither do samples.
+are asked for. One token's part of a packed product does not depend on how many tokens there are, so neither do samples.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class LeanBlock:
         pairs = torch.arange(self.each).view(2, half).T.flatten()
         order = (torch.arange(self.heads)[:, None] * self.each + pairs).flatten() if block.rope_heads else None
         keep = torch.arange(width) if order is None else order
-        rows = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
-        weight, bias = weight[rows], bias[rows]
+        channels = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
+        weight, bias = weight[channels], bias[channels]
         self.qkv = linear_of(weight, bias, dtype)
         self.query = linear_of(weight[:width], bias[:width], dtype)
         self.key_value = linear_of(weight[width:], bias[width:], dtype)
@@ -54,7 +54,7 @@ class LeanBlock:
         x: Tensor,
         turn: Tensor | None,
         sees: Tensor | None,
-        rows: Tensor | None = None,
+        asked: Tensor | None = None,
         before: tuple[Tensor, Tensor] | None = None,
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """One block, and the keys and values of its tokens.
@@ -63,23 +63,23 @@ class LeanBlock:
             x: (B, L, d).
             turn: (L, D / 2) complex, or None.
             sees: (L, M + L) bool, or None.
-            rows: (r,) int, which tokens are wanted; None: all.
+            asked: (r,) int, which tokens are wanted; None: all.
             before: keys and values (B, M, heads, D) of tokens in front of these.
 
         Returns:
             (B, L or r, d), and keys and values (B, M + L, heads, D).
         """
-        if rows is None:
+        if asked is None:
             made = self.qkv(x).unflatten(-1, (3, self.heads, self.each))
             both, value = made[:, :, :2], made[:, :, 2]
             query, key = (both if turn is None else turned(both, turn[:, None, None])).unbind(2)
         else:
             key, value = self.key_value(x).unflatten(-1, (2, self.heads, self.each)).unbind(2)
-            x = x[:, rows]
+            x = x[:, asked]
             query = self.query(x).unflatten(-1, (self.heads, self.each))
-            sees = None if sees is None else sees[rows]
+            sees = None if sees is None else sees[asked]
             if turn is not None:
-                query, key = turned(query, turn[rows][:, None]), turned(key, turn[:, None])
+                query, key = turned(query, turn[asked][:, None]), turned(key, turn[:, None])
         if before is not None:
             key, value = torch.cat([before[0], key], dim=1), torch.cat([before[1], value], dim=1)
         q, k, v = (each.transpose(1, 2) for each in (query, key, value))
@@ -156,12 +156,12 @@ class LeanTransformer:
         extra = self._extra(cond, B, N)
         if extra is not None and extra.shape[1] > 1:
             extra = extra[:, begins:ends]
-        for group, (rows, slots) in enumerate(seats(present)):
-            x = entered[rows][:, :, slots] if rows is not None else entered[:, :, slots]
+        for group, (scenes, slots) in enumerate(seats(present)):
+            x = entered[scenes][:, :, slots] if scenes is not None else entered[:, :, slots]
             for layer in self.entry:
                 x = layer(x)
             if extra is not None:
-                x = x + (extra if len(extra) == 1 or rows is None else extra[rows])
+                x = x + (extra if len(extra) == 1 or scenes is None else extra[scenes])
             asked = None if wanted is None else wanted[begins:ends, slots].flatten().nonzero()[:, 0]
             y = self._blocks(x, begins, asked, memory, group)
             answer = self.exit(y)
@@ -170,10 +170,10 @@ class LeanTransformer:
                 whole[:, asked] = answer
                 answer = whole
             answer = answer.unflatten(1, (ends - begins, -1))
-            if rows is None:
+            if scenes is None:
                 finished[:, begins:ends, slots] = answer
             else:
-                finished[rows[:, None], begins:ends, slots] = answer.transpose(1, 2)
+                finished[scenes[:, None], begins:ends, slots] = answer.transpose(1, 2)
         if memory is not None:
             if begins and memory.answers is not None:
                 finished[:, :begins] = memory.answers
@@ -251,9 +251,9 @@ def everybody(present: Tensor) -> bool:
 
 
 def seats(present: Tensor) -> list[tuple[Tensor | None, slice | Tensor]]:
-    """Scenes with equally many people, and the slots that these are in. present (B, P) -> [(rows, slots)]
+    """Scenes with equally many people, and the slots that these are in. present (B, P) -> [(scenes, slots)]
 
-    Rows None: all of them, which then use the same slots.
+    Scenes None: all of them, which then use the same slots.
     """
     if present.device.type == "cpu":
         return _seats(present.detach().contiguous().numpy().tobytes(), *present.shape, present.device)
@@ -279,10 +279,10 @@ def _seats(present: bytes, B: int, P: int, device: torch.device) -> list[tuple[T
                 return [(None, slice(0, len(slots)))]
             return [(None, slots.to(device))]
         found: list[tuple[Tensor | None, slice | Tensor]] = []
-        for row in there.unique(dim=0):
-            rows, slots = (there == row).all(dim=1).nonzero()[:, 0], row.nonzero()[:, 0]
+        for taken in there.unique(dim=0):
+            scenes, slots = (there == taken).all(dim=1).nonzero()[:, 0], taken.nonzero()[:, 0]
             if len(slots):
-                found.append((rows.to(device), slots.to(device)))
+                found.append((scenes.to(device), slots.to(device)))
         return found
 
 

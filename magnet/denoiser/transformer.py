@@ -38,7 +38,7 @@ def rotate(x: Tensor, time: Tensor, base: float = 10_000.0) -> Tensor:
 def block_causal(time: Tensor, size: int) -> Tensor:
     """Whom each token sees where time comes in blocks of `size` steps: those of its own block and of earlier ones.
 
-    time (L,) int -> (L, L) bool, row: who looks, column: at whom
+    time (L,) int -> (L, L) bool: who looks, at whom
     """
     block = time // size
     return block[:, None] >= block[None, :]
@@ -187,14 +187,14 @@ class Transformer(nn.Module):
         for size in people.unique().tolist():
             if size == 0:
                 continue
-            rows = (people == size).nonzero()
-            slots = slots_in_use[rows[:, 0], :size]
-            y = x[rows, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
+            scenes = (people == size).nonzero()
+            slots = slots_in_use[scenes[:, 0], :size]
+            y = x[scenes, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
             time = torch.arange(x.shape[1], device=x.device).repeat_interleave(size)
             sees = block_causal(time, self.options.causal_block) if self.options.causal_block else None
             if self.options.rope == "hidden":
                 y = y + rotate(y, time)
             for block in self.blocks:
                 y = block(y, time, sees)
-            finished[rows, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
+            finished[scenes, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
         return finished

@@ -65,9 +65,9 @@ class Guidance:
             return everybody
         special = {"history": nobody, "self": self.alone(there), "partner": ~self.alone(there) & there}[self.kind]
         kept: list[Tensor] = []
-        for row in torch.cat([everybody, nobody, special[there] if self.kind != "history" else special]):
-            if not any(torch.equal(row, other) for other in kept):
-                kept.append(row)
+        for view in torch.cat([everybody, nobody, special[there] if self.kind != "history" else special]):
+            if not any(torch.equal(view, other) for other in kept):
+                kept.append(view)
         return torch.stack(kept)
 
     @staticmethod
@@ -134,15 +134,15 @@ class Guidance:
             views.flatten(0, 1), shown.flatten(0, 1), present[:, None].expand(B, K, P).flatten(0, 1)
         ).unflatten(0, (B, K))
 
-        def branch(row: Tensor) -> Tensor:
-            return clean_of[:, int((sees == row).all(dim=1).nonzero()[0, 0])]
+        def branch(view: Tensor) -> Tensor:
+            return clean_of[:, int((sees == view).all(dim=1).nonzero()[0, 0])]
 
         cond, uncond = branch(there), branch(torch.zeros_like(there))
         if self.kind == "history":
             special = cond
         else:
-            rows = self.alone(there) if self.kind == "self" else ~self.alone(there) & there
-            each = torch.stack([branch(row) if here else cond for row, here in zip(rows, there, strict=True)])
+            views = self.alone(there) if self.kind == "self" else ~self.alone(there) & there
+            each = torch.stack([branch(view) if here else cond for view, here in zip(views, there, strict=True)])
             if self.paper_average:
                 total = torch.where(present.T[..., None, None, None], each, 0.0).sum(dim=0)
                 special = total / present.sum(dim=1).view(-1, 1, 1, 1)

@@ -27,8 +27,8 @@ class Stage:
 
     Attributes:
         start: token step at which the window begins.
-        levels: (S + 1, W, P) int16 in 0..K. Row s holds the levels before denoising step s, the last row those after
-            the last step. 0 is clean.
+        levels: (S + 1, W, P) int16 in 0..K, 0 is clean. levels[s] holds before denoising step s, levels[S] after the
+            last step.
         visibility: (P, W, P) bool or None. visibility[p, i, q]: the model sees agent q's token i while agent p's tokens
             are updated. None: every agent sees every token. Agents that see different tokens are updated from separate
             views, which run as one batch.
@@ -89,8 +89,8 @@ class MaskSchedule:
 
     >>> grid = Grid(tokens=4, agents=2, context=2, steps=2, spacing="even")
     >>> plan = MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)  # go on from two known tokens
-    >>> for row in plan.level_rows():
-    ...     print(row[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step
+    >>> for level in plan.levels_by_step():
+    ...     print(level[:, 0].tolist())  # agent 0: noise levels of the 4 tokens, after each denoising step
     [0, 0, 1000, 1000]
     [0, 0, 500, 500]
     [0, 0, 0, 0]
@@ -161,13 +161,13 @@ class MaskSchedule:
             level[stage.start : stage.stop] = stage.levels[-1]
         return level
 
-    def level_rows(self) -> Iterator[Tensor]:
+    def levels_by_step(self) -> Iterator[Tensor]:
         """Levels of the whole grid before each denoising step and after the last, for pictures. (N, P) int each"""
         level = initial_levels(self.known)
         yield level.clone()
         for stage in self.stages:
-            for row in stage.levels[1:]:
-                level[stage.start : stage.stop] = row
+            for after in stage.levels[1:]:
+                level[stage.start : stage.stop] = after
                 yield level.clone()
 
     @staticmethod

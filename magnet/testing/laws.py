@@ -129,12 +129,12 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
     size = (schedule.tokens, schedule.agents)
     _require(size == (grid.tokens, grid.agents), f"{place}: planned {size[0]} tokens of {size[1]} agents")
     _require(known.dtype == torch.bool, f"{place}: known is {known.dtype}, expected bool")
-    rows = torch.stack(list(schedule.level_rows()))
-    rises = (rows.diff(dim=0) > 0).nonzero().tolist()
+    levels = torch.stack(list(schedule.levels_by_step()))  # (S, N, P)
+    rises = (levels.diff(dim=0) > 0).nonzero().tolist()
     _require(not rises, f"{place}: (step, token, agent) {rises[:1]} rises in level")
-    _require((rows[:, known] == 0).all(), f"{place}: a known token is not clean throughout")
-    _require((rows[0][~known] == LEVELS).all(), f"{place}: an unknown token does not begin at pure noise")
-    left = ((rows[-1] != 0) & (rows[-1] != LEVELS)).nonzero().tolist()
+    _require((levels[:, known] == 0).all(), f"{place}: a known token is not clean throughout")
+    _require((levels[0][~known] == LEVELS).all(), f"{place}: an unknown token does not begin at pure noise")
+    left = ((levels[-1] != 0) & (levels[-1] != LEVELS)).nonzero().tolist()
     _require(not left, f"{place}: (token, agent) {left[:1]} is left half denoised: end at 0 or stay at {LEVELS}")
     _require((schedule.finished & ~known).any(), f"{place}: nothing is generated")
     for number, stage in enumerate(schedule.stages):
@@ -282,10 +282,10 @@ def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:
     latent, deltas, pairs = layout.unpack(tokens)
     P = layout.agents
     whole = pairs.new_zeros(*pairs.shape[:2], P, P, *pairs.shape[4:])
-    rows, columns = torch.arange(P)[:, None], partners(P)
+    own, others = torch.arange(P)[:, None], partners(P)
     if layout.slots:
-        whole[:, :, rows, columns] = pairs
-        pairs = whole[:, :, order][:, :, :, order][:, :, rows, columns]
+        whole[:, :, own, others] = pairs
+        pairs = whole[:, :, order][:, :, :, order][:, :, own, others]
     return layout.pack(latent[:, :, order], deltas[:, :, order], pairs)
 
 

@@ -64,9 +64,9 @@ def statistics(scenes: Iterable[Scene]) -> dict[str, tuple[Tensor, Tensor]]:
             "deltas": seen.deltas[deltas_count],
             "betas": seen.betas[:, None].expand(*seen.counts.shape, -1)[seen.counts],
         }
-        for name, rows in parts.items():
-            rows = rows.double()
-            one = torch.cat([rows.new_full((1,), len(rows)), rows.sum(0), rows.square().sum(0)])
+        for name, values in parts.items():
+            values = values.double()
+            one = torch.cat([values.new_full((1,), len(values)), values.sum(0), values.square().sum(0)])
             sums[name] = sums[name] + one if name in sums else one
     result = {}
     for name, total in sums.items():

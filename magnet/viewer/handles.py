@@ -108,8 +108,8 @@ class Steering:
 
 
 @dataclass
-class KeyframeRow:
-    """A keyframe on the stage."""
+class KeyframeEntry:
+    """A keyframe in the list and on the stage."""
 
     key: Keyframe
     handle: Any
@@ -125,7 +125,7 @@ class KeyframePanel:
 
     def __init__(self, app: App) -> None:
         self.app, self.live = app, app.live
-        self.rows: list[KeyframeRow] = []
+        self.entries: list[KeyframeEntry] = []
         self.made = 0
         gui = app.server.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
@@ -162,56 +162,56 @@ class KeyframePanel:
 
     def add(self, key: Keyframe) -> None:
         """Add a keyframe; it replaces one of the same person and frame."""
-        for row in self.rows:
-            if (row.key.agent, row.key.frame) == (key.agent, key.frame):
-                self._drop(row)
+        for entry in self.entries:
+            if (entry.key.agent, entry.key.frame) == (key.agent, key.frame):
+                self._drop(entry)
         self.made += 1
         server, name = self.app.server, f"/stage/key_{self.made}"
         scene = self.live.scene.slice(0, 1).permute_agents(key_slot(key))
         preview = add_people(
             server, f"{name}_pose", self.app.body, scene, "skeleton", agent_colours((key.agent,)), opacity=0.55
         )
-        row = KeyframeRow(key, None, preview)
+        entry = KeyframeEntry(key, None, preview)
 
         def moved(goal: Goal) -> None:
-            self._change(row, goal=goal)
+            self._change(entry, goal=goal)
 
-        row.handle = floor_handle(server, f"{name}_handle", key.goal, moved, scale=0.5)
-        self.rows.append(row)
-        self._pose(row)
-        self._listed(row)
+        entry.handle = floor_handle(server, f"{name}_handle", key.goal, moved, scale=0.5)
+        self.entries.append(entry)
+        self._pose(entry)
+        self._listed(entry)
 
     def _remove(self) -> None:
-        row = self._chosen()
-        if row is None:
+        entry = self._chosen()
+        if entry is None:
             raise ValueError("no keyframe to remove")
-        self._drop(row)
+        self._drop(entry)
         self._listed()
 
     def clear(self) -> None:
         """Remove all."""
-        for row in list(self.rows):
-            self._drop(row)
+        for entry in list(self.entries):
+            self._drop(entry)
         self._listed()
 
-    def _drop(self, row: KeyframeRow) -> None:
-        row.handle.remove()
-        row.preview.show(False)
-        self.rows = [each for each in self.rows if each is not row]
+    def _drop(self, entry: KeyframeEntry) -> None:
+        entry.handle.remove()
+        entry.preview.show(False)
+        self.entries = [each for each in self.entries if each is not entry]
 
     def _moved_in_time(self, event: Any) -> None:
-        row = self._chosen()
-        if event.client_id is None or row is None:  # by the panel itself
+        entry = self._chosen()
+        if event.client_id is None or entry is None:  # by the panel itself
             return
         frame = max(int(self.at.value), 0) // 4 * 4
-        taken = any(e is not row and (e.key.agent, e.key.frame) == (row.key.agent, frame) for e in self.rows)
-        if frame != row.key.frame and not taken:
-            self._change(row, frame=frame)
-            self._listed(row)
+        taken = any(e is not entry and (e.key.agent, e.key.frame) == (entry.key.agent, frame) for e in self.entries)
+        if frame != entry.key.frame and not taken:
+            self._change(entry, frame=frame)
+            self._listed(entry)
 
     def _generate(self) -> None:
         start = self.live.between_from()
-        last = max(row.key.frame for row in self.rows) + 4
+        last = max(entry.key.frame for entry in self.entries) + 4
         with self.live.lock:
             self.live.asked = True
         self.go.disabled = True
@@ -220,62 +220,62 @@ class KeyframePanel:
 
     # -- what is shown -------------------------------------------------------------------------
 
-    def _chosen(self) -> KeyframeRow | None:
-        return next((row for row in self.rows if row.label == self.which.value), None)
+    def _chosen(self) -> KeyframeEntry | None:
+        return next((entry for entry in self.entries if entry.label == self.which.value), None)
 
     def _chosen_key(self) -> tuple[Keyframe, Any] | None:
-        row = self._chosen()
-        return None if row is None else (row.key, self.live.scene.betas[0, row.key.agent].cpu())
+        entry = self._chosen()
+        return None if entry is None else (entry.key, self.live.scene.betas[0, entry.key.agent].cpu())
 
     def _bent(self, key: Keyframe) -> None:
-        row = self._chosen()
-        if row is not None and (row.key.agent, row.key.frame) == (key.agent, key.frame):
-            self._change(row, body_rot=key.body_rot)
+        entry = self._chosen()
+        if entry is not None and (entry.key.agent, entry.key.frame) == (key.agent, key.frame):
+            self._change(entry, body_rot=key.body_rot)
 
-    def _change(self, row: KeyframeRow, **changes: Any) -> None:
-        row.key = dataclasses.replace(row.key, **changes)
-        self._pose(row)
+    def _change(self, entry: KeyframeEntry, **changes: Any) -> None:
+        entry.key = dataclasses.replace(entry.key, **changes)
+        self._pose(entry)
         self._tell()
-        if row is self._chosen() and "body_rot" not in changes:  # its limbs go with it
+        if entry is self._chosen() and "body_rot" not in changes:  # its limbs go with it
             self.limb.show()
 
-    def _pose(self, row: KeyframeRow) -> None:
+    def _pose(self, entry: KeyframeEntry) -> None:
         """Put the preview where the keyframe is."""
-        first = dataclasses.replace(row.key, agent=0, frame=0)
-        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(row.key)).pad_frames(4).slice(0, 4)
+        first = dataclasses.replace(entry.key, agent=0, frame=0)
+        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(entry.key)).pad_frames(4).slice(0, 4)
         turns, places = bone_poses(self.app.body, with_keyframes(scene, [first]).slice(0, 1))
         with self.app.server.atomic():
-            row.preview.pose(turns[0], places[0])
+            entry.preview.pose(turns[0], places[0])
 
-    def _listed(self, chosen: KeyframeRow | None = None) -> None:
+    def _listed(self, chosen: KeyframeEntry | None = None) -> None:
         """Bring lists up to date, and choose a keyframe in them."""
-        self.rows.sort(key=lambda row: (row.key.frame, row.key.agent))
-        chosen = chosen or (self.rows[-1] if self.rows else None)
-        self.which.options = tuple(row.label for row in self.rows) or (NO_KEYS,)
+        self.entries.sort(key=lambda entry: (entry.key.frame, entry.key.agent))
+        chosen = chosen or (self.entries[-1] if self.entries else None)
+        self.which.options = tuple(entry.label for entry in self.entries) or (NO_KEYS,)
         self.which.value = NO_KEYS if chosen is None else chosen.label
         self._shown()
         self._tell()
 
     def _shown(self) -> None:
-        row = self._chosen()
-        self.at.value = 0 if row is None else row.key.frame
+        entry = self._chosen()
+        self.at.value = 0 if entry is None else entry.key.frame
         self.limb.show()
 
     def _tell(self) -> None:
         """Hand the keyframes to the engine, and say how fast people must go to reach them."""
         with self.live.lock:
-            self.live.keys = [row.key for row in self.rows]
+            self.live.keys = [entry.key for entry in self.entries]
             self.app.shown = -1  # the timeline has them too, also while the clock stands
             try:
                 start, scene = self.live.between_from(), self.live.scene
                 needed = speeds(self.live.keys, scene, start - 1)
             except ValueError as error:
-                self.list.content = "" if not self.rows else f"**{error}**"
+                self.list.content = "" if not self.entries else f"**{error}**"
                 return
         lines = []
-        for row in self.rows:
-            speed = needed[row.key.agent, row.key.frame]
-            text = f"{row.label}: {row.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
+        for entry in self.entries:
+            speed = needed[entry.key.agent, entry.key.frame]
+            text = f"{entry.label}: {entry.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
             lines.append(f"**{text}: too far**" if speed > HURRIED else text)
         self.list.content = "  \n".join([*lines, f"from frame {start} on all is made anew"])
 

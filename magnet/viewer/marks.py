@@ -70,5 +70,5 @@ def nearest(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, d: torch.Tensor, 
     on_first = a[:, None] + share * (b - a)[:, None]  # (M, parts + 1, 3)
     on_second = c[:, None] + share * (d - c)[:, None]
     best = torch.cdist(on_first, on_second).flatten(1).argmin(dim=1)
-    row = torch.arange(len(a))
-    return (on_first[row, best // (parts + 1)] + on_second[row, best % (parts + 1)]) / 2
+    each = torch.arange(len(a))
+    return (on_first[each, best // (parts + 1)] + on_second[each, best % (parts + 1)]) / 2

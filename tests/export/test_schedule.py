@@ -63,7 +63,7 @@ def test_saturation_falls_with_the_level() -> None:
 @pytest.mark.parametrize("name", registry.names())
 def test_moments_are_rows_of_the_schedule(name: str) -> None:
     schedule = plan(name)
-    rows = list(schedule.level_rows())
+    rows = list(schedule.levels_by_step())
     for count in (4, 7, 12, 200):
         shown = moments(schedule, count)
         numbers = [moment.number for moment in shown]

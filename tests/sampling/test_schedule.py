@@ -27,7 +27,7 @@ def test_everything_asked_for_ends_clean(grid: Grid):
 
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
 def test_each_token_is_denoised_in_exactly_the_steps_asked_for(grid: Grid):
-    rows = torch.stack(list(joint(grid).level_rows()))
+    rows = torch.stack(list(joint(grid).levels_by_step()))
     changes = (rows.diff(dim=0) != 0).sum(dim=0)
     assert (changes[grid.context :] == grid.steps).all()
     assert (changes[: grid.context] == 0).all()
@@ -97,7 +97,7 @@ def rolled(**options) -> MaskSchedule:
 def test_rolling_levels_are_a_slope_along_time():
     """Each token is `pyramid_offset` denoising steps behind the one before it."""
     plan = rolled()
-    rows = torch.stack(list(plan.level_rows()))[:, 4:, 0]  # (steps + 1, targets)
+    rows = torch.stack(list(plan.levels_by_step()))[:, 4:, 0]  # (steps + 1, targets)
     slope = [1000 * (6 - s) // 6 for s in range(7)]
     for step, row in enumerate(rows):
         assert row.tolist() == [slope[min(max(step - 2 * token, 0), 6)] for token in range(20)]
@@ -222,7 +222,7 @@ def test_jointly_agents_at_a_time_step_are_at_one_level_throughout(pyramid_offse
 @pytest.mark.parametrize("pyramid_offset", [0, 4])
 def test_independently_each_token_passes_levels_of_its_own(pyramid_offset):
     plan = independent(pyramid_offset=pyramid_offset)
-    rows = torch.stack(list(plan.level_rows()))[:, 4:]
+    rows = torch.stack(list(plan.levels_by_step()))[:, 4:]
     passed = [tuple(column.unique_consecutive().tolist()) for column in rows.flatten(1).T]
     assert all(len(each) == 21 and each[0] == 1000 and each[-1] == 0 for each in passed)
     assert len(set(passed)) == 8 * 2  # no two alike inside a window; the next window's are these again

@@ -62,7 +62,7 @@ def test_a_task_that_cannot_roll_says_why(name: str):
 def test_tasks_that_can_roll_do_so_unless_told_otherwise(name: str):
     def plan(pyramid_offset: int | None) -> list[Tensor]:
         grid = Grid(20, 2, 0 if name == "generation" else 4, steps=8, window=8, pyramid_offset=pyramid_offset)
-        return list(registry.get(name)().schedule(grid).level_rows())
+        return list(registry.get(name)().schedule(grid).levels_by_step())
 
     left_to_itself, told = plan(None), plan(0 if name in CANNOT_ROLL else 2)
     assert len(left_to_itself) == len(told)

@@ -53,7 +53,7 @@ def test_agents_in_step_do_not_see_each_others_current_tokens():
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 1.0])
 def test_turns_start_the_offset_apart(offset):
     grid = Grid(tokens=12, agents=3, context=8, steps=10)
-    rows = torch.stack(list(AgenticAsync(offset, order=(2, 0)).schedule(grid).level_rows()))[:, 8:]
+    rows = torch.stack(list(AgenticAsync(offset, order=(2, 0)).schedule(grid).levels_by_step()))[:, 8:]
     starts = (rows < LEVELS).int().argmax(dim=0)
     for now in range(4):
         second, third, first = starts[now].tolist()

@@ -45,8 +45,8 @@ def test_a_limb_of_a_keyframe_isdragged_by_its_arrows_and_what_is_generated_has_
     moved = limb_places(live.keys[0], "left hand", body, betas)[0]
     torch.testing.assert_close(moved, place, atol=1e-3, rtol=0)
     foot = limb_places(live.keys[0], "right foot", body, betas)[0]
-    app.keys.rows[0].handle.position = (2.0, 0.03, 1.0)  # all of it is moved: the arrows of its foot go with it
-    for told in app.keys.rows[0].handle._impl_aux.update_cb:
+    app.keys.entries[0].handle.position = (2.0, 0.03, 1.0)  # all of it is moved: the arrows of its foot go with it
+    for told in app.keys.entries[0].handle._impl_aux.update_cb:
         told(None)
     shifted = limb_places(live.keys[0], "right foot", body, betas)[0]
     assert (shifted - foot).norm() > 0.1
