@@ -16,7 +16,8 @@ COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY magnet magnet
 RUN pip install --no-cache-dir uv \
  && uv pip install --system --no-cache --torch-backend ${TORCH} -c constraints.txt ".[${EXTRAS}]" \
- && magnet doctor
+ && magnet doctor \
+ && python -m magnet.cli.all_answers --ship
 
 RUN useradd --create-home magnet
 USER magnet

@@ -10,7 +10,7 @@ PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format docs clean distclean
+.PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format docs wheel clean distclean
 
 help:  ## list what make can do
 	@echo "magnet: diffusion forcing for the motion of several people"
@@ -94,6 +94,12 @@ docs: $(READY)  ## the documentation as a site in site/; a broken link is an err
 	@$(PY) -m pip install -qq --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build -q
 	@echo "docs: open site/index.html, or $(PY) -m http.server -d site"
+
+wheel: $(READY)  ## the wheel and the source archive in dist/, with this Python's recorded answers
+	@echo "wheel: answers of --help are made for it, half a minute"
+	@rm -f magnet/cli/answers-*.json
+	@$(PY) -m magnet.cli.all_answers --ship
+	@$(PY) -m build --no-isolation; done=$$?; rm -f magnet/cli/answers-*.json; exit $$done
 
 clean:  ## remove caches and builds
 	@echo "clean: caches and builds"

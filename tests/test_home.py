@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -68,19 +70,30 @@ def test_hooks_before_commits_keep_recordings_out() -> None:
     assert {"ruff", "ruff-format", "mypy", "no-recordings"} <= set(hooks)
     refused = re.compile(hooks["no-recordings"]["files"])
     assert all(refused.search(name) for name in ("a/60_01.amc", "x.bvh", "SMPLX_NEUTRAL.npz", "b/SMPL_MALE.pkl"))
-    kept = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, timeout=30).stdout.split()
-    assert not [name for name in kept if refused.search(name)]
+    assert not [name for name in tracked(".") if refused.search(name)]
+
+
+def tracked(folder: str) -> set[str]:
+    """Files under a folder that are part of the repository."""
+    words = ["git", "ls-files", folder]
+    return set(subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=30, check=True).stdout.split())
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built wheel of this tree."""
+    """The wheel built of what this tree tracks, and of the answers that are made for it."""
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
     out = tmp_path_factory.mktemp("wheel")
-    words = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    tree = tmp_path_factory.mktemp("tree")
+    for name in [*tracked("magnet"), "pyproject.toml", "README.md", "LICENSE", ".gitignore"]:
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, tree / name)
+    for words in ("magnet.cli.all_answers --ship", f"build --wheel --no-isolation --outdir {out}"):
+        run = [sys.executable, "-m", *words.split()]
+        environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(run, capture_output=True, text=True, timeout=300, cwd=tree, env=environment)
+        assert done.returncode == 0, done.stderr
     (built,) = out.glob("*.whl")
     return built
 
@@ -88,14 +101,27 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_the_wheel_holds_all_of_the_package_and_nothing_else(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    tracked = subprocess.run(["git", "ls-files", "magnet"], cwd=ROOT, capture_output=True, text=True, timeout=30)
     held = {name for name in names if not name.split("/")[0].endswith(".dist-info")}
-    assert held == set(tracked.stdout.split())
+    (answers,) = held - tracked("magnet")
+    assert re.fullmatch(r"magnet/cli/answers-[0-9a-f]{24}\.json", answers)
+    assert held - {answers} == tracked("magnet")
     assert {"magnet/body/open_body.npz", "magnet/body/OPEN_BODY.md", "magnet/py.typed"} <= held
     assert {"magnet/weights/duet/config.json", "magnet/weights/duet/weights-01.safetensors"} <= held
     assert not [name for name in held if re.search(r"(^|/)tests?/|\.(amc|asf|bvh|pkl|ckpt|glb|mp4)$", name)]
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert wheel.stat().st_size < 50e6
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(entry_points(group="magnet.tasks")), reason="plug-ins are installed")
+def test_the_wheel_answers_its_first_help_without_importing_torch(wheel: Path, tmp_path: Path) -> None:
+    shutil.unpack_archive(wheel, tmp_path / "site", "zip")
+    code = "import sys; from magnet.cli import main; main(sys.argv[1:]); print('torch' in sys.modules)"
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    for words in ("fit --help", "data list"):
+        run = [sys.executable, "-c", code, *words.split()]
+        done = subprocess.run(run, capture_output=True, text=True, timeout=120, cwd=tmp_path, env=environment)
+        assert len(done.stdout) > 1000 and done.stdout.endswith("False\n"), done.stderr
 
 
 @pytest.mark.slow

@@ -1,10 +1,16 @@
-"""Make every answer that `magnet.cli.answers` keeps, so that the first call is quick, too."""
+"""Make every answer that `magnet.cli.answers` keeps, so that the first call is quick, too.
+
+python -m magnet.cli.all_answers           # into the user's cache
+python -m magnet.cli.all_answers --ship    # into the package, for a wheel or an image
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import os
+import sys
+import tempfile
 
 from magnet.cli import answers, data, task_list  # isort: split
 
@@ -25,5 +31,26 @@ def make_all() -> None:
         answers.keep(help_answers(command))
 
 
+def ship() -> None:
+    """Make every answer anew and put them into the package.
+
+    Raises:
+        SystemExit: plug-ins are installed, whose names would be among the answers.
+    """
+    path = answers.shipped()
+    if path is None:
+        sys.exit(
+            f"answers of the package alone cannot be made where {answers.VARIABLE} is set or plug-ins are installed"
+        )
+    path.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["XDG_CACHE_HOME"] = cache
+        make_all()
+        made = answers.place()
+        assert made is not None
+        path.write_bytes(made.read_bytes())
+    print(path)
+
+
 if __name__ == "__main__":
-    make_all()
+    ship() if sys.argv[1:] == ["--ship"] else make_all()

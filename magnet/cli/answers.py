@@ -2,7 +2,8 @@
 
 What is kept belongs to the code that it was made from: this package, Lightning, the parser and all plug-ins. Where any
 of it has changed, everything is made anew; of the package outside the commands and the registries, what functions do
-inside says nothing here and may change. `make setup` makes all there are (`python -m magnet.cli.all_answers`).
+inside says nothing here and may change. `make setup` makes all there are (`python -m magnet.cli.all_answers`), and a
+wheel brings those of the code in it, for each Python that they were made with (`make wheel`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ KEPT = 4
 """Files of answers: of as many versions or copies of the code."""
 OUTLINES = "outlines.json"
 """Digests of files' outlines by those of their code: to read 47,000 lines takes a second."""
+OURS = Path(__file__).parents[1]
+"""Where this package's code lies."""
 FRESH = "torch" not in sys.modules
 """Whether this process began with the command; in others what takes long is imported, and registries may be changed."""
 
@@ -43,8 +46,11 @@ def width() -> int:
 
 
 def recall(name: str) -> Any:
-    """What was kept under a name; None where nothing was, or where the code has changed since."""
-    return _read(place()).get(name) if FRESH else None
+    """What came with the package or was kept under a name; None where nothing was, or where the code has changed."""
+    if not FRESH:
+        return None
+    found = _read(shipped()).get(name)
+    return _read(place()).get(name) if found is None else found
 
 
 def keep(answers: dict[str, Any]) -> None:
@@ -106,6 +112,19 @@ def place() -> Path | None:
     return folder() / f"answers-{code_digest()}.json"
 
 
+@functools.cache
+def shipped() -> Path | None:
+    """The file inside the package of all answers of exactly this code; None where plug-ins may change them."""
+    if os.environ.get(VARIABLE) or any(entry_points(group=group) for group in PLUGINS):
+        return None
+    digest = _packages()
+    digest.update("python {}.{}".format(*sys.version_info).encode())
+    for file in sorted(OURS.rglob("*.py")):
+        digest.update(f"{file.relative_to(OURS)}\n".encode())
+        digest.update(file.read_bytes())
+    return OURS / "cli" / f"answers-{digest.hexdigest()}.json"
+
+
 def folder() -> Path:
     """Where everything is kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
@@ -114,11 +133,8 @@ def folder() -> Path:
 @functools.cache
 def code_digest() -> str:
     """Of all code that answers depend on: ours and plug-ins' by their files, packages by their versions."""
-    digest = hashlib.blake2b(digest_size=12)
-    for package in ("lightning", "jsonargparse"):
-        digest.update(f"{package} {version(package)}\n".encode())
-    ours = Path(__file__).parents[1]
-    folders = {ours}
+    digest = _packages()
+    folders = {OURS}
     for group in PLUGINS:
         for point in entry_points(group=group):
             digest.update(f"{point.group} {point.name} {point.value}\n".encode())
@@ -127,7 +143,7 @@ def code_digest() -> str:
     for home in sorted(folders):
         for file in sorted(home.rglob("*.py")) if home.is_dir() else [home]:
             code = file.read_bytes()
-            if home == ours and file.parent.name != "cli" and file.name != "registry.py":
+            if home == OURS and file.parent.name != "cli" and file.name != "registry.py":
                 key = hashlib.blake2b(code, digest_size=12).hexdigest()
                 now[key] = before.get(key) or hashlib.blake2b(outline(code).encode(), digest_size=12).hexdigest()
                 code = now[key].encode()
@@ -146,6 +162,14 @@ def outline(code: bytes) -> str:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             node.body = node.body[:1] if ast.get_docstring(node, clean=False) is not None else []
     return ast.dump(module)
+
+
+def _packages() -> hashlib.blake2b:
+    """Begins a digest with the versions of the packages that answers depend on."""
+    digest = hashlib.blake2b(digest_size=12)
+    for package in ("lightning", "jsonargparse"):
+        digest.update(f"{package} {version(package)}\n".encode())
+    return digest
 
 
 def _home(point: EntryPoint) -> set[Path]:

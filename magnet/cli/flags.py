@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 import yaml
 
 Options = dict[str, Any]
+NO_WORDS = {"true", "false", "yes", "no", "y", "n", "on", "off", "null", "none", "nan", "inf", "infinity"}
+"""What YAML or Python may read as something else than a word."""
 CLASS_WORDS = ("help", "class_path", "init_args", "dict_kwargs")
 
 
@@ -124,24 +126,30 @@ def chosen_flags(
     return flags
 
 
-def unknown_flag(arguments: Sequence[str], known: Mapping[str, Any]) -> str | None:
-    """What is wrong with the first option that nothing here has; None where there is none, or where only the parser
-    can tell: with files, checkpoints and classes of the user's own, and for tasks.
+def mistake(arguments: Sequence[str], known: Mapping[str, Any]) -> str | None:
+    """What is wrong with the first option that nothing here has, or whose value is a word in place of a number; None
+    where there is none, or where only the parser can tell: with files, checkpoints and classes of the user's own, and
+    for tasks.
 
     Args:
         arguments: after the command.
-        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, and `old` names by key.
+        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, `old` names by key, and `values`: what
+            options expect that take no words.
     """
     if any(argument.partition("=")[0] in ("-c", "--config", "--ckpt_path") for argument in arguments):
         return None
     named = {key: name for key in known["classes"] if (name := class_in_flags(arguments, key))}
     if any(name not in known["classes"][key] for key, name in named.items()):
         return None
+    flags = chosen_flags(known["actions"], known["classes"], {**known["chosen"], **named})
     for argument in arguments:
         name = argument.partition("=")[0].rstrip("+")
         if name[:2] == "--" and name[2:3].isalpha() and not _accepted(name, known):
-            flags = chosen_flags(known["actions"], known["classes"], {**known["chosen"], **named})
             return f"no option {name}{closest(name, flags)}"
+    for name, value in valued(arguments):
+        plain = re.fullmatch(r"[A-Za-z][\w.-]*", value) and value.lower() not in NO_WORDS
+        if plain and name in flags and name in known["values"]:
+            return f"{name}: got {value}, expected {known['values'][name]}"
     return None
 
 
@@ -154,4 +162,6 @@ def _accepted(name: str, known: Mapping[str, Any]) -> bool:
         field = rest.removeprefix("init_args.").partition(".")[0]
         fields = {option.split(".")[1] for options in known["classes"][key].values() for option in options}
         return field in fields or field in CLASS_WORDS or field in known["old"].get(key, ())
-    return any(flag == name or name.startswith(f"{flag}.") for flag in known["actions"])
+    told = [flag for flag in known["actions"] if not flag.endswith(".help")]
+    open_ones = [flag for flag in told if not any(other.startswith(f"{flag}.") for other in told)]
+    return name in told or any(name.startswith(f"{flag}.") for flag in open_ones)

@@ -112,7 +112,7 @@ def run(command: str, arguments: list[str]) -> int:
 
 
 def quick_answer(command: str, arguments: list[str]) -> int | None:
-    """Answer for help, or for an option that there is not, out of what was kept; None where nothing is known of it."""
+    """Answer for help, or for a mistaken option, out of what was kept; None where nothing is known of it."""
     from magnet.cli import answers, flags
 
     topic = flags.help_topic(arguments)
@@ -123,7 +123,7 @@ def quick_answer(command: str, arguments: list[str]) -> int | None:
         print(text, end="")
         return 0
     known = answers.recall(f"{command} flags")
-    said = flags.unknown_flag(arguments, known) if known else None
+    said = flags.mistake(arguments, known) if known else None
     if said is None:
         return None
     print(flags.refused(command, said), file=sys.stderr)

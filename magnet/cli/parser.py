@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import inspect
 import re
 import sys
+import types
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NoReturn
 
 from jsonargparse import ActionConfigFile, Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 
-from magnet.cli.errors import wrong_value
+from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
 
 USAGE = (
@@ -222,9 +225,17 @@ class Parser(LightningArgumentParser):
         """Options of each class, or of those that are chosen where one is, by key and short name."""
         wanted = {key: name.rpartition(".")[2] for key, name in (chosen or {}).items()}
         return {
-            key: {name: _options(key, kind) for name, kind in classes.items() if wanted.get(key, name) == name}
+            key: {name: list(_options(key, kind)) for name, kind in classes.items() if wanted.get(key, name) == name}
             for key, classes in self.classes.items()
         }
+
+    def values(self) -> dict[str, str]:
+        """What options expect that take numbers, true, false or null alone; of classes where all mean the same."""
+        found = {flag: _expected(action) for action in self._actions for flag in action.option_strings}
+        for key, classes in self.classes.items():
+            for name, text in [item for kind in classes.values() for item in _options(key, kind).items()]:
+                found[f"--{name}"] = text if found.get(f"--{name}", text) == text else ""
+        return {flag: text for flag, text in found.items() if text}
 
 
 def _topic_of(group: Any) -> str:
@@ -233,8 +244,21 @@ def _topic_of(group: Any) -> str:
     return next((name for name in ("trainer", "sampler") if any(flag.startswith(f"--{name}") for flag in flags)), "")
 
 
-def _options(key: str, kind: type) -> list[str]:
-    return list(LightningArgumentParser().add_class_arguments(kind, key, fail_untyped=False))
+@functools.cache
+def _options(key: str, kind: type) -> dict[str, str]:
+    """Options of a class, without dashes, and what each expects as `_expected` says it."""
+    parser = LightningArgumentParser()
+    names = parser.add_class_arguments(kind, key, fail_untyped=False)
+    told = {flag: _expected(action) for action in parser._actions for flag in action.option_strings}
+    return {name: told.get(f"--{name}", "") for name in names}
+
+
+def _expected(action: argparse.Action) -> str:
+    """What an option expects, in the words of `wrong_value`; empty where it takes more than numbers, truth and null."""
+    kind = getattr(action, "_typehint", None) or action.type
+    kinds = typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
+    plain = all(each in (int, float, bool, types.NoneType) for each in kinds)
+    return " or ".join(KINDS[each.__name__] for each in kinds) if plain else ""
 
 
 def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:

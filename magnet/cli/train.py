@@ -103,10 +103,11 @@ def help_answers(command: str) -> dict[str, Any]:
 
 
 def flag_answers(parser: Parser) -> dict[str, Any]:
-    """What a command takes, as `flags.unknown_flag` reads it."""
+    """What a command takes, as `flags.mistake` reads it."""
     chosen = {} if parser.command == "fit" else {"model": path_of(MODELS), "data": registry.default_path()}
     old = {key: sorted(names) for key, names in OPTIONS.items()}
     known = {"actions": parser.own_flags(), "classes": parser.options(), "chosen": chosen, "old": old}
+    known["values"] = parser.values()
     return {f"{parser.command} flags": known}
 
 

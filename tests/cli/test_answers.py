@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -23,8 +24,11 @@ ASKED = [[command, "--help"] for command in {**TRAINER_COMMANDS, **LIGHT_COMMAND
     ["fit", "--model", "Denoiser", "--model.widht", "3"],
     ["predict", "--data.max_agent", "2"],
     ["fit", "--data.pth", "x"],
+    ["fit", "--trainer.max_step", "3"],
+    ["fit", "--trainer.gradient_clip_val", "abc"],
+    ["test", "--sampler.requantize", "maybe"],
 ]
-COMPARED = [["test", "--help"], ["tasks"], ["data", "list"], ["test", "--tsak", "joint_future"]]
+COMPARED = [["test", "--help"], ["tasks"], ["data", "list"], ["test", "--tsak", "joint_future"], ASKED[-2]]
 """Those that are also asked with nothing kept, which takes seconds each."""
 
 
@@ -63,6 +67,35 @@ def test_answers_are_forgotten_with_the_code_that_they_were_made_from(
     assert answers.kept("a", lambda: "four") == "four"
 
 
+def test_shipped_answers_are_those_of_exactly_this_code_and_no_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(answers.VARIABLE, raising=False)
+    monkeypatch.setattr(answers, "FRESH", True)
+    monkeypatch.setattr(answers, "OURS", tmp_path)
+    monkeypatch.setattr(answers, "entry_points", lambda group: [])
+    shipped = inspect.unwrap(answers.shipped)
+    monkeypatch.setattr(answers, "shipped", shipped)  # anew at every call
+    code, first = tmp_path / "cli" / "a.py", "x = 1\n"
+    code.parent.mkdir()
+    code.write_text(first)
+    shipped().write_text('{"a": "shipped"}')
+    answers.keep({"b": "kept"})
+    assert [answers.recall(name) for name in "abc"] == ["shipped", "kept", None]
+    code.write_text("def go():\n    return 2\n")
+    assert answers.recall("a") is None
+    code.write_text(first)
+    for changed in ({"version": lambda name: "0"}, {"entry_points": lambda group: ["plugin"]}):
+        with monkeypatch.context() as other:
+            for name, value in changed.items():
+                other.setattr(answers, name, value)
+            assert shipped() is None or not shipped().exists()
+    assert answers.recall("a") == "shipped"
+    monkeypatch.setenv(answers.VARIABLE, "my_tasks")
+    assert answers.recall("a") is None
+
+
 def test_what_functions_do_inside_is_no_part_of_an_outline_and_all_else_is() -> None:
     code = b'class Walk:\n    far: int = 3\n    def go(self, on=1):\n        """Go."""\n        return on\n'
     assert answers.outline(code) == answers.outline(code.replace(b"return on", b"return far(on)"))
@@ -77,10 +110,21 @@ def test_a_place_that_cannot_be_written_is_no_error(monkeypatch: pytest.MonkeyPa
 
 
 KNOWN = {
-    "actions": ["--help", "--out", "--data", "--model", "--trainer.max_steps", "--trainer.logger", "--sampler.steps"],
+    "actions": [
+        "--help",
+        "--out",
+        "--data",
+        "--model",
+        "--trainer",
+        "--trainer.max_steps",
+        "--trainer.logger.help",
+        "--trainer.logger",
+        "--sampler.steps",
+    ],
     "classes": {"model": {"Net": ["model.width", "model.loss.latent"]}, "data": {"Walks": ["data.root"]}},
     "chosen": {"model": "Net"},
     "old": {"model": ["size"]},
+    "values": {"--trainer.max_steps": "a whole number", "--model.width": "a number or null", "--data.root": "a number"},
 }
 
 
@@ -97,6 +141,11 @@ KNOWN = {
         ("--trainer.maxsteps 3", "no option --trainer.maxsteps; did you mean --trainer.max_steps?"),
         ("--model.width=3 --model.init_args.width 4 --model.loss.latent 1 --trainer.logger.save_dir x", None),
         ("--model.size 3", None),
+        ("--trainer.max_steps abc --out x", "--trainer.max_steps: got abc, expected a whole number"),
+        ("--out x --model.width=wide", "--model.width: got wide, expected a number or null"),
+        ("--trainer.max_steps 1e3 --model.width null", None),
+        ("--trainer.max_steps --model.width NaN", None),
+        ("--model my.Net --trainer.max_steps abc", None),
         ("--task.anything 3", None),
         ("--model my.Net --model.depth 3", None),
         ("--config my.yaml --otu runs", None),
@@ -104,4 +153,4 @@ KNOWN = {
     ],
 )
 def test_only_what_nothing_can_take_is_refused_at_once(words: str, said: str | None) -> None:
-    assert flags.unknown_flag(words.split(), KNOWN) == said
+    assert flags.mistake(words.split(), KNOWN) == said
