@@ -207,10 +207,6 @@ def _encode(text: str, encoding: str = "latin-1") -> bytes:
     return text.encode(encoding)
 
 
-def _no_bytes() -> bytes:
-    return b""
-
-
 def _bytes(raw: Any) -> bytes:
     return raw.encode("latin-1") if isinstance(raw, str) else bytes(raw)
 
@@ -229,7 +225,7 @@ ADMITTED: dict[str, Callable[..., Any]] = {
     **{
         f"{module} {name}": call
         for module in ("builtins", "__builtin__")
-        for name, call in (("set", set), ("frozenset", frozenset), ("complex", complex), ("bytes", _no_bytes))
+        for name, call in (("set", set), ("frozenset", frozenset), ("complex", complex), ("bytes", lambda: b""))
     },
 }
 """Everything that a pickle may name; numpy's are replaced by stand-ins."""

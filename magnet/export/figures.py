@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.export.drawing import BACKGROUND, Array, Canvas, View, strokes
-from magnet.export.limbs import CAPSULES, L_HEEL, L_TOE, R_HEEL, R_TOE, SIDE_TONE, STICKS, extended, limbs
+from magnet.export.limbs import CAPSULES, L_HEEL, L_TOE, R_HEEL, R_TOE, SIDE_TONE, STICKS, extended, limbs, turn_to
 
 
 def add_shadows(canvas: Canvas, joints: Array) -> None:
@@ -69,11 +69,7 @@ def add_capsules(canvas: Canvas, joints: Array, colours: Array) -> None:
     start, end, radii = limbs(joints, CAPSULES)
     directions, fraction, quads = _capsule_mesh()
     along = end - start
-    z = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
-    helper = np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-    x = np.cross(helper, z)
-    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
-    normals = directions @ np.stack([x, np.cross(z, x), z], axis=-2)  # (P, M, V, 3)
+    normals = directions @ turn_to(along).swapaxes(-1, -2)  # (P, M, V, 3)
     sizes = radii[..., :1] + fraction * (radii[..., 1:] - radii[..., :1])
     surface = start[:, :, None] + fraction[:, None] * along[:, :, None] + sizes[..., None] * normals
     tone = SIDE_TONE[[limb[4] for limb in CAPSULES]] ** 0.7

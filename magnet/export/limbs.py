@@ -79,3 +79,12 @@ def limbs(joints: Array, table: tuple[Limb, ...]) -> tuple[Array, Array, Array]:
     points = extended(joints)
     radii = np.array([limb[2:4] for limb in table]) * scale(joints)[:, None, None]
     return points[:, [limb[0] for limb in table]], points[:, [limb[1] for limb in table]], radii
+
+
+def turn_to(direction: Array) -> Array:
+    """Rotations that take +z to a direction. (..., 3) -> (..., 3, 3)"""
+    z = direction / np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
+    helper = np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    x = np.cross(helper, z)
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)

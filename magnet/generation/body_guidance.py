@@ -13,7 +13,7 @@ from magnet.body.energy import CONTACT, limit_excess, pair_energy, slide, under_
 from magnet.body.fit import clearance
 from magnet.body.fitted_capsules import fit_capsules
 from magnet.body.settle_wishes import standing
-from magnet.generation.settling import open_body_on
+from magnet.generation.separation import open_body_on
 from magnet.motion.frames import from_9d, partners, posed, project_se2, to_planar
 from magnet.motion.placement import place
 from magnet.motion.planar import rotate_ground

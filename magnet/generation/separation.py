@@ -19,7 +19,8 @@ Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @lru_cache(maxsize=4)
-def _body(device: torch.device) -> Body:
+def open_body_on(device: torch.device) -> Body:
+    """Bodies while sampling are the open body's: where the skin lies is told well enough by anybody's shape numbers."""
     return load_body().requires_grad_(False).to(device)
 
 
@@ -64,7 +65,7 @@ def separated(
         frames = slice((rows.start or 0) * TOKEN_FRAMES, None if rows.stop is None else rows.stop * TOKEN_FRAMES)
         recorded = given.frames_at(frames)
         made = posed(decode(latent[:, rows], given.betas, deltas[:, rows]), T_world_can[:, frames], recorded)
-        body, there = _body(latent.device), known[rows].repeat_interleave(TOKEN_FRAMES, dim=0)
+        body, there = open_body_on(latent.device), known[rows].repeat_interleave(TOKEN_FRAMES, dim=0)
         real, decoded = (body.joints(scene.replace(body=body.id)) for scene in (recorded, made))
         return torch.where(there[..., None, None], real, decoded)
 

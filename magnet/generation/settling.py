@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
-from magnet.body import Body, load_body
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
-from magnet.generation.separation import Decode
+from magnet.generation.separation import Decode, open_body_on
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -26,12 +23,6 @@ SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
 
 WORTH = 0.02
 """Metres that some joint must be moved for a person's block to be corrected: encoding it again costs about as much."""
-
-
-@lru_cache(maxsize=4)
-def open_body_on(device: torch.device) -> Body:
-    """Bodies while sampling are the open body's: where the skin lies is told well enough by anybody's shape numbers."""
-    return load_body().requires_grad_(False).to(device)
 
 
 def frozen(scene: Scene, agents: Tensor, frame: int) -> Scene:

@@ -14,7 +14,7 @@ import yaml
 from torch import Tensor
 
 from magnet import checkpoints
-from magnet.baselines.predictor import Generators, Predictor
+from magnet.baselines.predictor import Predictor
 from magnet.datamodules import registry
 from magnet.datamodules.base import MotionDataModule
 from magnet.datamodules.options import Augmentation, HeldOutScenes
@@ -26,7 +26,6 @@ from magnet.evaluation.scoring import generators_of
 from magnet.metrics import FrechetDistance, frechet_distance
 from magnet.metrics.frechet import moments
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
-from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout
 from magnet.report.cells import Cell
 from magnet.report.folds import FoldScoring
@@ -156,7 +155,8 @@ def long(cell: Cell, checkpoint: str) -> dict[str, Any]:
     done = 0
     for batch in data.test_dataloader():
         numbers = list(range(done, done + batch.scenes))
-        parts.append(_without_future(method, batch, cell.samples, generators_of(cell.seed, numbers, cell.samples)))
+        generators = generators_of(cell.seed, numbers, cell.samples)
+        parts.append(method(batch.slice(0, CONTEXT), cell.samples, generators))  # without the future
         recorded.append(data.body.joints(batch.slice(CONTEXT)))
         done += batch.scenes
     made, real = torch.cat(parts, dim=1), torch.cat(recorded)
@@ -173,10 +173,6 @@ def long(cell: Cell, checkpoint: str) -> dict[str, Any]:
     last = {"fd": curve[f"fd@{cell.frames // length * length}"]}
     without = {b: {**row, "fd": row[f"fd@{cell.frames // length * length}"]} for b, row in folds.items()}
     return {"rows": {OURS: {"value": {**curve, **last}, "without": without}}, "scenes": done}
-
-
-def _without_future(method: Predictor, batch: Scene, samples: int, generators: Generators) -> Tensor:
-    return method(batch.slice(0, CONTEXT), samples, generators)
 
 
 def _placed(joints: Tensor) -> Tensor:

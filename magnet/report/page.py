@@ -30,7 +30,6 @@ WORDS = {
     "own": "Trainings that differ from base.yaml in one choice of ours, which the paper does not have.",
     "A.3": "Speeds of this machine, each taken in turn with the shipped model's: only the ratio can be compared.",
 }
-CLAIM = ("claim", "place", "verdict", "difference")
 FILMS = Path("docs/pictures")
 
 Runs = Sequence[Mapping[str, Any]]

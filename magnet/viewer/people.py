@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body.base import Body
-from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs
+from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs, turn_to
 from magnet.export.page.palette import Colours, for_batches
-from magnet.export.page.rig import Array, Rig, Style, capsule, rigs, turn_to
+from magnet.export.page.rig import Array, Rig, Style, capsule, rigs
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MANY = 8

@@ -24,7 +24,6 @@ from magnet.cli import class_options, train
 from magnet.cli.checkpoint_config import LINKS, OWN_WAY
 from magnet.cli.config_files import Layer, merged, read_layers
 from magnet.cli.main import TRAINER_COMMANDS
-from magnet.datamodules import registry
 from magnet.tasks import registry as task_registry
 from tests.cases import some_slow
 from tests.toys import OtherData, ToyData, ToyModel
@@ -244,15 +243,6 @@ def test_a_command_that_a_page_shows_for_a_data_set_runs_what_it_says(
 
 
 # -- what is given ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty working folder, and toys in place of the real models and data."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
-    return tmp_path
 
 
 def data_of(*words: str) -> Any:

@@ -10,22 +10,12 @@ import yaml
 
 from magnet import cli
 from magnet.cli import config_files, demo, train, view
-from magnet.datamodules import registry
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
-from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel
+from tests.toys import ToyEvaluator, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 PAPER = SamplerOptions.preset("paper")
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty working folder, and toys in place of the real models and data."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
-    return tmp_path
 
 
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict:

@@ -12,13 +12,11 @@ import pytest
 import torch
 
 from magnet import __version__, cli
-from magnet.cli import train
 from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
 from tests import toys
 from tests.cases import some_slow
-from tests.toys import OtherData, ToyData
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
@@ -30,16 +28,6 @@ def loaded_by(*arguments: str) -> tuple[str, set[str]]:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     text, _, modules = done.stdout.rpartition("\n# ")
     return text, set(modules.split())
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty working folder, and toys in place of the real models and data."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("MAGNET_DEBUG", raising=False)
-    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
-    return tmp_path
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,19 +9,10 @@ import torch
 from torch import nn
 
 from magnet import cli
-from magnet.cli import train
 from magnet.cli.optimizers import optimizer_of
-from magnet.datamodules import registry
-from tests.toys import ToyData, ToyModel
+from tests.toys import ToyModel
 
 QUIET = ["--trainer.enable_progress_bar", "false", "--trainer.logger", "false", "--trainer.accelerator", "cpu"]
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData})
 
 
 def trained(*words: str) -> Any:

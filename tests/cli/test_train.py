@@ -13,19 +13,9 @@ from lightning.pytorch.trainer.connectors import checkpoint_connector
 
 from magnet import cli
 from magnet.cli import train
-from magnet.datamodules import registry
 from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty working folder, and toys in place of the real models and data."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
-    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
-    return tmp_path
 
 
 @pytest.fixture

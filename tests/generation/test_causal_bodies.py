@@ -14,15 +14,10 @@ from magnet.sampling.noise import LEVELS
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, Stage
 from magnet.tasks.partner import MotionControl
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene
 
 TOKENS, PAST = 14, 4
 BARE = SamplerOptions(steps=2, keep_given=False, blend=0)
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,6 @@ from magnet.tokenizer.features import features
 FAST = SamplerOptions(steps=3, stride=2)
 
 
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
-
-
 def run(
     model, scene: Scene, context: int = 16, frames: int = 34, samples: int = 1, seed: int = 0, options=FAST, task=None
 ):

@@ -23,25 +23,20 @@ FAST = SamplerOptions(steps=2)
 
 
 @pytest.fixture(scope="module")
-def denoiser():
-    return tiny_denoiser(max_agents=3, window=8)
-
-
-@pytest.fixture(scope="module")
 def duet() -> Scene:
     return random_scene(1, 60, 2, torch.Generator().manual_seed(5))
 
 
-def answered(denoiser, scene: Scene, chunk: int = 4, past: int = 16, agents=(0,)) -> Scene:
-    partner = Partner(denoiser, scene.slice(0, past), agents, FAST, torch.Generator().manual_seed(0))
+def answered(model, scene: Scene, chunk: int = 4, past: int = 16, agents=(0,)) -> Scene:
+    partner = Partner(model, scene.slice(0, past), agents, FAST, torch.Generator().manual_seed(0))
     fed = [scene.slice(first, first + chunk) for first in range(past, scene.frames, chunk)]
     return cat_time([partner.answer(frames) for frames in fed])
 
 
 @pytest.mark.parametrize("chunk", [4, 8])
-def test_what_is_fed_comes_back_and_the_answer_is_the_models(denoiser, duet, chunk):
+def test_what_is_fed_comes_back_and_the_answer_is_the_models(model, duet, chunk):
     scene = duet.slice(0, 56)
-    out, fed = answered(denoiser, scene, chunk), scene.slice(16)
+    out, fed = answered(model, scene, chunk), scene.slice(16)
     assert out.frames == 40
     assert torch.equal(out.T_world_root[:, :, 1], fed.T_world_root[:, :, 1])
     assert torch.equal(out.body_rot[:, :, 1], fed.body_rot[:, :, 1])
@@ -50,21 +45,21 @@ def test_what_is_fed_comes_back_and_the_answer_is_the_models(denoiser, duet, chu
     assert not torch.equal(out.T_world_root[:, :, 0], fed.T_world_root[:, :, 0])
 
 
-def test_nothing_of_those_who_answer_is_read_from_what_is_fed(denoiser, duet):
+def test_nothing_of_those_who_answer_is_read_from_what_is_fed(model, duet):
     other = random_scene(1, 60, 2, torch.Generator().manual_seed(6))
     T_world_root, body_rot = duet.T_world_root.clone(), duet.body_rot.clone()
     T_world_root[:, 16:, 0], body_rot[:, 16:, 0] = other.T_world_root[:, 16:, 0], other.body_rot[:, 16:, 0]
     replaced = duet.replace(T_world_root=T_world_root, body_rot=body_rot)
-    ours, theirs = answered(denoiser, duet), answered(denoiser, replaced)
+    ours, theirs = answered(model, duet), answered(model, replaced)
     assert torch.equal(ours.T_world_root, theirs.T_world_root) and torch.equal(ours.body_rot, theirs.body_rot)
 
 
-def test_an_answer_is_there_before_what_comes_next(denoiser, duet):
+def test_an_answer_is_there_before_what_comes_next(model, duet):
     """What is fed later changes nothing that was answered; what was fed before does."""
     later = duet.T_world_root.clone()
     later[:, 40:, 1, :3, 3] += 1.0
     moved = duet.replace(T_world_root=later)
-    ours, theirs = answered(denoiser, duet), answered(denoiser, moved)
+    ours, theirs = answered(model, duet), answered(model, moved)
     assert torch.equal(ours.T_world_root[:, :24], theirs.T_world_root[:, :24])
     assert not torch.equal(ours.T_world_root[:, 24:, 0], theirs.T_world_root[:, 24:, 0])
 
@@ -82,12 +77,12 @@ def test_answers_of_the_model_that_ships_go_on_from_one_another():
     assert (live.T_world_root[0, -1, 1, :3, 3] - scene.T_world_root[0, -1, 1, :3, 3]).norm() < 0.5
 
 
-def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(denoiser, duet):
+def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(model, duet):
     """Also where the frames in which they lay down have been let go."""
     T_world_root = duet.T_world_root.clone()
     T_world_root[:, 10:30, 1, :3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     scene, move = duet.replace(T_world_root=T_world_root).slice(0, 40), from_planar(torch.tensor(1.2), torch.ones(2))
-    here, there = answered(denoiser, scene).transformed(move), answered(denoiser, scene.transformed(move))
+    here, there = answered(model, scene).transformed(move), answered(model, scene.transformed(move))
     assert (here.T_world_root - there.T_world_root).abs().max() < 1e-4
 
 
@@ -101,12 +96,12 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(denoise
     ],
     ids=["token by token", "three tokens", "guided", "bare"],
 )
-def test_answers_are_what_motion_control_gives_bit_for_bit(denoiser, block, options):
+def test_answers_are_what_motion_control_gives_bit_for_bit(model, block, options):
     """Live and offline score the same: fed as it comes, or all known at once."""
     scene, past = random_scene(2, 136, 3, torch.Generator().manual_seed(7)), 16
     task, frames = MotionControl((0, 2), block), 136 - 16
-    whole = generate(denoiser, scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
-    partner = Partner(denoiser, scene.slice(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)
+    whole = generate(model, scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
+    partner = Partner(model, scene.slice(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)
     chunks = [4 * block * n for n in (1, 2)] * 40
     fed, first = [], past
     while first < scene.frames:
@@ -118,18 +113,16 @@ def test_answers_are_what_motion_control_gives_bit_for_bit(denoiser, block, opti
         assert torch.equal(getattr(live, name), getattr(whole, name)[:, past:])
 
 
-def test_a_past_of_any_length_is_used_from_its_last_whole_tokens(denoiser, duet):
+def test_a_past_of_any_length_is_used_from_its_last_whole_tokens(model, duet):
     out = [
-        Partner(denoiser, duet.slice(first, 32), (0,), FAST, torch.Generator().manual_seed(0)).answer(
-            duet.slice(32, 36)
-        )
+        Partner(model, duet.slice(first, 32), (0,), FAST, torch.Generator().manual_seed(0)).answer(duet.slice(32, 36))
         for first in (2, 4)
     ]
     assert torch.equal(out[0].T_world_root, out[1].T_world_root)
 
 
-def test_memory_does_not_grow(denoiser, duet):
-    partner = Partner(denoiser, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(0))
+def test_memory_does_not_grow(model, duet):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(0))
     held = []
     for _ in range(60):
         partner.answer(duet.slice(16, 20))
@@ -139,27 +132,27 @@ def test_memory_does_not_grow(denoiser, duet):
     assert torch.equal(partner.past.T_world_root[:, -4:, 1], duet.T_world_root[:, 16:20, 1])
 
 
-def test_what_cannot_be_answered_is_named(denoiser, duet):
-    partner = Partner(denoiser, duet.slice(0, 16), (0,), FAST)
+def test_what_cannot_be_answered_is_named(model, duet):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
     with pytest.raises(ValueError, match="multiple of 4"):
         partner.answer(duet.slice(16, 18))
     with pytest.raises(ValueError, match="same slots"):
         partner.answer(random_scene(1, 4, 3, torch.Generator().manual_seed(0)))
     with pytest.raises(ValueError, match="expected at least 4"):
-        Partner(denoiser, duet.slice(0, 2))
+        Partner(model, duet.slice(0, 2))
     with pytest.raises(ValueError, match="not none and not all"):
-        Partner(denoiser, duet.slice(0, 16), (0, 1), FAST)
+        Partner(model, duet.slice(0, 16), (0, 1), FAST)
     with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 1"):
-        Partner(denoiser, duet.slice(0, 16), (5,), FAST)
+        Partner(model, duet.slice(0, 16), (5,), FAST)
     with pytest.raises(ValueError, match=r"multiple of 12: .* 3 are answered at a time"):
-        Partner(denoiser, duet.slice(0, 16), (0,), FAST, block=3).answer(duet.slice(16, 20))
+        Partner(model, duet.slice(0, 16), (0,), FAST, block=3).answer(duet.slice(16, 20))
     with pytest.raises(ValueError, match="pairwise_noise='token': given tokens hold where the others are"):
         Partner(tiny_denoiser(noise={"pairwise": "token"}), duet.slice(0, 16))
 
 
-def test_a_loaded_model_gives_a_partner(denoiser, duet):
-    partner = Model(denoiser, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
-    again = Model(denoiser, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
+def test_a_loaded_model_gives_a_partner(model, duet):
+    partner = Model(model, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
+    again = Model(model, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
     one, two = (each.answer(duet.slice(32, 40)) for each in (partner, again))
     assert torch.equal(one.T_world_root, two.T_world_root)
     assert torch.equal(one.T_world_root[:, :, 0], duet.T_world_root[:, 32:40, 0])

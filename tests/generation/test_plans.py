@@ -10,16 +10,11 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene
 
 PYRAMID = SamplerOptions(steps=12, stride=2, pyramid_offset=1)
 INDEPENDENT = SamplerOptions(steps=4, stride=2, pyramid_offset=0, noise_sampling="independent")
 CANNOT_ROLL = ("agentic_async", "agentic_sync", "inbetweening", "motion_control")
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
 
 
 def run(model, scene: Scene, task, options: SamplerOptions, context: int = 16, frames: int | None = 32, **more):

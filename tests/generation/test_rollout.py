@@ -48,11 +48,6 @@ FROM_NOTHING = ("generation", "one keyframe, nothing before")
 
 
 @pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
-
-
-@pytest.fixture(scope="module")
 def recording() -> Scene:
     return random_scene(2, 4 * TOKENS, 3, torch.Generator().manual_seed(3))
 

@@ -19,17 +19,12 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions, Separation
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene
 from magnet.testing.poses import pose_law
 from tests.cases import some_slow
 
 BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="firm", settle_blocks=True)
 GRID = Grid(12, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
 
 
 def run(model, scene: Scene, name: str, options: SamplerOptions, **more) -> Scene:

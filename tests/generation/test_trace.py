@@ -13,13 +13,8 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import PartnerPrediction
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import random_scene
 from magnet.viewer.levels import level_image
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
 
 
 @pytest.fixture

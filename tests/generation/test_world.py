@@ -18,14 +18,9 @@ from magnet.tasks.base import Task
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
-from magnet.testing import tiny_denoiser, without_absent
+from magnet.testing import without_absent
 
 OPTIONS = SamplerOptions(steps=2, stride=2)
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_denoiser(max_agents=3, window=8)
 
 
 def test_rows_taken_in_one_after_the_other_are_those_taken_in_at_once(model, scene):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import os
 import re
@@ -17,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 
 from magnet.datamodules.reading.cmu_subjects import folder_of
+from magnet.files import file_hash
 
 SITE = "http://mocap.cs.cmu.edu"  # plain: the site's certificate chain is incomplete
 MOST_SUBJECTS = 20
@@ -112,7 +112,7 @@ def download_cmu(
                 target.parent.mkdir(parents=True, exist_ok=True)
                 part = _fetch(f"{base_url}/subjects/{subject}/{file}", target, retries, progress)
                 time.sleep(retries.pause)
-            found = sha256(target if there else part)
+            found = file_hash(target if there else part)
             if known not in (None, found) and not any_version:
                 refused.append(f"{target}: its SHA-256 is {found}, expected {known}")
                 if not there:
@@ -317,17 +317,11 @@ def unsound(path: Path, kind: str) -> str:
 # -- checksums ---------------------------------------------------------------------------------
 
 
-def sha256(path: Path) -> str:
-    """Of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _whole(path: Path, known: str | None) -> bool:
     """The file is as it was fetched; one that was put there by hand is whole if it reads like one."""
     if not path.is_file():
         return False
-    return sha256(path) == known if known else not unsound(path, path.suffix)
+    return file_hash(path) == known if known else not unsound(path, path.suffix)
 
 
 def _read_manifest(path: Path) -> dict[str, str]:

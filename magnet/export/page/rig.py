@@ -17,7 +17,20 @@ from torch import Tensor
 
 from magnet.body.base import Body
 from magnet.body.joints import PARENTS
-from magnet.export.limbs import CAPSULES, CROWN, L_HAND, L_HEEL, L_TOE, R_HAND, R_HEEL, R_TOE, STICKS, Limb, limbs
+from magnet.export.limbs import (
+    CAPSULES,
+    CROWN,
+    L_HAND,
+    L_HEEL,
+    L_TOE,
+    R_HAND,
+    R_HEEL,
+    R_TOE,
+    STICKS,
+    Limb,
+    limbs,
+    turn_to,
+)
 from magnet.export.page.light import light
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -161,12 +174,3 @@ def capsule(length: float, near: float, far: float, sectors: int = 14, rings: in
     here, after, up = i * sectors + k, i * sectors + (k + 1) % sectors, sectors
     quads = [np.stack([here, after, after + up], axis=1), np.stack([here, after + up, here + up], axis=1)]
     return points, np.concatenate(quads), np.repeat(half, sectors)
-
-
-def turn_to(direction: Array) -> Array:
-    """Rotations that take +z to a direction. (..., 3) -> (..., 3, 3)"""
-    z = direction / np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
-    helper = np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-    x = np.cross(helper, z)
-    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-1)

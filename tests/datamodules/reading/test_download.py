@@ -16,6 +16,7 @@ from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.reading import download
 from magnet.datamodules.reading.download import DownloadError, Retries, download_cmu
 from magnet.datamodules.reading.recording import DataError
+from magnet.files import file_hash
 
 QUICK = Retries(attempts=3, backoff=0.001, timeout=5.0, pause=0.0)
 
@@ -331,6 +332,4 @@ def test_real_recordings_are_whole_and_are_the_tested_ones(cmu_root: Path) -> No
     assert len(tested) > 60
     for path in paths:
         assert not download.unsound(path, path.suffix)
-        assert tested.get(path.name) == download.sha256(path), (
-            f"{path.name} is not the file this project was tested with"
-        )
+        assert tested.get(path.name) == file_hash(path), f"{path.name} is not the file this project was tested with"

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from magnet.body import Body
-from magnet.export.limbs import CAPSULES, STICKS, limbs
-from magnet.export.page.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest, turn_to, world_rotations
+from magnet.export.limbs import CAPSULES, STICKS, limbs, turn_to
+from magnet.export.page.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest, world_rotations
 from magnet.motion.scene import Scene
 
 MILLIMETRE = 1e-3
