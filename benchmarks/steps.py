@@ -1,4 +1,4 @@
-"""Quality against denoising steps: joint future, motion control and turn-taking on recorded test takes.
+"""Quality against denoising steps on recorded test takes, of some tasks or all.
 
     MAGNET_CMU=... python benchmarks/steps.py --scenes 6 --samples 2 --out runs/results/steps
 
@@ -21,17 +21,10 @@ from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import TRUTH, Evaluator
 from magnet.evaluation.results import Results, machine
 from magnet.sampling.options import SamplerOptions
-from magnet.tasks.agentic import AgenticAsync
-from magnet.tasks.base import Task
-from magnet.tasks.joint import JointFuture
-from magnet.tasks.partner import MotionControl
+from magnet.tasks import registry
 
 METRICS = ["fd_pair", "fd", "div", "fs", "ip_ratio", "mpjpe@1s", "mpjpe@5s"]
-TASKS: dict[str, Task] = {
-    "joint_future": JointFuture(),
-    "motion_control": MotionControl(),
-    "agentic_async": AgenticAsync(),
-}
+TASKS = ["joint_future", "motion_control", "agentic_async"]
 
 
 def main() -> None:
@@ -44,7 +37,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=150, help="after the context")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 4, 8, 16, 30])
     parser.add_argument("--precision", default="float32", choices=["reference", "float32", "bf16"])
-    parser.add_argument("--task", nargs="+", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--task", nargs="+", default=TASKS, choices=registry.names())
     given = parser.parse_args()
     quiet()
     warnings.filterwarnings("ignore", ".*inference tensor.*")
@@ -60,7 +53,7 @@ def main() -> None:
             if name in found.rows:
                 continue
             options = SamplerOptions(steps=steps, precision=given.precision)
-            evaluator = Evaluator(model, TASKS[task], options, given.samples, baselines=False)
+            evaluator = Evaluator(model, registry.get(task)(), options, given.samples, baselines=False)
             silent = {"logger": False, "enable_checkpointing": False, "enable_model_summary": False}
             trainer = L.Trainer(accelerator="cpu", enable_progress_bar=False, **silent)  # type: ignore[arg-type]
             trainer.test(evaluator, datamodule=data, verbose=False)
