@@ -19,6 +19,8 @@ from magnet.viewer.scenery import Floor
 from magnet.viewer.server import start
 from magnet.viewer.timeline import Timeline, Tracks
 
+TOLD = 15.0
+"""Seconds that a refusal stays in sight."""
 RATE = FPS
 """Frames a second that are sent at most."""
 SETTLES = 0.3
@@ -182,7 +184,7 @@ class ViewerBase:
                 name = "".join(c if c.isalnum() else "_" for c in view.take.label) or "scene"
                 event.client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
             except (ValueError, OSError, ImportError) as error:
-                event.client.add_notification("Not saved", str(error), color="red", auto_close_seconds=15.0)
+                event.client.add_notification("Not saved", str(error), color="red", auto_close_seconds=TOLD)
             finally:
                 button.disabled = False
 

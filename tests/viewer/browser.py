@@ -162,6 +162,10 @@ class Panel:
         """Press a button."""
         self.page.get_by_role("button", name=name, exact=True).click()
 
+    def look_from(self, name: str) -> None:
+        """Stand where a preset says; while people play, the camera moves as far away as a machine's speed has it."""
+        self.page.get_by_text(name, exact=True).click()
+
     def downloaded(self, kind: str, name: str, folder: Path) -> Path:
         """Save the take as a format, from the open folder Save; the file that the browser gets."""
         self.choose("format", kind)
@@ -207,7 +211,7 @@ def seen(page: Any, name: str, right: Callable[[np.ndarray], Any]) -> np.ndarray
         image = shot(page, name)[STAGE]
         return image if right(image) else None
 
-    end = time.monotonic() + 120
+    end = time.monotonic() + 300
     while (image := stage()) is None:
         assert time.monotonic() < end, f"{name}.png does not look right"
     return image

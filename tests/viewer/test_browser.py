@@ -19,8 +19,8 @@ from tests.viewer.browser import blue, grey, orange, pale_orange, seen, shipped,
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-GHOSTS = 6_000
-"""Grey pixels of a stage above which there are ghosts: they make 3,500, lines and trails 4,300."""
+GHOSTS = 9_000
+"""Grey pixels of a stage above which there are ghosts: 14,000 with them, 6,000 of lines and trails without."""
 
 
 def test_files_play_pause_step_and_scrub(page, panel, handshake, body) -> None:
@@ -40,6 +40,7 @@ def test_files_play_pause_step_and_scrub(page, panel, handshake, body) -> None:
         panel.enter("frame", 66)
         wait(lambda: viewer.shown == 66)
         wait(lambda: panel.field("frame").last.input_value() == "66")  # also where older frames come late
+        panel.look_from("three quarters")
         seen(page, "watch_body", lambda image: blue(image).sum() > 500 and grey(image).sum() > GHOSTS)
         assert page.get_by_text("standing feet").is_visible()
         panel.tick("ground truth")
@@ -54,14 +55,16 @@ def test_the_look_changes_and_the_scene_is_saved(page, panel, handshake, body, t
     with watched(page, takes, body) as viewer:
         viewer.clock.playing = False
         viewer.clock.seek(64)
+        panel.look_from("three quarters")
+        bodies = blue(seen(page, "watch_bodies", lambda image: blue(image).sum() > 4000)).sum()
         panel.choose("people", "capsules")
         wait(lambda: viewer.render.style == "capsules")
-        full = blue(seen(page, "watch_capsules", lambda image: blue(image).sum() > 300)).sum()
+        full = blue(seen(page, "watch_capsules", lambda image: 300 < blue(image).sum() < 0.6 * bodies)).sum()
         panel.choose("people", "skeleton")
         wait(lambda: viewer.render.style == "skeleton")
-        seen(page, "watch_skeleton", lambda image: 60 < blue(image).sum() < 0.8 * full)
+        seen(page, "watch_skeleton", lambda image: 60 < blue(image).sum() < 0.9 * full)
         (client,) = viewer.server.get_clients().values()
-        page.get_by_text("above", exact=True).click()
+        panel.look_from("above")
         wait(lambda: client.camera.position[1] > 0.9 * np.linalg.norm(client.camera.position))
         seen(page, "watch_above", lambda image: blue(image).any() and not upright(blue(image) | orange(image)))
         page.get_by_text("Save", exact=True).click()
@@ -106,6 +109,7 @@ def test_what_cannot_be_saved_is_said_and_nothing_is_downloaded(page, panel, han
     monkeypatch.setattr(base, "saved", refuses)
     files = []
     page.on("download", lambda download: files.append(download))
+    monkeypatch.setattr(base, "TOLD", 600.0)
     with watched(page, [take("dance", handshake.slice(40, 64))], body, style="skeleton"):
         page.get_by_text("Save", exact=True).click()
         panel.press("Download")
@@ -123,10 +127,15 @@ def differs(image: np.ndarray, before: np.ndarray | None) -> bool:
     return before is None or (abs(image - before).sum(axis=-1) > 60).sum() > 300
 
 
+def white(image: np.ndarray) -> float:
+    """Share of a picture that is white."""
+    return float((image.min(axis=-1) > 235).mean())
+
+
 def test_the_slider_goes_through_the_steps_of_denoising(page, panel, handshake, body) -> None:
     generator = torch.Generator().manual_seed(1)
     recording = record(shipped(), handshake, JointFuture(), 32, 32, SamplerOptions(steps=6), generator)
-    noise, images = [], []
+    images: list[np.ndarray] = []
     with watched(page, [take("steps", recording.scene, recording=recording)], body) as viewer:
         panel.press("Pause")
         wait(lambda: not viewer.clock.playing)
@@ -139,7 +148,6 @@ def test_the_slider_goes_through_the_steps_of_denoising(page, panel, handshake, 
             before = images[-1] if images else None
             shows = f"denoising_{name}"
             images.append(seen(page, shows, lambda image, before=before: blue(image).any() and differs(image, before)))
-            noise.append((shot(page, f"levels_{name}", levels).min(axis=-1) > 235).mean())
-    assert (
-        0.2 < noise[0] < 0.6 and noise[1] < 0.05
-    )  # the window's new half is white at first, and full of colour at last
+            # The window's new half is white at first, and full of colour at last.
+            least, most = (0.2, 0.6) if step == 0 else (0.0, 0.05)
+            wait(lambda least=least, most=most, name=name: least <= white(shot(page, f"levels_{name}", levels)) <= most)
