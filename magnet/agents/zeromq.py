@@ -96,7 +96,7 @@ class Link:
         self.out.send_multipart(parts)
 
     def receive(self, seconds: float) -> list[tuple[str, list[bytes]]]:
-        """What has come, with the name that its address was given for; waits so long for the first."""
+        """Messages that have arrived, each with its sender's name; waits for the first at most so long."""
         found = []
         for socket, _ in self.poller.poll(max(int(1000 * seconds), 0)):
             for _ in range(QUEUE):

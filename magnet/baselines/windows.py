@@ -113,9 +113,9 @@ class Windows:
 
 
 def recording(label: str) -> str:
-    """The recording that a window is of, by its label as data sets write it: "60_05+61_05 x1.1 [120:302]".
+    """Name of the recording that a window was cut from, read off the window's label: "60_05+61_05 x1.1 [120:302]".
 
-    Windows of one recording played at several speeds (`CMU.speeds`) are of the same.
+    A recording that is played at several speeds (`CMU.speeds`) has one name.
     """
     return re.sub(r" x[\d.]+$", "", label.partition(" [")[0])
 

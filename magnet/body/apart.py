@@ -48,7 +48,7 @@ class Apart:
     Args:
         body: depth in metres that is allowed between trunks, heads and legs.
         arms: the same between an arm and any of these. Arms may overlap each other without limit.
-        ease: frames before and after a collision over which people make way, twice (maximum, then mean).
+        ease: frames over which people make way before and after a collision: a running maximum, then a running mean.
         speed: highest speed in m/s of a push where the motion continues a past that stays.
         rounds: passes over all pairs; from three people on, more than one matters.
     """

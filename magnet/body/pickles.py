@@ -32,7 +32,7 @@ class _Chumpy(StandIn):
 
     def made(self, a: NDArray, inner: Callable[[Any], Any]) -> NDArray:
         """The numbers, computed from the array `a`."""
-        raise DataError("an array of chumpy without numbers")
+        raise DataError("an array of chumpy holds no numbers")
 
     def shape(self, key: str, size: int, inner: Callable[[Any], Any]) -> tuple[int, ...]:
         """The shape under a key of its state; it must hold `size` numbers."""
@@ -77,7 +77,7 @@ class _Sparse(StandIn):
     by_column: ClassVar[bool] = True
 
     def real(self, inner: Callable[[Any], Any]) -> NDArray:
-        """The dense matrix."""
+        """As a dense matrix."""
         state = {key.lstrip("_"): value for key, value in self.state.items() if isinstance(key, str)}
         parts = {key: _numbers(inner(state.get(key))).ravel() for key in ("data", "indices", "indptr", "shape")}
         rows, columns = (int(n) for n in parts["shape"]) if parts["shape"].size == 2 else (0, 0)

@@ -25,7 +25,7 @@ LET_GO = 0.10
 """Metres that people may be moved apart before their held hands are let go."""
 
 
-def moved_apart(scene: Scene, body: Body, keep: Apart, fixed: Tensor | None = None, begun: bool = False) -> Scene:
+def moved_apart(scene: Scene, body: Body, keep: Apart, fixed: Tensor | None = None) -> Scene:
     """A scene whose people are moved over the ground, out of each other's bodies.
 
     Args:
@@ -33,9 +33,8 @@ def moved_apart(scene: Scene, body: Body, keep: Apart, fixed: Tensor | None = No
         body: that its shapes belong to.
         keep: depths and times.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved.
-        begun: as for `kept_apart`.
     """
-    offsets = kept_apart(body.joints(scene), scene.present, fixed, keep, begun, scene.fps)
+    offsets = kept_apart(body.joints(scene), scene.present, fixed, keep, fps=scene.fps)
     return moved_over_ground(scene, offsets)
 
 

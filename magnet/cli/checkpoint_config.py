@@ -65,10 +65,10 @@ class Arguments:
         return [layer.options for layer in self.layers]
 
     def flag(self, key: str) -> str | None:
-        """The last value that a flag gives.
+        """The value of a flag; of several the last.
 
         Raises:
-            CommandError: the flag stands at the end, without one.
+            CommandError: the flag is the last word, without a value.
         """
         value = None
         for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):

@@ -75,7 +75,7 @@ def read_yaml(file: str) -> dict[str, Any]:
 
 
 def with_presets(options: dict[str, Any]) -> dict[str, Any]:
-    """Options in which `sampler: NAME`, or `preset: NAME` among the sampler's, is what the preset stands for.
+    """Options with `sampler: NAME`, or `preset: NAME` among the sampler's, replaced by the preset's values.
 
     Raises:
         CommandError: no such preset.

@@ -31,7 +31,7 @@ def run_list(given: argparse.Namespace) -> int:
 
 
 def draw_list(console: Console, name: str | None) -> bool:
-    """Everything that there is to tell, or of one data set. -> whether it will be the same the next time"""
+    """Print all data sets, or one in full. -> whether the same call will print the same again"""
     from magnet.datamodules import registry
 
     if name:

@@ -80,7 +80,7 @@ KINDS = {
 
 
 def wrong_value(message: str, flag: str | None = None) -> str | None:
-    """The parser's lines about a value that does not fit its field, as one; None where it says something else.
+    """The parser's message about a value that does not fit its field, in one line; None for any other message.
 
     Args:
         message: jsonargparse's.

@@ -84,7 +84,7 @@ class SoloPairs(Parts):
         self.pair_seed = pair_seed
 
     def clips(self, split: Split) -> list[Clip]:
-        """A pair of each kind for every training clip of one person; nothing to validate or test on."""
+        """One pair of each kind for every training clip of one person; none for validation and test."""
         if split != "train":
             return []
         pairs = []

@@ -83,7 +83,7 @@ class Benchmark:
         return task
 
     def sight(self, task: str, people: int | None = None) -> Sight:
-        """What a task gives and asks for."""
+        """Which frames of whom a task gives, and which it asks for."""
         plan = planned(self.task(task), self.context_frames, self.horizon_frames, people or self.people)
         return Sight.of(plan, self.context_frames, self.horizon_frames)
 

@@ -1,4 +1,4 @@
-"""Methods by name, as predictors: baselines by the name of their row, models by their checkpoint."""
+"""Predictors by name: a baseline by its row in the results, a model by its checkpoint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BASELINES = ("NN", "RS", "zero velocity", "ridge")
 
 
 def sight_of(task: Task, datamodule: MotionDataModule, people: int) -> Sight:
-    """What a task gives and asks for in a data set's test scenes."""
+    """Which frames of whom a task gives in a data set's test scenes, and which it asks for."""
     context, horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
     return Sight.of(planned(task, context, horizon, people), context, horizon)
 

@@ -5,7 +5,7 @@ from magnet.export.drawing import Camera
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
-from magnet.export.picture import contact_sheet, topview
+from magnet.export.picture import contact_sheet
 from magnet.export.retarget import load_bvh
 from magnet.export.video import render_video
 from magnet.motion.resample import resampled
@@ -21,5 +21,4 @@ __all__ = [
     "save_csv",
     "save_glb",
     "save_smplx",
-    "topview",
 ]

@@ -172,7 +172,7 @@ class _Gltf:
         return self.add("accessors", item)
 
     def skin_of(self, body: Skinned) -> dict[str, int]:
-        """What meshes of every shape share: faces, and which joints move which vertex."""
+        """The part of the skin that does not depend on a person's shape: faces, and which joints move which vertex."""
         joints, weights = influences(body.weights.detach().cpu().double().numpy())
         faces = body.faces.detach().cpu().numpy()
         wide = INT if faces.max() > 65534 else SHORT

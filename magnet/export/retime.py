@@ -1,4 +1,4 @@
-"""People of several files in one scene."""
+"""People of several files put into one scene, at one frame rate and length."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def agent_name(agent: int) -> str:
 
 
 def shade(colour: Colour, level: int) -> Colour:
-    """A colour as saturated as a token at that level is clean."""
+    """A colour by noise level: full where a token is clean, paler the noisier it is."""
     return mix(colour, NOISE_SHARE + (1 - NOISE_SHARE) * (1 - level / LEVELS))
 
 

@@ -85,9 +85,9 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
         b = int(off.abs().argmax())
         metres = float(off[b])
         raise ValueError(
-            f"{label(scene, b)}: everybody stands {abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where "
-            "the model has its floor: put them there with magnet.on_floor(scene) or magnet export --on_floor, or say "
-            "any_floor=True (--sampler.any_floor true) if they really are up there"
+            f"{label(scene, b)}: everybody stands {abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, the "
+            "model's floor: move them there with magnet.on_floor(scene) or magnet export --on_floor; if they really "
+            "are off the floor, give any_floor=True (--sampler.any_floor true)"
         )
 
 

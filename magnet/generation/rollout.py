@@ -275,7 +275,7 @@ class Rollout:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
     def _ask_for(self, stage: Stage) -> None:
-        """Which predictions of each step are read: of what the stage changes, and of what follows it in the end."""
+        """Note whose predictions are read: tokens that the stage changes and, in its last step, those behind them."""
         self._left = len(stage.levels) - 1
         # A token that is known may hold pairwise transforms to somebody who is not.
         begins, ends = (self.model.layout.group_levels(levels) for levels in stage.levels[[0, -1]])

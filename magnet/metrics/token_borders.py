@@ -28,10 +28,10 @@ def at_borders(frames: int, order: int, stride: int = TOKEN_FRAMES) -> Tensor:
 
 
 class TokenBorders(MotionMetric):
-    """`border_acceleration` and `border_jerk`: the pelvis's at token borders, divided by those inside tokens.
+    """`border_acceleration` and `border_jerk`: those of the pelvis at token borders, divided by those inside tokens.
 
-    Mean length of the second and third difference over differences with frames of two tokens, and of one alone. The
-    future begins with a token. Recorded motion knows of no tokens and has about 1.
+    The mean length of second (third) differences that span two tokens, over the mean of those within one token. The
+    future begins with a token. Recorded motion, which has no tokens, is at about 1.
 
     Args:
         stride: frames in a token.
@@ -58,7 +58,9 @@ class TokenBorders(MotionMetric):
     def __init__(self, stride: int = TOKEN_FRAMES, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         if stride < 4:
-            raise ValueError(f"stride={stride}: a jerk spans 4 frames, so tokens of at least 4 have an inside")
+            raise ValueError(
+                f"stride: got {stride}, expected at least 4: a jerk spans 4 frames, so shorter tokens have none inside"
+            )
         self.stride = stride
         self.add_sum("sums", 2, 2, 2)
 

@@ -55,10 +55,10 @@ def _table(table: tuple[tuple[int, ...], ...], device: torch.device | None) -> T
 def nearest_partners(
     ground: Tensor, present: Tensor, before: Tensor, bonds: Tensor, enter: float = ENTER, leave: float = LEAVE
 ) -> Tensor:
-    """Each person's nearest partners, and whoever was one before until further away than `leave`.
+    """Each person's nearest partners; a partner of before stays one until further away than `leave`.
 
-    Who was a partner before counts as `leave - enter` nearer than he is, so that nobody flickers. Partners who stay
-    keep their slots; slots are free for anybody otherwise.
+    Distances to partners of before count as `leave - enter` shorter, so that partners do not change to and fro. Those
+    who stay keep their slots; the other slots go to the new ones.
 
     Args:
         ground: (P, 2) metres, where people are.

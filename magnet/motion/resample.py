@@ -100,8 +100,7 @@ def at_speed(scene: Scene, speed: float) -> Scene:
 def resampled(scene: Scene, fps: float) -> Scene:
     """The same motion at exact times t = i / fps: slerp between rotations, straight lines between positions.
 
-    A frame between two of which one is not valid is not valid; one between two of which one was not given to a model
-    was not given either.
+    A new frame is valid if all old frames that it is made of are, and given if all of these were given to a model.
 
     Raises:
         ValueError: the rate is not positive.

@@ -47,7 +47,7 @@ class Head(nn.Module):
 
 
 class ReadyToReact(Peer):
-    """Each of two people goes on by itself, having seen both up to now; it never sees anything later."""
+    """Each of two people is predicted step by step from the past of both; nothing later is seen."""
 
     def build_network(self) -> None:
         self.transformer = PartnerTransformer(self.layout.width, self.own_width, self.network)

@@ -38,8 +38,8 @@ class Folds:
 
     Args:
         fps: frames a second.
-        compares: False: the motion itself is measured, and nothing of how far it is from the recording.
-        everybody: people who were given are scored too, who are copies of the recording.
+        compares: also measure how far the motion is from the recording; False: the motion alone.
+        everybody: score people who were given as well; their motion is the recording's.
     """
 
     def __init__(self, fps: float, compares: bool = True, everybody: bool = False) -> None:

@@ -67,7 +67,7 @@ def _centre(k: int, pairs: int) -> Tensor:
 def _shake(
     plan: Plan, people: People, pair: tuple[int, int], centre: Tensor, contact: list[float], hertz: float, clock: Tensor
 ) -> None:
-    """Write the right hands, the eyes and the bow of a pair into the plan."""
+    """Add to the plan how a pair's right hands move, where both look and how they bow."""
     grip, release = contact
     held = ease((clock - grip) / 0.25) * (1 - ease((clock - release + 0.3) / 0.3))
     pump = 0.035 * held * torch.sin(2 * math.pi * hertz * (clock - grip))

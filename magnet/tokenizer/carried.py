@@ -21,7 +21,7 @@ class SpanLayer(Protocol):
         ...
 
     def final(self, steps: int) -> int:
-        """How many first steps of the output see so many first ones of the input, and no later ones."""
+        """How many steps of the output depend on the first so many steps of the input alone."""
         ...
 
     def __call__(self, x: Tensor, held: Span, span: Span, length: int) -> Tensor:

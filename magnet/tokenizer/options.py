@@ -31,7 +31,9 @@ class AutoencoderOptions:
         require_whole("depth", self.depth, 1)
         require_whole("lookahead", self.lookahead, 0, 1)
         if self.lookahead and not self.causal:
-            raise ValueError("lookahead: only of a causal tokenizer, one that is not sees both ways; give causal too")
+            raise ValueError(
+                "lookahead: got 1 without causal, but a tokenizer that is not causal sees all frames; set causal, too"
+            )
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ class ResidualVQ(Float32):
         return self.waits and not bool(self.initialized)
 
     def continuous(self, vectors: Tensor) -> Tensor:
-        """The vectors unchanged: codes lie in the same space."""
+        """The vectors as they are, not quantized: codes lie in the same space."""
         return vectors.float()
 
     @torch.no_grad()

@@ -25,7 +25,7 @@ class RawPose(nn.Module):
         self.pose = Normalizer(POSE_FEATURES)
 
     def fit_normalizers(self, scenes: Iterable[Scene]) -> None:
-        """z-scores from scenes; until then the latent is the plain pose."""
+        """Set mean and standard deviation of poses from scenes; before, the latent is the pose, not normalized."""
         self.pose.set(*statistics(scenes)["pose"])
 
     def encode(

@@ -78,7 +78,7 @@ def _every(seconds: float) -> int:
 
 
 class Timeline:
-    """The panel along the bottom, as wide as the picture of whoever came last.
+    """The panel along the bottom, as wide as the window of the browser whose camera moved last.
 
     Args:
         server: viser's.

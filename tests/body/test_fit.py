@@ -11,9 +11,10 @@ from torch import Tensor
 
 from magnet.body import JOINT_NAMES, PARENTS, Body, load_body
 from magnet.body.fit import FitSettings, clearance, fit_body, kabsch, shape_from_lengths, swing
-from magnet.datamodules.preparing.fit_whole import LIMBS, fit_recordings
+from magnet.datamodules.preparing.fit_whole import LIMBS, fit_whole
 from magnet.datamodules.reading.asf import read_asf
 from magnet.datamodules.reading.asf_amc import read_amc
+from magnet.datamodules.reading.cmu_joints import measured
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -170,7 +171,7 @@ def test_a_real_couple_fits_within_the_bars(cmu_root: Path, body: Body) -> None:
     for subject in (60, 61):
         whole = read_amc(cmu_root / f"salsa/{subject}_10.amc", read_asf(cmu_root / f"salsa/{subject}.asf"), 60)
         people.append(replace(whole, root=whole.root[700:1000], local=whole.local[700:1000]))
-    fitted = fit_recordings(people, body)
+    fitted = fit_whole(*measured(people), body)
     scene = fitted.fit.scene
     assert scene.frames == 150 and scene.agents == 2 and scene.fps == 30
     assert fitted.limb_error < 0.025

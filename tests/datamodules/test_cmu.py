@@ -16,11 +16,11 @@ from magnet.datamodules.cmu import CMU, CMUReader, is_couple
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
-from magnet.datamodules.preparing.fit_whole import fit_recordings, wrists_apart
+from magnet.datamodules.preparing.fit_whole import fit_whole, wrists_apart
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.asf import read_asf
 from magnet.datamodules.reading.asf_amc import read_amc
-from magnet.datamodules.reading.cmu_joints import ENDS, check_rate
+from magnet.datamodules.reading.cmu_joints import ENDS, check_rate, measured
 from magnet.datamodules.reading.recording import DataError
 from magnet.motion.scene import Scene
 from tests.datamodules.slow_cmu import slow_ends
@@ -124,7 +124,7 @@ def test_an_interrupted_write_leaves_nothing(made: Path, tmp_path: Path, monkeyp
 def test_a_wrist_is_where_the_hand_begins_on_one_line_with_the_forearm(filled: CMU, made: Path) -> None:
     """The bone `wrist` only rolls: whoever ends an arm at `radius` cuts a third of the forearm off."""
     skeleton = read_asf(made / "02.asf")
-    fitted = fit_recordings([read_amc(made / "02_01.amc", skeleton, 120)], filled.body)
+    fitted = fit_whole(*measured([read_amc(made / "02_01.amc", skeleton, 120)]), filled.body)
     found = filled.body.joints(fitted.fit.scene)[0, :, 0]
     for joint, side in ((20, "l"), (21, "r")):
         for frame in (0, 30, 60):

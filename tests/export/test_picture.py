@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from magnet.body import Body
-from magnet.export import contact_sheet, topview
+from magnet.export import contact_sheet
 from magnet.export.cast import STYLES, Style
 from magnet.export.drawing import AGENTS, CONTEXT
 from magnet.export.figures import bulged
@@ -46,21 +46,11 @@ def test_columns_spread_from_first_to_last_frame(duet: Scene, body: Body, tmp_pa
     assert every.read_bytes() == named.read_bytes()
 
 
-def test_ways_from_above_start_pink_and_end_in_the_agents_colours(
-    duet: Scene, body: Body, tmp_path: Path, pixels_like: Count
-) -> None:
-    path = topview([("a", duet), ("b", duet)], tmp_path / "top.png", context_frames=4, body=body, title="ways")
-    with Image.open(path) as page:
-        assert page.width == 840
-        for colour in (*CONTEXT[:2], *AGENTS[:2]):
-            assert pixels_like(page, colour) > 40
-
-
 def test_bad_frames_and_suffixes_are_named(duet: Scene, body: Body, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"frames \[12\]: expected some of 0 to 11"):
         contact_sheet(duet, tmp_path / "a.png", context_frames=4, frames=[12], body=body)
     with pytest.raises(ValueError, match=r"a\.jpg.*\.png"):
-        topview(duet, tmp_path / "a.jpg", context_frames=4, body=body)
+        contact_sheet(duet, tmp_path / "a.jpg", context_frames=4, body=body)
 
 
 def test_rounding_a_mesh_of_a_sphere_comes_nearer_the_sphere() -> None:

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES, PARENTS
-from magnet.datamodules.preparing.fit_whole import fit_recordings
+from magnet.datamodules.preparing.fit_whole import fit_whole
 from magnet.datamodules.reading.asf import read_asf
 from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc
+from magnet.datamodules.reading.cmu_joints import measured
 from magnet.export import load_bvh, save_bvh
 from magnet.export.naming import recognised
 from magnet.export.retarget import Imported
@@ -265,7 +266,7 @@ def test_recorded_dancers_as_bvh_fit_as_well_as_their_own_reader_does(take, cmu_
     found = load_bvh(as_bvh(short, tmp_path / f"{take}.bvh"), body)
     (source,) = found.sources
     assert source.unit.startswith("CMU") and source.scheme == "CMU" and len(source.joints) >= 20
-    own = fit_recordings([short], body)
+    own = fit_whole(*measured([short]), body)
     assert source.residual < own.limb_error + 0.01 < 0.04
     ours, theirs = body.joints(own.fit.scene)[0, :, 0], body.joints(found.scene)[0, :, 0]
     assert (ours - theirs).norm(dim=-1)[:, LIMBS].mean() < 0.03

@@ -43,5 +43,5 @@ def test_a_jump_at_each_border_shows_and_one_inside_tokens_shows_the_other_way()
 
 
 def test_tokens_too_short_to_have_an_inside_are_refused() -> None:
-    with pytest.raises(ValueError, match="stride=3"):
+    with pytest.raises(ValueError, match="stride: got 3"):
         TokenBorders(stride=3)

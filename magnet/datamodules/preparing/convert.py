@@ -57,8 +57,8 @@ def require_family(kind: type[Reader], body: Body, option: str, file: str) -> No
         "" if option == "--bodies" else f", or with --bodies beside this one, to have everybody as {title(body.family)}"
     )
     raise ValueError(
-        f"{option} {file}: body {body.id!r} is {title(body.family)}'s by its tree of joints, but {kind.title} holds "
-        f"shape numbers of {titles(families)}: give that body's file with {option}{other}; it is from "
+        f"{option} {file}: body {body.id!r} has the joints of {title(body.family)}, but {kind.title} holds shape "
+        f"numbers of {titles(families)}: give a body file of that family with {option}{other}; such files are from "
         f"{BODY_FROM[kind.family]}"
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,7 @@ from magnet.body import Body
 from magnet.body.fit import BodyFit, floor_height
 from magnet.body.joints import ELBOWS, FEET, HIPS, KNEES, SHOULDERS, WRISTS
 from magnet.datamodules.preparing.canonicalize import fit_positions
-from magnet.datamodules.reading.asf_amc import AmcRecording
 from magnet.datamodules.reading.cmu_glitches import Glitches
-from magnet.datamodules.reading.cmu_joints import measured
 from magnet.datamodules.reading.recording import Recording
 from magnet.motion.scene import Scene
 
@@ -39,21 +37,6 @@ class Fitted:
     held_recorded: float  # share of frames with two people's wrists closer than HELD; NaN for one person
     held_fitted: float
     floor: float  # metres that the recording's ground lay above its y = 0
-
-
-def fit_recordings(
-    recordings: Sequence[AmcRecording],
-    body: Body,
-    *,
-    trim: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Fitted:
-    """People captured together as bodies in one scene at 30 fps, standing on y = 0.
-
-    Raises:
-        ValueError: lengths differ, or the body does not fit.
-    """
-    return fit_whole(*measured(recordings, trim), body, progress)
 
 
 def fit_whole(

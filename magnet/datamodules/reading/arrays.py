@@ -107,7 +107,7 @@ def reported(path: Path, what: str) -> Iterator[None]:
 
 
 def require(where: object, there: Collection[Any], keys: Sequence[str]) -> None:
-    """Every key is there.
+    """Check that every key is there.
 
     Raises:
         DataError: names the missing ones and what is there.

@@ -102,7 +102,7 @@ def _label(root: Path, path: Path) -> str:
 
 
 def _told(root: Path, path: Path) -> tuple[str, str, Path]:
-    """Scene and person by a file's name; "" for nobody's."""
+    """Scene and person that a file's name tells, and the file; person "" where it tells none."""
     folder = path.parent.relative_to(root).as_posix()
     inside = "" if folder == "." else f"{folder}/"
     if match := NAMED.fullmatch(path.stem):

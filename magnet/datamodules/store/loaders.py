@@ -62,7 +62,7 @@ class Prefetcher:
         self.begun.clear()
 
     def _begin(self, cursor: Cursor, count: int) -> None:
-        """Begin batches until `depth` are in progress."""
+        """Start reading batches, from `cursor` on, until `count` are in progress."""
         self.threads = self.threads or ThreadPoolExecutor(self.depth, thread_name_prefix="read-ahead")
         while len(self.begun) < count:
             cursor = self.after(self.begun[-1][0]) if self.begun else cursor

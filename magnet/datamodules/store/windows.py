@@ -157,7 +157,7 @@ def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
 
 
 def without_empty_groups(windows: WindowIndex) -> WindowIndex:
-    """A scene of which one group has been dropped altogether is a scene of the other."""
+    """Composed scenes of which all people of one group were dropped, as plain scenes of the other group; in place."""
     for group in (0, 1):
         gone = (windows.clips[:, 1] >= 0) & ~((windows.members >= 0) & (windows.groups == group)).any(axis=1)
         if group == 0:

@@ -75,7 +75,7 @@ def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace |
 
 
 def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[ShownTake]:
-    """The first of a file's B scenes, each a take."""
+    """The first `samples` scenes of a file, each as a take."""
     names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
     many = scene.scenes > 1
     return [

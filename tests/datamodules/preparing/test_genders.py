@@ -210,14 +210,14 @@ def test_a_body_of_another_family_is_refused_by_its_tree(name, tmp_path):
     if not families_of(kind):
         assert order(name, tmp_path, files[other]).body().family == other
         return
-    titles = {"smpl": "SMPL's", "smplx": "SMPL-X's"}
-    said = rf"{other}_is_here.*is {titles[other]} by its tree.*{kind.title} holds .* from"
+    titles = {"smpl": "SMPL", "smplx": "SMPL-X"}
+    said = rf"{other}_is_here.*has the joints of {titles[other]}.*{kind.title} holds .* from"
     with pytest.raises(ValueError, match=said):
         order(name, tmp_path, files[other]).body()
     neutral = {one: str(write_body(tmp_path / one / "neutral.npz", one)) for one in files}
     both = order(name, tmp_path, files[other], (neutral[own],))
     assert both.body().family == other and both.bodies()["neutral"].family == own
-    with pytest.raises(ValueError, match=rf"--bodies the neutral one: .* is {titles[other]} by its tree"):
+    with pytest.raises(ValueError, match=rf"--bodies the neutral one: .* has the joints of {titles[other]}"):
         order(name, tmp_path, files[own], (neutral[other],)).bodies()
 
 
