@@ -70,7 +70,12 @@ def contact_sheet(
         draw.multiline_text((12 * unit, middle), _broken(label), fill=INK, font=font(15 * unit), anchor="lm")
         if row:
             draw.line((0, top + row * cell[1], page.width, top + row * cell[1]), fill=(226, 229, 235))
-    return _save(page, path)
+    path = Path(path)
+    if path.suffix != ".png":
+        raise ValueError(f"{path.name}: pictures are written as .png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    page.save(path)
+    return path
 
 
 def _time(frame: int, context_frames: int, fps: float) -> str:
@@ -91,12 +96,3 @@ def _label_width(labels: list[str], size: float) -> float:
     lines = [line for label in labels for line in _broken(label).split("\n")]
     widest = max(font(size).getlength(line) for line in lines)
     return widest + 24 * size / 15 if widest else 0.0
-
-
-def _save(page: Image.Image, path: str | Path) -> Path:
-    path = Path(path)
-    if path.suffix != ".png":
-        raise ValueError(f"{path.name}: pictures are written as .png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    page.save(path)
-    return path

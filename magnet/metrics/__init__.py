@@ -86,7 +86,7 @@ def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: floa
             between keyframes; None: everything. `update(..., agents=...)` says it for one batch instead.
         confidence: such as 0.95, for metrics that are means over clips; adds `_low` and `_high`.
     """
-    means: dict[str, Any] = {"agents": scored, "confidence": confidence}
+    means: dict[str, Any] = {"agents": scored, "confidence": confidence, "fps": fps}
     return MetricCollection(
         {
             "FD": FrechetDistance(fps=fps, agents=scored),
@@ -95,8 +95,8 @@ def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: floa
             "FD own velocity": FrechetDistance("own_velocity", fps=fps, agents=scored),
             "DIV": Diversity(**means),
             **_of_motion(fps, "generated", scored, confidence),
-            "MPJPE": PositionError(fps, **means),
-            "MPJVE": VelocityError(fps, **means),
+            "MPJPE": PositionError(**means),
+            "MPJVE": VelocityError(**means),
         },
         compute_groups=False,
     )
@@ -114,19 +114,19 @@ def ground_truth_metrics(
 
 def _of_motion(fps: float, of: Of, scored: Tensor | None, confidence: float | None) -> dict[str, Metric]:
     """Metrics that need one motion, or for MI make sense of one."""
-    means: dict[str, Any] = {"of": of, "agents": scored, "confidence": confidence}
+    means: dict[str, Any] = {"of": of, "agents": scored, "confidence": confidence, "fps": fps}
     return {
         "MI": MotionInteraction(of=of, agents=scored),
-        "FS": FootSkating(fps, **means),
+        "FS": FootSkating(**means),
         "IP": Interpenetration(**means),
         "depth": BodyDepth(**means),
         "bearing": PartnerBearing(**means),
-        "turning": TurnRate(fps, of=of, agents=scored),
-        "hands": HandContact(fps, **means),
+        "turning": TurnRate(of=of, agents=scored, fps=fps),
+        "hands": HandContact(**means),
         "distance": PartnerDistance(of=of, agents=scored),
         "floating": Floating(**means),
         "ground": GroundPenetration(**means),
-        "toes": StandingToes(fps, **means),
-        "jitter": Jitter(fps, **means),
+        "toes": StandingToes(**means),
+        "jitter": Jitter(**means),
         "borders": TokenBorders(of=of, agents=scored),
     }

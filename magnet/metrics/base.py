@@ -14,6 +14,7 @@ from torchmetrics.utilities import dim_zero_cat
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import bootstrap_interval
+from magnet.motion.scene import FPS
 
 Of = Literal["generated", "truth"]
 
@@ -29,6 +30,7 @@ class MotionMetric(Metric):
             truth's own row of a table.
         agents: (P,) or (T, P) bool, what is scored where `update` is not told: the agents, or the frames of each,
             that were generated; None: everything of everybody present.
+        fps: frames a second, for speeds and durations.
         kwargs: of `torchmetrics.Metric`, such as `compute_on_cpu`.
     """
 
@@ -38,10 +40,10 @@ class MotionMetric(Metric):
     columns: ClassVar[Mapping[str, Column]] = {}
     """How its numbers are shown, by name; for `fd@second3` the entry of `fd` is read."""
 
-    def __init__(self, of: Of = "generated", agents: Tensor | None = None, **kwargs: Any) -> None:
+    def __init__(self, of: Of = "generated", agents: Tensor | None = None, fps: float = FPS, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._empty: dict[str, Tensor] = {}  # states that are lists, as they are without a batch
-        self.of = of
+        self.of, self.fps = of, fps
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
 
     def update(

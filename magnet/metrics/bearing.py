@@ -85,9 +85,8 @@ class TurnRate(MotionMetric):
 
     turned: list[Tensor]  # of (P, 2) by slot: total and count
 
-    def __init__(self, fps: float = FPS, **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.fps = fps
         self.add_keyed("turned", 2)
 
     def add(self, futures: Futures) -> None:

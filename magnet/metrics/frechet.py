@@ -106,12 +106,9 @@ class FrechetDistance(MotionMetric):
     sum: Tensor  # (2, 63)
     outer: Tensor  # (2, 63, 63)
 
-    def __init__(
-        self, features: Features = "world_joints", fps: float = FPS, jitter: float = JITTER, **kwargs: Any
-    ) -> None:
+    def __init__(self, features: Features = "world_joints", jitter: float = JITTER, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.features: Features = features
-        self.fps = fps
         self.jitter = jitter
         self.name = "fd" if features == "world_joints" else f"fd_{features}"
         self.add_sum("count", 2)

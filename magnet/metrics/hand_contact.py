@@ -12,7 +12,6 @@ from magnet.body.energy import BEYOND, hand_points
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-from magnet.motion.scene import FPS
 
 WITHIN = 0.20
 """Metres between the middles of two hands under which they are in contact."""
@@ -73,12 +72,9 @@ class HandContact(ClipMeans):
         "hand_hold_long": Column("long holds", "", "real", "share of hand contact in holds over 1 s"),
     }
 
-    def __init__(
-        self, fps: float = FPS, within: float = WITHIN, beyond: float = BEYOND, of: Of = "generated", **kwargs: Any
-    ) -> None:
+    def __init__(self, within: float = WITHIN, beyond: float = BEYOND, of: Of = "generated", **kwargs: Any) -> None:
         compared = ["hand_contact_precision", "hand_contact_recall"] if of == "generated" else []
         super().__init__(["hand_contact", *compared, "hand_hold", "hand_hold_long"], of=of, **kwargs)
-        self.fps = fps
         self.within = within
         self.beyond = beyond
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -37,10 +37,6 @@ class Jitter(ClipMeans):
     """
 
     columns: ClassVar[Mapping[str, Column]] = {"jitter": Column("jitter", "10 m/s³", "real", "mean third difference")}
-
-    def __init__(self, fps: float = FPS, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.fps = fps
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
         return [clip_sums(jitter(futures.generated, self.fps), futures.spans(4))]

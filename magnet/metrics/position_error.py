@@ -55,7 +55,7 @@ class PositionError(ClipMeans):
     def __init__(self, fps: float = FPS, seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0), **kwargs: Any) -> None:
         horizons = ["", *(f"@{s:g}s" for s in seconds)]
         names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best", "mpjpe_mean")]
-        super().__init__(names, **kwargs)
+        super().__init__(names, fps=fps, **kwargs)
         self.until = tuple(round(s * fps) for s in seconds)
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

@@ -61,14 +61,12 @@ class FootSkating(ClipMeans):
 
     def __init__(
         self,
-        fps: float = FPS,
         preset: Literal["default", "reference"] = "default",
         height: float | None = None,
         speed: float | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(["fs", "fs_ratio", "fs_contact"], **kwargs)
-        self.fps = fps
         self.height = PRESETS[preset][0] if height is None else height
         self.speed = PRESETS[preset][1] if speed is None else speed
 

@@ -12,7 +12,6 @@ from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.histogram import histogram_of, quantile
 from magnet.metrics.skating import toe_steps
-from magnet.motion.scene import FPS
 
 
 class StandingToes(ClipMeans):
@@ -39,9 +38,8 @@ class StandingToes(ClipMeans):
 
     histogram: Tensor
 
-    def __init__(self, fps: float = FPS, height: float = 0.05, still: float = 0.05, **kwargs: Any) -> None:
+    def __init__(self, height: float = 0.05, still: float = 0.05, **kwargs: Any) -> None:
         super().__init__(["toe_still"], **kwargs)
-        self.fps = fps
         self.height = height
         self.still = still
         self.add_sum("histogram", round(self.FASTEST / self.BIN) + 1)

@@ -48,7 +48,7 @@ class VelocityError(ClipMeans):
     }
 
     def __init__(self, fps: float = FPS, per_second: bool = False, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
+        super().__init__(fps=fps, **kwargs)
         self.scale = fps if per_second else 1.0
         if per_second:
             self.columns = {name: shown._replace(unit="m/s") for name, shown in self.columns.items()}  # type: ignore[misc]

@@ -51,7 +51,7 @@ class Folds:
             "FD": FrechetDistance(fps=self.fps),
             "FD pair": FrechetBySecond("pair", fps=self.fps),
             "MI": MotionInteraction(),
-            "FS": FootSkating(self.fps),
+            "FS": FootSkating(fps=self.fps),
             "IP": Interpenetration(),
             "depth": BodyDepth(),
         }
