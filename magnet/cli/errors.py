@@ -73,9 +73,11 @@ KINDS = {
     "tuple": "a list such as [0,1]",
     "list": "a list such as [0,1]",
     "Sequence": "a list such as [a,b]",
+    "Iterable": "a list such as [a,b]",
     "Mapping": "options",
     "dict": "options",
     "NoneType": "null",
+    "dotted_path": "a class's dotted path",
 }
 
 
@@ -90,8 +92,10 @@ def wrong_value(message: str, flag: str | None = None) -> str | None:
     got = re.search(r"(?:Got|Given) value: (.*)", message)
     if key and got and (inner := re.match(r"NestedArg\(key='(\w+)'", got[1])):
         return f"no option {flag or '--' + key[1]}.{inner[1]}; {flag or '--' + key[1]} takes a value, it has no fields"
+    message = message.replace("Expected a dot import path string:", "Expected a <class 'dotted_path'>")
     kinds = re.findall(r"Expected an? (?:<class '(?:\w+\.)*(\w+)'>|\S*Literal\[(.*?)\])", message)
-    told = re.search(r"^ *- (?!Expected )", message, re.MULTILINE)  # a class that has said itself what it wants
+    # A class may have said itself what it wants.
+    told = re.search(r"^ *- (?!Expected |Does not validate)", message, re.MULTILINE)
     if told or not (key and got and kinds):
         return None
     wanted = dict.fromkeys(KINDS.get(kind, kind) if kind else choices.replace("'", "") for kind, choices in kinds)

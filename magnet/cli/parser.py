@@ -10,6 +10,7 @@ import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, ClassVar, NoReturn
 
 from jsonargparse import ActionConfigFile, Namespace
@@ -168,6 +169,10 @@ class Parser(LightningArgumentParser):
         """The parser's message without its internals."""
         if dangling := next((word for word in self.arguments if re.match(r"--[\w.]+\.(=|$)", word)), None):
             return f"no option {dangling.partition('=')[0]}; the name of a field belongs behind the point"
+        if bare := re.search(r"argument (?:-\w/)?(--[\w.]+): expected one argument", message):
+            behind = pairwise([*self.arguments, "--"])
+            short = [flag for flag, after in behind if flag.startswith(bare[1]) and after.startswith("--")]
+            return f"{(short or [bare[1]])[0]}: got nothing, expected a value behind it"
         unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
         refused = re.search(REFUSED, message)
         if unknown and not unknown[1].startswith("-"):

@@ -161,6 +161,11 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
         (["test", "--frames", "9"], "did you mean --data.window_frames?"),
         (["test", "--sampler.step", "4"], "no option --sampler.step; did you mean --sampler.steps?"),
         (["test", "--trainer.max_epoch", "4"], "no option --trainer.max_epoch; did you mean --trainer.max_epochs?"),
+        (["fit", "--model", "ToyModel", "--data.root"], "--data.root: got nothing, expected a value"),
+        (
+            ["fit", "--model", "ToyModel", "--trainer.callbacks", "x"],
+            "callbacks: got x, expected a list such as [0,1] or a",
+        ),
         (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
         (
             ["test", "--sampler.pyramid_offset", "four"],
