@@ -1,4 +1,4 @@
-"""Nine recorded scenes, three pushed into each other, three floated, three slid, and what `magnet refine` does.
+"""Ten recorded scenes, three pushed into each other, three floated, three slid, one all of it, and `magnet refine`.
 
 MAGNET_CMU=... python benchmarks/damaged_scenes.py --out runs/results/damaged
 """
@@ -22,7 +22,12 @@ BODY = load_body()
 
 
 def damaged(scene: Scene, kind: str) -> Scene:
-    """One of two people pushed 15 cm into the other; 12 cm up and the other 5 cm down; or both sliding at 0.3 m/s."""
+    """One of two people pushed 15 cm into the other; 12 cm up and the other 5 cm down; or both sliding at 0.3 m/s.
+
+    kind: "pushed", "floated", "slid" or "all", one after the other.
+    """
+    if kind == "all":
+        return damaged(damaged(damaged(scene, "pushed"), "floated"), "slid")
     roots, time = scene.T_world_root.clone(), torch.arange(scene.frames) / scene.fps
     if kind == "pushed":
         way = (roots[:, :, 1, :3, 3] - roots[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
@@ -46,7 +51,8 @@ def row(scene: Scene, real: Scene) -> str:
     off = (joints - BODY.joints(real)).norm(dim=-1).mean()
     shares = (depth[:, 1] > 0.05, depth[:, 1] > 0.10, speed[stands] < 0.05, foot > 0.06, foot < -0.02, hands)
     cells = " | ".join(f"{100 * float(share.float().mean()):.1f} %" for share in shares)
-    return f"{100 * float(depth[:, 0].max()):.1f} cm | {cells} | {100 * float(off):.1f} cm"
+    jerk = (joints.diff(n=3, dim=1) * scene.fps**3).norm(dim=-1).mean()
+    return f"{100 * float(depth[:, 0].max()):.1f} cm | {cells} | {float(jerk):.0f} m/s³ | {100 * float(off):.1f} cm"
 
 
 def main() -> None:
@@ -58,9 +64,11 @@ def main() -> None:
     data.setup("test")
     scenes = concatenate(list(data.test_dataloader()))
     scenes = scenes.select(list(range(0, scenes.scenes, max(1, scenes.scenes // 10)))[:9])
-    print("| scene | deepest | body over 5 cm | over 10 cm | toes still | in the air | in the floor | hands | off |")
-    for number in range(scenes.scenes):
-        real, kind = scenes.select([number]), ("pushed", "floated", "slid")[number % 3]
+    cells = "deepest | body over 5 cm | over 10 cm | toes still | in the air | in the floor | hands | jerk | off"
+    print(f"| scene | {cells} |")
+    kinds = [("pushed", "floated", "slid")[number % 3] for number in range(scenes.scenes)]
+    for number, kind in [*enumerate(kinds), (len(kinds) // 2, "all")]:
+        real = scenes.select([number])
         bad = damaged(real, kind)
         good = repaired(bad, BODY)
         for name, scene in (("recorded", real), ("damaged", bad), ("repaired", good)):

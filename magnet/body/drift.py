@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.body.apart import lifted
 from magnet.body.base import Body
 from magnet.body.joints import TOES
-from magnet.body.settle_wishes import SLIDES, Wishes
+from magnet.body.settle_wishes import SLIDES, Wishes, holds
 from magnet.motion.frames import from_planar
 from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene
@@ -19,6 +20,10 @@ AVERAGED = 0.5
 STILL, DRIFTS = 0.06, 0.12
 """Averaged speeds in m/s: below the first a body stands, above the second it drifts. In CMU's salsa 90 % of the
 frames are below 0.06 and 99 % below 0.12."""
+
+
+KEPT = 0.95
+"""Share of the frames in which somebody holds hands that must be left without drift."""
 
 
 def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
@@ -47,6 +52,8 @@ def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
 def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: float = SLIDES) -> Scene:
     """A scene whose people do not slide over the ground. The first frame and people who do not drift stay as they are.
 
+    Whoever would hold fewer hands without their drift keeps it: then both slide together, or turn on their toes.
+
     Args:
         scene: (B, T, P).
         body: the body of its shape numbers.
@@ -56,11 +63,26 @@ def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: flo
     if scene.frames < 2:
         return scene
     wishes = Wishes.of(scene, body, slides=slides)
-    velocity = drift(body.joints(scene), wishes.stands, scene.fps)
+    joints = body.joints(scene)
+    velocity = drift(joints, wishes.stands, scene.fps)
     if fixed is not None:
         whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
         velocity = torch.where(whole.to(velocity.device)[..., None], 0.0, velocity)
-    return moved_over_ground(scene, -velocity.cumsum(dim=1) / scene.fps)
+    offsets = -velocity.cumsum(dim=1) / scene.fps
+    least = KEPT * frames_held(joints, scene.present)
+    for _ in range(scene.agents):  # whoever stays may take from those who move
+        lets_go = frames_held(joints + lifted(offsets)[..., None, :], scene.present) < least
+        offsets = torch.where(lets_go[:, None, :, None], 0.0, offsets)
+    return moved_over_ground(scene, offsets)
+
+
+def frames_held(joints: Tensor, present: Tensor) -> Tensor:
+    """In how many frames everybody holds hands, added up over partners. (B, T, P, 22, 3), (B, P) -> (B, P)"""
+    P = joints.shape[2]
+    held = holds(joints, present)[0].flatten(3).any(dim=-1).sum(dim=1)  # (B, Q)
+    first, second = torch.triu_indices(P, P, 1, device=held.device)
+    frames = held.new_zeros(len(held), P)
+    return frames.index_add_(1, first, held).index_add_(1, second, held)
 
 
 def moved_over_ground(scene: Scene, offsets: Tensor) -> Scene:

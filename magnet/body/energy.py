@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.body.capsules import nearest_points
+from magnet.body.capsules import CAPSULES, nearest_points
 from magnet.body.fitted_capsules import FOREARMS, HANDS, LEGS, PARTS, TRUNK, UPPER_ARMS
 
 from magnet.body.joints import (  # isort: skip
@@ -34,14 +34,16 @@ class Contact:
         body: trunks, heads and legs of two people.
         arms: an arm or a hand of one, and any part of the other.
         own: parts of one body; neighbouring parts always overlap and do not count.
+        measured: the capsules that depth is measured by (`magnet.body.capsules`), forearm on forearm apart.
     """
 
     body: float = 0.02
     arms: float = 0.03
     own: float = 0.04
+    measured: float = 0.04
 
 
-CONTACT: dict[str, Contact] = {"light": Contact(body=0.05, arms=0.06, own=0.06), "firm": Contact()}
+CONTACT: dict[str, Contact] = {"light": Contact(body=0.05, arms=0.06, own=0.06, measured=0.06), "firm": Contact()}
 """By name: `light` lets people lean on each other, `firm` lets them touch."""
 
 
@@ -52,6 +54,17 @@ def allowed_between(contact: Contact) -> Tensor:
     arm[list(UPPER_ARMS + FOREARMS + HANDS)], hold[list(FOREARMS + HANDS)] = True, True
     allowed = torch.where(arm[:, None] | arm, contact.arms, contact.body)
     return torch.where(hold[:, None] & hold, torch.inf, allowed)
+
+
+def allowed_between_measured(contact: Contact) -> Tensor:
+    """`allowed_between` for capsules of `with_measured`, each kind against its own. -> (K + 13, K + 13) metres"""
+    fitted = allowed_between(contact)
+    K = len(fitted)
+    allowed = torch.full((K + len(CAPSULES), K + len(CAPSULES)), torch.inf)
+    allowed[:K, :K], allowed[K:, K:] = fitted, contact.measured
+    forearm = torch.tensor([False] * K + [capsule.name.endswith("forearm") for capsule in CAPSULES])
+    allowed[forearm[:, None] & forearm] = torch.inf
+    return allowed
 
 
 def allowed_within(contact: Contact) -> Tensor:

@@ -1,4 +1,4 @@
-"""Capsules fitted to a body's mesh, for any shape numbers; hands and feet included."""
+"""Capsules fitted to a body's mesh, hands and feet included, and beside them those that depth is measured by."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.base import Body
+from magnet.body.capsules import CAPSULES
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,
@@ -67,25 +68,37 @@ MIDDLE = (0.2, 0.8)
 
 @dataclass(frozen=True)
 class FittedCapsules:
-    """K capsules, one for each of `PARTS` and fixed to its bone, of P people in B scenes.
+    """K capsules, each fixed to a bone, of P people in B scenes.
 
     Attributes:
         ends: (B, P, K, 2, 3) metres from the bone's joint, in its frame at rest.
         radius: (B, P, K) metres.
+        bones: the joint that each capsule moves with, by default that of each of `PARTS`.
     """
 
     ends: Tensor
     radius: Tensor
-
-    @property
-    def bones(self) -> list[int]:
-        """The joint that each capsule moves with."""
-        return [part.bone for part in PARTS]
+    bones: tuple[int, ...] = tuple(part.bone for part in PARTS)
 
     def posed(self, R_world: Tensor, joints: Tensor) -> Tensor:
         """Ends in the world. Rotations (B, T, P, 22, 3, 3), joints (B, T, P, 22, 3) -> (B, T, P, K, 2, 3) metres"""
-        R, t = R_world[..., self.bones, :, :], joints[..., self.bones, :]
+        bones = list(self.bones)
+        R, t = R_world[..., bones, :, :], joints[..., bones, :]
         return (R[..., None, :, :] @ self.ends[:, None, ..., None])[..., 0] + t[..., None, :]
+
+
+def with_measured(fitted: FittedCapsules, rest: Tensor) -> FittedCapsules:
+    """The fitted capsules and behind them `CAPSULES`, by which depth is measured.
+
+    rest: (B, 1, P, 22, 3) joints at rest, metres.
+    """
+    at = rest[:, 0]
+    first = [capsule.joint_a for capsule in CAPSULES]
+    along = at[..., [capsule.joint_b for capsule in CAPSULES], :] - at[..., first, :]
+    ends = torch.stack([torch.zeros_like(along), along], dim=-2).to(fitted.ends)
+    radius = fitted.radius.new_tensor([capsule.radius for capsule in CAPSULES]).expand(ends.shape[:3])
+    both = torch.cat([fitted.ends, ends], dim=2), torch.cat([fitted.radius, radius], dim=2)
+    return FittedCapsules(*both, (*fitted.bones, *first))
 
 
 _KEPT: WeakKeyDictionary[Body, dict[bytes, FittedCapsules]] = WeakKeyDictionary()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.base import Body
-from magnet.body.fitted_capsules import fit_capsules
+from magnet.body.fitted_capsules import fit_capsules, with_measured
 from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals
 from magnet.body.settle_wishes import Wishes
@@ -38,6 +38,12 @@ FOLLOWS = 20.0
 WINDOW, AHEAD = 240, 24
 """Frames that are corrected together, and frames after them that are computed and dropped."""
 
+ROUNDS = 2
+"""How often it is found out in a Gauss-Newton step which one-sided residuals count."""
+
+SOFT = 0.005
+"""Metres around 0 over which a one-sided residual comes to count: a hair's breadth must not decide about a step."""
+
 DONE = 1e-10
 """Squared norm of the preconditioned residual at which conjugate gradients stop."""
 
@@ -57,7 +63,7 @@ class Settle:
         most: largest change of a step, metres or radians.
     """
 
-    iterations: int = 8
+    iterations: int = 12
     inner: int = 40
     stay: float = 0.05
     speed: float = 0.3
@@ -182,13 +188,44 @@ class Smoothness:
 def solve(
     residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, free: Tensor, inner: int
 ) -> Tensor:
-    """One Gauss-Newton step by preconditioned conjugate gradients. -> (B, T, P, DOFS)
+    """One Gauss-Newton step. -> (B, T, P, DOFS)
+
+    One-sided residuals count where they are positive before the step, then where they are after it: otherwise what one
+    step mends is let go by the next, and depth comes back with every second step.
 
     Args:
         residuals: M of them.
         first, second: (M, DOFS) their slopes at either end, times the square root of the weight.
         offset: (B, T, P, DOFS) the correction so far.
         free: (B, T, P) bool, who may move.
+    """
+    a, b, step = residuals.node, residuals.other, torch.zeros_like(offset)
+    for _ in range(ROUNDS):
+        flat = step.view(-1, DOFS)
+        moved = (first * flat[a]).sum(-1) - (second * flat[b]).sum(-1)
+        after = residuals.value + moved / residuals.root_weight
+        share = torch.where(residuals.one_sided, (after / SOFT / 2 + 0.5).clamp(0, 1), 1.0)
+        counts = share > 0
+        some, share = residuals.kept(counts), share[counts]
+        some = replace(some, root_weight=some.root_weight * share)
+        slopes = first[counts] * share[:, None], second[counts] * share[:, None]
+        step = least_squares(some, *slopes, smooth, offset, step, free, inner // ROUNDS)
+    return step
+
+
+def least_squares(
+    residuals: Residuals,
+    first: Tensor,
+    second: Tensor,
+    smooth: Smoothness,
+    offset: Tensor,
+    step: Tensor,
+    free: Tensor,
+    inner: int,
+) -> Tensor:
+    """The step that all residuals count for, by preconditioned conjugate gradients from a first guess `step`.
+
+    Arguments as for `solve`.
     """
     shape, keep = offset.shape, free[..., None].to(offset)
     a, b = residuals.node, residuals.other
@@ -206,8 +243,8 @@ def solve(
         """Scene by scene, so that scenes do not depend on each other. -> (B, 1, 1, 1)"""
         return (x * y).sum(dim=(1, 2, 3), keepdim=True)
 
-    residual = -(back(residuals.root_weight * residuals.value) + smooth.slope(offset)) * keep
-    step = torch.zeros_like(offset)
+    gradient = back(residuals.root_weight * residuals.value + across(step)) + smooth.slope(offset) + smooth(step)
+    residual = -gradient * keep
     z = smooth.undo(residual) * keep
     direction, rz = z, product(residual, z)
     for _ in range(inner):
@@ -277,7 +314,6 @@ def correct_window(
     offset = scene.T_world_root.new_zeros(B, T, P, DOFS)
     if not bool(free.any()):
         return offset
-    capsules = fit_capsules(body, scene.betas)
     ramp = begun and past is None
     if ramp:
         past = offset.new_zeros(B, LEAD, P, DOFS)
@@ -288,6 +324,7 @@ def correct_window(
         offset = torch.where(free[..., None], past[:, -1:], offset)
     offset = offset + smooth.start
     rest = body.rest_joints(scene.betas[:, None])
+    capsules = with_measured(fit_capsules(body, scene.betas), rest)
     for _ in range(settle.iterations):
         now = corrected(scene, offset)
         R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)

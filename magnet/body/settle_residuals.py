@@ -9,13 +9,18 @@ import torch
 from torch import Tensor
 
 from magnet.body.capsules import nearest_points
-from magnet.body.energy import allowed_between, allowed_within, hand_points
+from magnet.body.energy import allowed_between_measured, allowed_within, hand_points
 from magnet.body.fitted_capsules import FittedCapsules
 from magnet.body.joints import FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
 
 WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
 """Cost of a squared metre of each kind of residual."""
+
+ONE_SIDED = ("between", "within", "floor", "float")
+
+NEAR = 0.03
+"""Metres short of counting at which one-sided residuals are kept: a step may make them count."""
 
 REACH = 1.6
 """Metres between pelvises beyond which bodies cannot touch, even with arms half stretched out."""
@@ -38,7 +43,10 @@ class Seen:
 
 @dataclass(frozen=True)
 class Residuals:
-    """M residuals: `value` is to become 0, and changes by along . (d point - d other_point)."""
+    """M residuals: `value` is to become 0, and changes by along . (d point - d other_point).
+
+    One-sided residuals, of depth and of feet over and under the floor, count only while they are positive.
+    """
 
     node: Tensor  # (M,) int
     bone: Tensor
@@ -50,6 +58,7 @@ class Residuals:
     value: Tensor  # (M,) metres
     root_weight: Tensor  # (M,)
     two: Tensor  # (M,) 1: the other point moves, too; 0: it is the floor
+    one_sided: Tensor  # (M,) bool
 
     def kept(self, keep: Tensor) -> Residuals:
         """Some of the residuals. keep (M,) bool"""
@@ -73,7 +82,8 @@ def residuals_of(
     """Residuals of one kind; `other` is (node, bone, point), None the floor."""
     two = torch.full_like(value, float(other is not None))
     weight = torch.full_like(value, WEIGHTS[kind] ** 0.5)
-    return Residuals(node, bone, point, *(other or (node, bone, point)), along, value, weight, two)
+    one_sided = torch.full_like(value, kind in ONE_SIDED, dtype=torch.bool)
+    return Residuals(node, bone, point, *(other or (node, bone, point)), along, value, weight, two, one_sided)
 
 
 def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
@@ -94,7 +104,7 @@ def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Te
 def touching(
     seen: Seen, capsules: FittedCapsules, pairs: tuple[Tensor, Tensor, Tensor, Tensor], allowed: Tensor, kind: str
 ) -> Residuals:
-    """Residuals of capsules deeper than allowed.
+    """Residuals of capsules deeper than allowed, or nearly so.
 
     pairs: (M,) b, t and the two people; allowed (K, K) metres.
     """
@@ -106,20 +116,31 @@ def touching(
     apart = first - second
     gap = apart.norm(dim=-1)
     depth = capsules.radius[b, p][:, i] + capsules.radius[b, q][:, j] - gap - allowed[i, j].to(gap)
-    m, k = (depth > 0).nonzero(as_tuple=True)
-    # Crossing axes have no direction between them: people then part along the line between their pelvises.
+    m, k = (depth > -NEAR).nonzero(as_tuple=True)
     pelvis = (seen.by_frame[b, t, p, 0] - seen.by_frame[b, t, q, 0])[m] * torch.tensor([1.0, 0.0, 1.0]).to(gap)
-    pelvis = torch.nn.functional.normalize(pelvis + torch.tensor([1e-6, 0.0, 0.0]).to(gap), dim=-1)
     length = gap[m, k]
-    away = torch.where((length > 0.005)[:, None], apart[m, k] / length.clamp_min(0.005)[:, None], pelvis)
+    across = off_axis(pelvis, one[m, i[k], 1] - one[m, i[k], 0])
+    away = torch.where((length > 0.005)[:, None], apart[m, k] / length.clamp_min(0.005)[:, None], across)
     node, others = seen.node(b, t, p)[m], seen.node(b, t, q)[m]
     # The value is the depth; moving along `away` reduces it.
     return residuals_of(kind, node, bones[i[k]], first[m, k], -away, depth[m, k], (others, bones[j[k]], second[m, k]))
 
 
+def off_axis(pelvis: Tensor, axis: Tensor) -> Tensor:
+    """The way out for capsules whose axes cross: no direction leads from one to the other. (M, 3) x 2 -> (M, 3)
+
+    People part along the line between their pelvises, but not along the limb itself.
+    """
+    axis = torch.nn.functional.normalize(axis, dim=-1)
+    pelvis = torch.nn.functional.normalize(pelvis, dim=-1)
+    beside = torch.linalg.cross(axis, axes(1, axis)[[1]].expand_as(axis), dim=-1)
+    across = pelvis - (pelvis * axis).sum(dim=-1, keepdim=True) * axis
+    return torch.nn.functional.normalize(across + 0.1 * beside + 1e-6 * axes(1, axis)[0], dim=-1)
+
+
 def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> list[Residuals]:
     """Depth between people."""
-    P, allowed = seen.by_frame.shape[2], allowed_between(wishes.contact).to(seen.joints.device)
+    P, allowed = seen.by_frame.shape[2], allowed_between_measured(wishes.contact).to(seen.joints.device)
     parts = []
     for p, q in combinations(range(P), 2):
         near = (seen.by_frame[:, :, p, 0] - seen.by_frame[:, :, q, 0]).norm(dim=-1) < REACH
@@ -185,16 +206,17 @@ def floor_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     """Soles are not under the floor."""
     feet = torch.tensor(FEET, device=seen.joints.device)
     depth = wishes.clearance[:, None] - seen.by_frame[..., FEET, 1]  # (B, T, P, 4)
-    b, t, p, i = ((depth > 0) & wishes.everybody(depth.shape[1])[..., None]).nonzero(as_tuple=True)
+    b, t, p, i = ((depth > -NEAR) & wishes.everybody(depth.shape[1])[..., None]).nonzero(as_tuple=True)
     down = -axes(1, depth)[1].expand(len(b), 3)
     return residuals_of("floor", seen.node(b, t, p), feet[i], seen.by_frame[b, t, p, feet[i]], down, depth[b, t, p, i])
 
 
 def float_residuals(seen: Seen, wishes: Wishes) -> Residuals:
-    """The lower foot of a floating person comes down to the floor."""
+    """The lower foot of a floating person comes down to the floor, and nobody's rises."""
     height = seen.by_frame[..., FEET, 1] - wishes.clearance[:, None]
     lowest, which = height.min(dim=-1)
-    b, t, p = (wishes.floats & (lowest > 0)).nonzero(as_tuple=True)
+    over = lowest - wishes.highest
+    b, t, p = ((over > -NEAR) & wishes.everybody(over.shape[1])).nonzero(as_tuple=True)
     feet = torch.tensor(FEET, device=b.device)[which[b, t, p]]
     up = axes(1, height)[1].expand(len(b), 3)
-    return residuals_of("float", seen.node(b, t, p), feet, seen.by_frame[b, t, p, feet], up, lowest[b, t, p])
+    return residuals_of("float", seen.node(b, t, p), feet, seen.by_frame[b, t, p, feet], up, over[b, t, p])

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from magnet.body import load_body
+from magnet.body.capsules import CAPSULES, capsule_segments
 from magnet.body.energy import capsule_depth
-from magnet.body.fitted_capsules import PARTS, fit_capsules
+from magnet.body.fitted_capsules import PARTS, fit_capsules, with_measured
 from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene
 
@@ -81,6 +82,17 @@ def test_the_skin_is_a_centimetre_from_the_capsules(beta: float) -> None:
     share = (((skin[:, None] - a) * along).sum(-1) / along.square().sum(-1).clamp_min(1e-12)).clamp(0, 1)
     off = ((skin[:, None] - a - share[..., None] * along).norm(dim=-1) - capsules.radius[0, 0]).amin(dim=1)
     assert float(off.abs().mean()) < 0.015 and float(off.abs().quantile(0.95)) < 0.04
+
+
+def test_capsules_that_depth_is_measured_by_move_with_the_same_bones() -> None:
+    scene = people(2)
+    rest = BODY.rest_joints(scene.betas[:, None])
+    R_world, joints = BODY.bone_chain(scene.body_rot, scene.T_world_root, rest)
+    both = with_measured(fit_capsules(BODY, scene.betas), rest)
+    ends, (first, last, radius) = both.posed(R_world, joints), capsule_segments(joints)
+    assert ends.shape[3] == len(PARTS) + len(CAPSULES) == len(both.bones)
+    torch.testing.assert_close(ends[:, :, :, len(PARTS) :], torch.stack([first, last], dim=-2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(both.radius[0, 1, len(PARTS) :], radius)
 
 
 def test_left_and_right_are_alike() -> None:

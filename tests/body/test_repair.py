@@ -11,11 +11,15 @@ from torch import Tensor
 from magnet.body import load_body
 from magnet.body.drift import drift, undrifted
 from magnet.body.energy import hand_points
+from magnet.body.fit import clearance
 from magnet.body.joints import FEET, TOES
 from magnet.body.repair import repaired
-from magnet.body.settle import DOFS, corrected, jacobian
+from magnet.body.settle import DOFS, Settle, corrected, jacobian
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
+from magnet.metrics import hand_distance
+from magnet.metrics.body_depth import deepest
+from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene, cat_time
 from magnet.synthesis import synthesize
 
@@ -32,6 +36,21 @@ def moved(scene: Scene, agent: int, shift: Tensor) -> Scene:
     T_world_root = scene.T_world_root.clone()
     T_world_root[0, :, agent, :3, 3] += shift
     return scene.replace(T_world_root=T_world_root)
+
+
+def arms_out(apart: float, before: float, frames: int = 30) -> Scene:
+    """Two who stand side by side with their arms stretched out into each other, metres apart along x and z."""
+    betas, eye = torch.zeros(1, 2, 10), torch.eye(3)
+    floor = float(clearance(BODY, betas[0])[0, 2] - BODY.rest_joints(betas[0, 0])[TOES[0], 1])
+    place = torch.tensor([[0.0, floor, 0.0], [apart, floor, before]]).expand(1, frames, 2, 3)
+    T_world_root = rigid(eye.expand(1, frames, 2, 3, 3), place)
+    return Scene(eye.repeat(1, frames, 2, 21, 1, 1), T_world_root, betas, torch.ones(1, 2, dtype=torch.bool))
+
+
+def depths(scene: Scene) -> Tensor:
+    """How deep the first two people are in each other, as measured. -> (T,) metres"""
+    joints = BODY.joints(scene)[0]
+    return deepest(joints[:, 0], joints[:, 1])[:, 0]
 
 
 def speed_of_low_toes(scene: Scene, agent: int) -> float:
@@ -62,10 +81,22 @@ def test_what_is_right_is_let_be(handshake: Scene) -> None:
     assert float((BODY.joints(once) - BODY.joints(handshake)).norm(dim=-1).mean()) < 0.012
 
 
-def test_whoever_floats_comes_down_and_whoever_jumps_does_not(handshake: Scene) -> None:
+@pytest.mark.parametrize(("apart", "before"), [(0.55, 0.0), (0.7, 0.05), (1.1, 0.02)])
+def test_depth_that_is_measured_is_corrected_and_does_not_come_back_with_the_next_step(
+    apart: float, before: float
+) -> None:
+    """Also of arms along one line, whose axes do not tell the way out."""
+    scene = arms_out(apart, before)
+    assert float(depths(scene).max()) > 0.06
+    for iterations in (11, 12):
+        assert float(depths(repaired(scene, BODY, settle=Settle(iterations=iterations))).max()) < 0.055
+
+
+@pytest.mark.parametrize("height", [0.05, 0.15])
+def test_whoever_floats_comes_down_and_whoever_jumps_does_not(handshake: Scene, height: float) -> None:
     T = handshake.frames
     up = torch.zeros(T, 3)
-    up[20:70, 1] = 0.15
+    up[20:70, 1] = height
     foot = BODY.joints(repaired(moved(handshake, 1, up), BODY))[0, :, 1][:, FEET, 1].amin(dim=-1)
     real = BODY.joints(handshake)[0, :, 1][:, FEET, 1].amin(dim=-1)
     assert float((foot - real)[25:65].abs().max()) < 0.02
@@ -88,6 +119,18 @@ def test_whoever_slides_stands_and_holds_again(handshake: Scene) -> None:
     )
     whole = undrifted(damaged, BODY, fixed=torch.tensor([True, False]))
     assert torch.equal(whole.T_world_root[:, :, 0], damaged.T_world_root[:, :, 0])
+
+
+def test_nobody_is_held_back_from_sliding_away_from_hands_that_they_hold(handshake: Scene) -> None:
+    slide = torch.zeros(handshake.frames, 3)
+    slide[:, 2] = 0.3 * torch.arange(handshake.frames) / 30.0
+    both = moved(moved(handshake, 0, slide), 1, slide)
+    alone = undrifted(both, BODY, fixed=torch.tensor([False, True]))
+    assert torch.equal(alone.T_world_root, both.T_world_root)
+    together = undrifted(both, BODY)
+    assert float((together.T_world_root - both.T_world_root)[0, -1, :, 2, 3].max()) < -0.5
+    joints = BODY.joints(together)
+    assert int((hand_distance(joints[:, :, 0], joints[:, :, 1]) < 0.2).sum()) > 30
 
 
 def test_hands_that_hold_hold_on_while_bodies_leave_each_other(handshake: Scene) -> None:

@@ -61,7 +61,8 @@ def test_who_is_kept_does_not_move(crowded: Scene, tmp_path: Path) -> None:
 def test_poses_are_corrected_too_unless_they_are_to_be_kept(crowded: Scene, tmp_path: Path, capsys) -> None:
     scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "corrected.npz"
     assert cli.main(["refine", str(scene), str(out)]) == 0
-    assert numbers(next(x for x in capsys.readouterr().out.splitlines() if x.startswith("after")))[1] == 0
+    after = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("after"))
+    assert numbers(after)[1] == 0 and numbers(after)[0] < 7, "they walked in one place"
     assert not torch.equal(Scene.load(out).body_rot, crowded.body_rot)
 
 
