@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,19 +12,12 @@ import yaml
 
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
+from tests.scripts import module_at
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def loaded() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gpu_round", ROOT / "scripts" / "gpu_round.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-script = loaded()
+script = module_at(ROOT / "scripts" / "gpu_round.py")
 
 
 def given(**fields: object) -> SimpleNamespace:

@@ -1,15 +1,13 @@
 """The table of `benchmarks/relation.py`: each number with its bar."""
 
-import importlib.util
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
-SPEC = importlib.util.spec_from_file_location("relation", Path(__file__).parents[1] / "benchmarks" / "relation.py")
-assert SPEC and SPEC.loader
-relation = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(relation)
+from tests.scripts import module_at
+
+relation = module_at(Path(__file__).parents[1] / "benchmarks" / "relation.py")
 
 
 def rows(**changed: float) -> dict[str, dict[str, float]]:

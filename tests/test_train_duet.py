@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -13,20 +11,13 @@ import torch
 from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
+from tests.scripts import module_at
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = os.environ.get("MAGNET_CMU") or str(ROOT.parent / "shared" / "data" / "cmu")
 
 
-def loaded() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("train_duet", ROOT / "scripts" / "train_duet.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-recipe = loaded()
+recipe = module_at(ROOT / "scripts" / "train_duet.py")
 
 
 def save(folder: Path, step: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +19,7 @@ from magnet.motion.scene import Scene
 from magnet.motion.tokens import scene_deltas
 from magnet.sampling.noise import LEVELS, ddim_step
 from magnet.testing import random_scene, tiny_denoiser
+from tests.scripts import module_at
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "sample_without_torch.py"
 PRESENT = torch.tensor([[1, 1, 1], [1, 0, 0], [1, 0, 1], [0, 0, 0]], dtype=torch.bool)
@@ -109,10 +109,7 @@ def test_the_sampler_without_torch_samples_what_torch_samples(exported: Path, tm
     assert done.stdout.strip() == "False"
     assert EXAMPLE.read_text().count("\n") <= 60
 
-    spec = importlib.util.spec_from_file_location("sample_without_torch", EXAMPLE)
-    assert spec and spec.loader
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
+    example = module_at(EXAMPLE)
     tokens = torch.as_tensor(example.sample(onnxruntime.InferenceSession(exported), steps=10))
     model = magnet.load("duet").denoiser
     noisy = torch.as_tensor(np.random.default_rng(0).standard_normal(tuple(tokens.shape), np.float32))

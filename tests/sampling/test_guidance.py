@@ -100,8 +100,8 @@ def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
 # -- what is finished, shown faintly -----------------------------------------------------------
 
 
-def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(given):
-    tokens, levels, present, mask_noise = given
+def shown_at_level_40(tokens: Tensor, levels: Tensor, present: Tensor, mask_noise: Tensor) -> tuple[Tensor, Tensor]:
+    """What the model sees first: tokens and levels."""
     seen = []
 
     def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
@@ -109,7 +109,12 @@ def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(g
         return model(noisy, shown, present)
 
     Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
-    noisy, shown = seen[0]
+    return seen[0]
+
+
+def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(given):
+    tokens, levels, present, mask_noise = given
+    noisy, shown = shown_at_level_40(tokens, levels, present, mask_noise)
     assert (shown[:, :4] == 40).all() and (shown[:, 4:] == 600).all()
     assert torch.equal(noisy[:, 4:], tokens[:, 4:])
     expected = add_noise(tokens[:, :4], mask_noise[:, :4], torch.tensor(40))
@@ -215,14 +220,7 @@ def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):
     tokens, levels, present, mask_noise = given
     levels = levels.clone()
     levels[:, 4:] = 20
-    seen = []
-
-    def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
-        seen.append((noisy, shown))
-        return model(noisy, shown, present)
-
-    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
-    noisy, shown = seen[0]
+    noisy, shown = shown_at_level_40(tokens, levels, present, mask_noise)
     assert (shown[:, 4:] == 20).all()
     assert torch.equal(noisy[:, 4:], tokens[:, 4:])
 

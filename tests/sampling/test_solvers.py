@@ -18,6 +18,7 @@ from magnet.sampling.solvers import History, solver_step
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.joint import JointFuture
+from magnet.testing import mixing
 
 # -- levels ------------------------------------------------------------------------------------
 
@@ -157,12 +158,6 @@ def alone(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
     layout = LAYOUT[noisy.shape[2]]
     share = alpha_bar(layout.spread(layout.group_levels(levels)))
     return torch.tanh(1.5 * noisy * share.sqrt()) * (0.3 + share)
-
-
-def mixing(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-    """A denoiser in which everything depends on everything of its scene."""
-    pooled = (noisy * (1 + levels[..., None] / LEVELS)).mean(dim=(1, 2), keepdim=True)
-    return torch.tanh(noisy.roll(1, dims=1) + noisy.roll(1, dims=2) + pooled)
 
 
 def seeded(*seeds: int) -> list[torch.Generator]:
