@@ -40,20 +40,18 @@ def geodesic(a: Tensor, b: Tensor) -> Tensor:
     tensor(0.3000)
     """
     relative = a.transpose(-1, -2) @ b
-    vee = torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        dim=-1,
-    )
-    square = (vee * vee).sum(-1)
+    axis = vee(relative)
+    square = (axis * axis).sum(-1)
     # The square root's slope is infinite at 0, so that branch must not see the 0 at all.
     apart = square > 0
     twice_sin = torch.where(apart, torch.where(apart, square, 1.0).sqrt(), 0.0)
     twice_cos = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0
     return torch.atan2(twice_sin, twice_cos)
+
+
+def vee(rotation: Tensor) -> Tensor:
+    """A rotation's axis times twice the sine of its angle. (..., 3, 3) -> (..., 3)"""
+    return torch.stack([rotation[..., i, j] - rotation[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
 
 
 def about_y(yaw: Tensor) -> Tensor:

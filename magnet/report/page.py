@@ -70,7 +70,8 @@ def page(
     lines = ["# Report", "", *_head(facts), ""]
     content: dict[str, Any] = {"facts": dict(facts), "tables": {}}
     for name, parts in blocks.items():
-        lines += [f"## {name if name in WORDS and name != 'A.3' else _table_name(name)}", ""]
+        titled = name.startswith("Fig") or (name in WORDS and name != "A.3")
+        lines += [f"## {name if titled else f'Table {name}'}", ""]
         lines += [WORDS[name], ""] if name in WORDS else []
         content["tables"][name] = [
             _block(block, store, failed, lines, f"{_safe(name)}-{k}") for k, block in enumerate(parts)
@@ -180,10 +181,6 @@ def _printed(name: str) -> list[str]:
             lines.append(f"| {method} | " + " | ".join(texts) + " |")
         lines += [""]
     return lines
-
-
-def _table_name(name: str) -> str:
-    return name if name.startswith("Fig") else f"Table {name}"
 
 
 def _safe(name: str) -> str:

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from magnet.motion.rotations import vee
+
 
 def about_x(angle: Tensor) -> Tensor:
     """Rotation about x: positive turns forward (+z) down. (...) radians -> (..., 3, 3)"""
@@ -32,18 +34,11 @@ def about(axis: Tensor, angle: Tensor) -> Tensor:
 
 def fraction(rotation: Tensor, share: float) -> Tensor:
     """Rotation by a fraction of its angle, for angles below pi. (..., 3, 3) -> (..., 3, 3)"""
-    vee = torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        dim=-1,
-    )
-    twice_sin = vee.norm(dim=-1)
+    axis = vee(rotation)
+    twice_sin = axis.norm(dim=-1)
     twice_cos = rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
     angle = torch.atan2(twice_sin, twice_cos)
-    return about(vee / twice_sin.clamp_min(1e-12)[..., None], angle * share)
+    return about(axis / twice_sin.clamp_min(1e-12)[..., None], angle * share)
 
 
 def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
