@@ -20,6 +20,7 @@ from typing import Any
 import yaml
 
 from magnet import checkpoints
+from magnet.callbacks.narrow_codes import NAME as NARROW
 
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = ("tokenizer", "denoiser", "decoder")
@@ -46,13 +47,13 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
 
     Args:
         stage: of `STAGES`.
-        out: folder of all stages.
+        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
     command = [sys.executable, "-m", "magnet", "fit", "--config", str(config_of(stage)), "--out", str(out / stage)]
     command += ["--trainer.max_steps", str(steps)]
-    tokenizer = str(last_checkpoint(out / "tokenizer"))
+    tokenizer = str(last_checkpoint(out / "tokenizer").with_name(NARROW))
     if stage == "denoiser":
         command += ["--model.tokenizer", tokenizer]
     if stage == "decoder":

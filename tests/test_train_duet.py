@@ -36,7 +36,7 @@ def test_stages_take_the_steps_of_their_configurations_unless_told_otherwise() -
 
 
 def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_checkpoint(tmp_path: Path) -> None:
-    tokenizer = str(recipe.last_checkpoint(tmp_path / "tokenizer"))
+    tokenizer = str(tmp_path / "tokenizer" / "checkpoints" / "narrow.ckpt")
     for stage, flag in (("denoiser", "--model.tokenizer"), ("decoder", "--model.start_from")):
         command = recipe.fit_command(stage, tmp_path, 9, ["--data.batch_size=4"])
         assert command[command.index(flag) + 1] == tokenizer

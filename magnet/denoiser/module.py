@@ -183,7 +183,8 @@ class Denoiser(TokenModel):
 
     def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
         """Set how tokens are normalized from real ones, as `tokenize` returns them."""
-        self.normalizer.set(*token_statistics(self.layout, tokens, there, self.noise.pairwise_metres))
+        scales = (self.noise.pairwise_metres, self.narrow)
+        self.normalizer.set(*token_statistics(self.layout, tokens, there, *scales))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         generator = step_generator(

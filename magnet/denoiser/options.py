@@ -23,10 +23,10 @@ class TransformerOptions:
         layers: transformer blocks.
         heads: attention heads.
         mlp_ratio: MLP size over d.
-        dropout: in attention and MLPs; the paper does not say.
-        level_width: size of the noise-level embedding.
+        dropout: in attention and MLPs; not in the paper.
+        level_width: size of the level embedding.
         agent_width: size of the agent embedding.
-        slot_width: size of the level embedding of each partner slot (ours: the paper has one level a token).
+        slot_width: size of the level embedding of each partner slot (ours).
         rope: where time enters: `hidden` rotates the embedded token once, as in the paper, `heads` rotates queries and
             keys, `none` leaves time out (ablation, paper Table A.5).
         agent_embedding: false takes the agents' identities away (ablation, paper Table A.5).

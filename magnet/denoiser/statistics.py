@@ -11,11 +11,12 @@ from magnet.tokenizer.normalizer import FLOOR
 
 @torch.no_grad()
 def token_statistics(
-    layout: TokenLayout, tokens: Tensor, there: Tensor, pairwise_metres: float = 0.0
+    layout: TokenLayout, tokens: Tensor, there: Tensor, pairwise_metres: float = 0.0, narrow: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (D,) of each number of a token.
 
-    Latents share one scale and have mean 0, so that a distance between codes stays a distance. The nine numbers of a
+    Latents share one scale and have mean 0, so that a distance between codes stays a distance. Those of
+    narrow codes, whose numbers say different things, are standardized one by one. The nine numbers of a
     delta or of a pairwise transform are standardized one by one. They are pooled over the frames of a token and over
     partner slots, so that slots stay exchangeable.
 
@@ -24,12 +25,16 @@ def token_statistics(
         tokens: (B, N, P, D) in real units.
         there: (B, N, P, 1 + slots) bool, which groups count.
         pairwise_metres: metres that count as one over the ground in pairwise transforms; 0: their standard deviation.
+        narrow: whether latents are narrow codes, as `magnet.tokenizer.narrow` makes them.
     """
     latent, deltas, pairs = layout.unpack(tokens.double())
     own = there[..., 0]
-    latent_scale = latent[own].square().mean().sqrt().clamp_min(1e-6)
-    means = [torch.zeros(layout.latent, device=tokens.device)]
-    stds = [latent_scale.expand(layout.latent)]
+    coded = latent[own]
+    if narrow and len(coded) > 1:
+        means, stds = [coded.mean(0)], [coded.std(0).clamp_min(1e-6)]
+    else:
+        means = [torch.zeros(layout.latent, device=tokens.device)]
+        stds = [coded.square().mean().sqrt().clamp_min(1e-6).expand(layout.latent)]
     for values, repeats in ((deltas[own], 1), (pairs[there[..., 1:]], layout.slots)):
         flat = values.reshape(-1, 9)
         known = len(flat) > 1

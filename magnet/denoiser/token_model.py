@@ -69,6 +69,11 @@ class TokenModel(L.LightningModule):
         return True
 
     @property
+    def narrow(self) -> bool:
+        """Whether latents are narrow codes, whose numbers are standardized one by one."""
+        return isinstance(self.tokenizer, Tokenizer) and self.tokenizer.network.embed_dim > 0
+
+    @property
     def built(self) -> bool:
         return hasattr(self, "normalizer")
 
@@ -172,7 +177,7 @@ class TokenModel(L.LightningModule):
 
     def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
         """Set how tokens are normalized from real ones, as `tokenize` returns them."""
-        self.normalizer.set(*token_statistics(self.layout, tokens, there))
+        self.normalizer.set(*token_statistics(self.layout, tokens, there, narrow=self.narrow))
 
     def require_body(self) -> Body:
         """The body whose joints decoded losses compare, on this model's device."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet import checkpoints
 
 SHAPING = {
-    "network": ("width", "depth", "causal", "lookahead"),
+    "network": ("width", "depth", "causal", "lookahead", "embed_dim"),
     "quantizer": ("kind", "codebook_size", "codebook_dim", "num_quantizers", "levels"),
 }
 """Options that decide the shape of the weights, or what they mean, by their groups."""

@@ -98,7 +98,8 @@ class Tokenizer(L.LightningModule):
         self.quantizer = made = make_quantizer(options)
         self.codebook_dim = made.dim
         sizes = (network.width, network.depth, network.causal)
-        self.vqvae = VQVAE(POSE_FEATURES, made.dim, *sizes, TOKEN_FRAMES, made.unit_input, network.lookahead)
+        ends = (made.unit_input, network.lookahead, network.embed_dim)
+        self.vqvae = VQVAE(POSE_FEATURES, made.dim, *sizes, TOKEN_FRAMES, *ends)
         self.body: Body | None = None
         self.mpjpe = MeanMetric()
         self.local_mpjpe = MeanMetric()

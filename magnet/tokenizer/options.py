@@ -19,17 +19,20 @@ class AutoencoderOptions:
         depth: residual blocks in each of the two stages; the paper does not say.
         causal: no token sees later frames (ours, for streaming).
         lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1 (ours).
+        embed_dim: numbers that narrow codes are projected from (ours); 0: none.
     """
 
     width: int = 512
     depth: int = 3
     causal: bool = False
     lookahead: int = 0
+    embed_dim: int = 0
 
     def __post_init__(self) -> None:
         require_whole("width", self.width, 1)
         require_whole("depth", self.depth, 1)
         require_whole("lookahead", self.lookahead, 0, 1)
+        require_whole("embed_dim", self.embed_dim, 0)
         if self.lookahead and not self.causal:
             raise ValueError(
                 "lookahead: got 1 without causal, but a tokenizer that is not causal sees all frames; set causal, too"
@@ -50,7 +53,7 @@ class QuantizerOptions:
         dead_code_threshold: codes chosen less often than this a batch start anew.
         continuous_steps: training steps before there are codes, half of all at most (ours).
         levels: of `fsq`, so many values each number of a code can have. The default makes 64,000 codes (Mentzer et al.
-            2023, Finite scalar quantization: VQ-VAE made simple, Table 1).
+            2023, Table 1).
     """
 
     kind: QuantizerKind = "residual_vq"

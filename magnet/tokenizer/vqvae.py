@@ -67,16 +67,23 @@ class Upsample(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Frames to token embeddings, of unit spread each where `unit`. (B, T, inputs) -> (B, T / 4, latent)"""
+    """Frames to token embeddings, of unit spread each where `unit`. (B, T, inputs) -> (B, T / 4, latent)
 
-    def __init__(self, inputs: int, width: int, latent: int, depth: int, causal: bool, unit: bool = True) -> None:
+    With `embed` numbers these are brought to unit spread, and then projected to the `latent` that codes have.
+    """
+
+    def __init__(
+        self, inputs: int, width: int, latent: int, depth: int, causal: bool, unit: bool = True, embed: int = 0
+    ) -> None:
         super().__init__()
         layers: list[nn.Module] = [Conv(inputs, width, 3, causal=causal), nn.GELU()]
         for _ in range(STAGES):
             layers += [Conv(width, width, 4, stride=2, causal=causal), stack(width, depth, causal)]
-        layers.append(Conv(width, latent, 3, causal=causal))
+        layers.append(Conv(width, embed or latent, 3, causal=causal))
         if unit:
-            layers.append(nn.LayerNorm(latent))
+            layers.append(nn.LayerNorm(embed or latent))
+        if embed:
+            layers.append(Conv(embed, latent, 1))
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -128,6 +135,7 @@ class VQVAE(nn.Module):
         stride: frames in a token.
         unit: bring the encoder's output to unit spread.
         lookahead: tokens after its own that a causal decoder's frame sees, 0 or 1.
+        embed: numbers that the encoder ends with before it projects them to `latent`; 0: it makes `latent` at once.
     """
 
     def __init__(
@@ -140,6 +148,7 @@ class VQVAE(nn.Module):
         stride: int,
         unit: bool = True,
         lookahead: int = 0,
+        embed: int = 0,
     ) -> None:
         super().__init__()
         self.stride, self.latent = stride, latent
@@ -148,7 +157,7 @@ class VQVAE(nn.Module):
         # Shape numbers come in units of a population's spread; few people in training must not narrow that,
         # or a new person would lie hundreds of deviations away.
         self.betas = Normalizer(10, floor=1.0)
-        self.encoder = Encoder(pose + 10 + 9, width, latent, depth, causal, unit)
+        self.encoder = Encoder(pose + 10 + 9, width, latent, depth, causal, unit, embed)
         self.decoder = Decoder(latent + 10 + 9 * stride, width, pose, depth, causal, lookahead)
 
     def encode(self, pose: Tensor, betas: Tensor, deltas: Tensor, known: Tensor) -> Tensor:
