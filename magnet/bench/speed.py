@@ -81,8 +81,8 @@ def paper_model(max_agents: int = 4, seed: int = 0) -> Denoiser:
         tokenizer, model = Tokenizer(), Denoiser(max_agents=max_agents)
         for part in (tokenizer.vqvae.pose, tokenizer.vqvae.deltas, tokenizer.vqvae.betas):
             part.set(torch.zeros_like(part.mean), torch.ones_like(part.std))
-        tokenizer.quantizer.get_buffer("codes").normal_()
-        tokenizer.quantizer.get_buffer("initialized").fill_(True)
+        tokenizer.get_buffer("quantizer.codes").normal_()
+        tokenizer.get_buffer("quantizer.initialized").fill_(True)
         model.build(tokenizer)
         model.normalizer.set(torch.zeros_like(model.normalizer.mean), torch.ones_like(model.normalizer.std))
     return model.eval()

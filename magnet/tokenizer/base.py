@@ -70,9 +70,14 @@ class Quantizer(Protocol):
     dim: int  # C, numbers in a code
     num_quantizers: int  # codebooks in a row
     frozen: bool  # nothing moves, also in training
-    initialized: Tensor | bool  # codes mean something
     waits: bool  # not rounding to codes until they are started
     unit_input: bool  # whether the encoder's output is brought to unit spread first
+    training: bool
+
+    @property
+    def initialized(self) -> Tensor | bool:
+        """Whether codes mean something."""
+        ...
 
     def __call__(
         self, vectors: Tensor, mask: Tensor | None = None, generator: torch.Generator | None = None

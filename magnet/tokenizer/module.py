@@ -20,7 +20,7 @@ from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
 from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
-from magnet.tokenizer.base import Quantized
+from magnet.tokenizer.base import Quantized, Quantizer
 from magnet.tokenizer.checkpoint import check_fields, check_weights, read_checkpoint, shaping
 from magnet.tokenizer.features import Features, delta_known, features, fold, put, statistics, unfold
 from magnet.tokenizer.fsq import FSQ
@@ -43,7 +43,7 @@ GLANCE = 4
 """Scenes of a training batch whose joint error is logged: enough for a curve, at no cost."""
 
 
-def make_quantizer(options: QuantizerOptions) -> ResidualVQ | FSQ:
+def make_quantizer(options: QuantizerOptions) -> Quantizer:
     """The quantizer that options describe; a new kind has a line here and a file beside `fsq.py`."""
     if options.kind == "fsq":
         return FSQ(options.levels)
