@@ -15,14 +15,12 @@ import json
 from pathlib import Path
 
 import torch
+from pairwise_error import windows
 from torch import Tensor
 
-from magnet.datamodules.cmu import CMU
-from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.results import machine
-from magnet.motion.scene import concatenate
-from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
+from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import add_noise
 
 LEVELS = (200, 500, 700, 800, 900, 950, 1000)
@@ -62,12 +60,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON to write")
     options = parser.parse_args()
     model = Denoiser.load(options.ckpt_path)
-    frames = model.window * TOKEN_FRAMES
-    test = HeldOutScenes(stride=frames // 2, horizon_frames=frames - 32)
-    data = CMU(singles=False, test_takes=options.takes, test=test, batch_size=16)
-    data.prepare_data()
-    data.setup("test")
-    scenes = concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)
+    scenes = windows(model, options.takes, overlap=2)
     truth = model.normalizer.normalize(model.tokenize(scenes)[0])
     wanted = parts(model.layout, truth, scenes.present)
     generator, rows = torch.Generator().manual_seed(0), {}

@@ -21,11 +21,21 @@ from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.evaluation.results import machine
 from magnet.motion.planar import yaw_ground
-from magnet.motion.scene import concatenate
+from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS, add_noise
 
 SHOWN = (5, 20, 50, 100, 300, 500)
+
+
+def windows(model: Denoiser, takes: list[int], overlap: int = 1) -> Scene:
+    """Recorded windows of CMU's couples, as long as the model's; with `overlap` 2 each begins amid another."""
+    frames = model.window * TOKEN_FRAMES
+    test = HeldOutScenes(stride=frames // overlap, horizon_frames=frames - 32)
+    data = CMU(singles=False, test_takes=takes, test=test, batch_size=16)
+    data.prepare_data()
+    data.setup("test")
+    return concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)
 
 
 def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
@@ -56,12 +66,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON to write")
     options = parser.parse_args()
     model = Denoiser.load(options.ckpt_path)
-    frames = model.window * TOKEN_FRAMES
-    test = HeldOutScenes(stride=frames, horizon_frames=frames - 32)
-    data = CMU(singles=False, test_takes=options.takes, test=test, batch_size=16)
-    data.prepare_data()
-    data.setup("test")
-    scenes = concatenate(list(data.test_dataloader())).pad_agents(model.layout.agents)
+    scenes = windows(model, options.takes)
     truth = model.normalizer.normalize(model.tokenize(scenes)[0])
     posterior = model.posterior or PairwisePosterior(model.layout)
     model.posterior = None

@@ -177,6 +177,17 @@ class Panel:
         return path
 
 
+def keyframe_at(page: Any, panel: Panel, app: Any, frame: int) -> None:
+    """Pause, go to a frame, and add the first keyframe there."""
+    panel.press("Pause")
+    wait(lambda: not app.clock.playing)
+    app.clock.seek(frame)
+    wait(lambda: app.shown == frame)
+    page.get_by_text("Keyframes", exact=True).click()
+    panel.press("Add keyframe here")
+    wait(lambda: len(app.live.keys) == 1)
+
+
 def drag_handle(page: Any, name: str, moved: Callable[[], bool]) -> None:
     """Drag the green square between a handle's arrows some way over the floor, until it has `moved`."""
 

@@ -11,7 +11,7 @@ import torch
 from magnet.generation.keyframes import limb_places
 from magnet.generation.live import Live
 from magnet.testing import tiny_denoiser
-from tests.viewer.browser import played, shot, wait
+from tests.viewer.browser import keyframe_at, played, shot, wait
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -31,13 +31,7 @@ def test_a_hand_of_a_keyframe_goes_up_with_its_arrow_and_nowhere_else(page, pane
     live = Live(model, start=handshake.slice(0, 64), generator=torch.Generator().manual_seed(1))
     live.settings.steps = 2
     with played(page, live, body) as app:
-        panel.press("Pause")
-        wait(lambda: not app.clock.playing)
-        app.clock.seek(40)
-        wait(lambda: app.shown == 40)
-        page.get_by_text("Keyframes", exact=True).click()
-        panel.press("Add keyframe here")
-        wait(lambda: len(live.keys) == 1)
+        keyframe_at(page, panel, app, 40)
         panel.choose("drag its", "left hand")
         limb = app.keys.limb
         wait(lambda: limb.handle is not None)

@@ -7,7 +7,7 @@ import torch
 
 from magnet.generation.live import FIRST, REACH, Live
 from magnet.motion.scene import Scene
-from tests.viewer.browser import blue, drag_handle, orange, played, seen, shipped, wait
+from tests.viewer.browser import blue, drag_handle, keyframe_at, orange, played, seen, shipped, wait
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -61,13 +61,7 @@ def test_keyframes_are_added_dragged_and_gone_through_and_what_there_is_loops(pa
     with played(page, live, body) as app:
         panel.tick("loop")
         wait(lambda: app.worker.paused and app.clock.loop)
-        panel.press("Pause")
-        wait(lambda: not app.clock.playing)
-        app.clock.seek(64)
-        wait(lambda: app.shown == 64)
-        page.get_by_text("Keyframes", exact=True).click()
-        panel.press("Add keyframe here")
-        wait(lambda: len(live.keys) == 1)
+        keyframe_at(page, panel, app, 64)
         goal = live.keys[0].goal
         drag_handle(page, "live_keyframe", lambda: live.keys[0].goal != goal)
         panel.choose("of", "person 2")
