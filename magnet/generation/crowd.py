@@ -235,14 +235,25 @@ class CrowdRollout(Rollout):
         shown, each = self._shown(noisy, levels)
         there = self.views.present.expand(R, -1, -1).flatten(0, 1)
         cond = None if cond is None else cond.repeat_interleave(V, dim=0)
-        parts = []
-        for some in torch.arange(R * V, device=noisy.device).split(BATCH):
+        made = torch.empty_like(shown)
+        for some in self._batches(each, there):
             extra = None if cond is None else cond[some]
-            parts.append(self.viewer.denoise(shown[some], each[some], there[some], extra, network))
-        clean = self._read(torch.cat(parts).float().unflatten(0, (R, V)))
+            made[some] = self.viewer.denoise(shown[some], each[some], there[some], extra, network).to(made)
+        clean = self._read(made.float().unflatten(0, (R, V)))
         if self.crowd:
             self._guess, self._guess_at = clean[0].detach(), self._begins
         return clean
+
+    def _batches(self, levels: Tensor, present: Tensor) -> list[Tensor]:
+        """Numbers of the views that run together. levels (V, W, M), present (V, M)
+
+        Views that are alike in both share a batch where the model has a posterior, which then solves for all at once.
+        """
+        order = torch.arange(len(levels), device=levels.device)
+        if not self.crowd or self.viewer.posterior is None:
+            return list(order.split(BATCH))
+        kind = torch.cat([levels.flatten(1), present], dim=1).unique(dim=0, return_inverse=True)[1]
+        return [some for number in kind.unique().tolist() for some in order[kind == number].split(BATCH)]
 
     def _shown(self, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
         """What each view shows: tokens (R V, W, M, D) and their levels (R V, W, M)."""
@@ -262,6 +273,7 @@ class CrowdRollout(Rollout):
         """Fill in how two people of a view stand whose tokens do not say it. about (R, W, V, M, K, 36)
 
         The view's ego holds pairwise transforms to both: from their expected values, with the noise of one of them.
+        Two who are known stand where they are placed, whatever an ego who is not known expects.
         """
         views, device = self.views, noisy.device
         other = self.viewer.layout.partners(device)  # (M, K)
@@ -271,10 +283,15 @@ class CrowdRollout(Rollout):
             return
         ego, one, two = views.ego[v], views.people[v, a], views.people[v, other[a, s]]
         (T_ego_one, *first), (T_ego_two, *second) = (self._seen_by(ego, who, noisy, levels) for who in (one, two))
-        mean, std = self._pair_statistics()
-        clean = (to_9d(inverse(T_ego_one) @ T_ego_two).flatten(-2) - mean) / std  # (R, W, E, 36)
-        noise = torch.where((second[1] >= first[1])[..., None], second[0], first[0])
         level = torch.maximum(levels[:, :, one], levels[:, :, two])
+        T_world_can = self.world.T_world_can[0].unflatten(0, (-1, TOKEN_FRAMES)).transpose(1, 2)  # (n, P, 4, 4, 4)
+        row = torch.arange(levels.shape[1], device=device) + self._begins - self.first
+        T_world_can = T_world_can[row.clamp(max=len(T_world_can) - 1)]  # what lies ahead is nobody's
+        placed = inverse(T_world_can[:, one]) @ T_world_can[:, two]
+        T_one_two = torch.where((level == 0)[..., None, None, None], placed, inverse(T_ego_one) @ T_ego_two)
+        mean, std = self._pair_statistics()
+        clean = (to_9d(T_one_two).flatten(-2) - mean) / std  # (R, W, E, 36)
+        noise = torch.where((second[1] >= first[1])[..., None], second[0], first[0])
         about[:, :, v, a, s] = add_noise(clean, noise, level[..., None])
 
     def _seen_by(self, ego: Tensor, who: Tensor, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -313,10 +330,8 @@ def _refuse(model: Denoiser, scene: Scene, context: int, options: SamplerOptions
     """Raise ValueError for what is not made for crowds."""
     if scene.agents > MOST:
         raise ValueError(f"got {scene.agents} people, expected at most {MOST}")
-    if model.layout.agents < 2 or not model.layout.slots or model.posterior is not None:
-        raise ValueError(
-            "crowds need a model with pairwise transforms of two people or more, and without pairwise_posterior"
-        )
+    if model.layout.agents < 2 or not model.layout.slots:
+        raise ValueError("crowds need a model with pairwise transforms of two people or more")
     if context < TOKEN_FRAMES or context > scene.frames:
         raise ValueError(
             f"context: got {context} of {scene.frames} frames; a crowd goes on from where everybody stands: give at "
