@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from magnet.denoiser.quick_posterior import QuickSetting, quickly_fused
 from magnet.motion.frames import partners
 from magnet.motion.pose_graph import PoseGraph
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
@@ -68,6 +69,8 @@ class PairwisePosterior(nn.Module):
             (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s; deltas shown clean are `noisy`'s.
         """
         known = self._setting(levels, present, normalizer)
+        if known.quick is not None:
+            return quickly_fused(clean, noisy, known.quick)
         where = known.people.where(*clean.shape[:2])
         predicted, given = self._transforms(clean)[where], self._transforms(noisy)[where]
         told = torch.addcmul(known.mean, predicted, known.std)
@@ -98,6 +101,8 @@ class PairwisePosterior(nn.Module):
             if len(kept) == MOST_KEPT:
                 kept.pop(next(iter(kept)))
             kept[key] = self._new_setting(levels, present, normalizer)
+        elif kept[key].quick is None:  # what is asked for once would not be worth it
+            kept[key] = replace(kept[key], quick=QuickSetting.of(kept[key], self.layout))
         return kept[key]
 
     def _new_setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Setting:
@@ -214,6 +219,7 @@ class Setting:
         second: (2, B, T, P) precisions of shown deltas: yaws, ground positions.
         share: (2, B, T, P, P - 1) weight of shown pairwise transforms against predicted ones: yaws, ground positions.
         graph: precisions.
+        quick: the same for `quickly_fused`, of what has been asked for before.
     """
 
     people: SlotsInUse
@@ -225,6 +231,7 @@ class Setting:
     second: Tensor
     share: Tensor
     graph: PoseGraph
+    quick: QuickSetting | None = None
 
 
 SETTINGS: Kept[dict[tuple[object, ...], Setting]] = Kept(lambda posterior: {})

@@ -297,6 +297,8 @@ def test_what_is_kept_from_call_to_call_is_that_of_the_same_question(model: Deno
 
     def asked() -> list[Tensor]:
         cases = [(levels, present), (levels + 100, present), (levels, two), (others, present), (levels, present)]
+        for case in cases:  # what is asked for again takes a quicker way
+            posterior(guess, noisy, *case, normalizer)
         return [posterior(guess, noisy, *case, normalizer) for case in cases]
 
     changes = (lambda: None, lambda: posterior.log_pair_ground.add_(-1), lambda: normalizer.std.mul_(1.1))
@@ -309,6 +311,29 @@ def test_what_is_kept_from_call_to_call_is_that_of_the_same_question(model: Deno
             assert torch.allclose(one, other, atol=1e-5)
         differ = [not torch.allclose(one, expected[0], atol=1e-4) for one in expected]
         assert differ == [False, True, True, True, False]
+
+
+@pytest.mark.parametrize("people", [[], [1], [0, 2], [0, 1, 2]])
+@pytest.mark.parametrize("scenes", [1, 3])
+def test_the_quick_form_is_the_plain_one_to_rounding(model: Denoiser, people: list[int], scenes: int):
+    """Any levels, tokens that contradict each other, and what stays is what it was to the bit."""
+    generator, posterior = torch.Generator().manual_seed(5), PairwisePosterior(model.layout)
+    present = torch.isin(torch.arange(3), torch.tensor(people)).expand(scenes, 3).contiguous()
+    shape = (1, model.window, 3)
+    some = torch.randint(LEVELS + 1, shape, generator=generator)
+    begun = torch.where(torch.arange(model.window)[:, None] < 3, 0, some)
+    for levels in (some, begun, torch.zeros_like(some), torch.full_like(some, LEVELS)):
+        noisy, clean = torch.randn(2, scenes, *shape[1:], model.layout.width, generator=generator)
+        levels = levels.expand(scenes, -1, -1)
+        with torch.no_grad():
+            kept = [posterior._setting(levels, present, model.normalizer) for _ in range(2)]
+            assert kept[0].quick is None and kept[1].quick is not None
+            quick = posterior(clean, noisy, levels, present, model.normalizer)
+        plain = posterior(clean, noisy, levels, present, model.normalizer).detach()
+        assert torch.allclose(quick, plain, rtol=1e-5, atol=2e-5)
+        same = plain == clean
+        assert torch.equal(quick[same], clean[same])
+        assert bool(same.all()) == (len(people) < 2)
 
 
 def test_deviations_can_be_learnt(model: Denoiser):
