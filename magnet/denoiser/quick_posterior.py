@@ -8,17 +8,15 @@ Transforms of P people are (P, P) here: an agent's own delta on the diagonal, an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.denoiser.posterior_setting import Setting
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
-
-if TYPE_CHECKING:
-    from magnet.denoiser.pairwise_posterior import Setting
 
 Array = NDArray[Any]
 
