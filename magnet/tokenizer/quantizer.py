@@ -9,10 +9,14 @@ from torch.nn import functional as F
 
 from magnet.precision import Float32
 from magnet.tokenizer.base import Quantized
+from magnet.tokenizer.code_search import FEW, Book, nearest_codes
 
 KMEANS_ROUNDS = 10
 KMEANS_VECTORS = 8
 """Vectors a code, over all processes, that the k-means start looks at; more only cost time."""
+
+OFTEN = 8
+"""So many times few vectors are looked up before codebooks are prepared for it (0.1 s at the shipped sizes)."""
 
 CROWD = 4.0
 """With at least this many vectors a code in a batch, `dead_code_threshold` means what it says."""
@@ -58,6 +62,8 @@ class ResidualVQ(Float32):
         self.ema_decay, self.dead_code_threshold = ema_decay, dead_code_threshold
         self.frozen = False
         self._lengths: tuple[tuple[int, int], Tensor] | None = None  # of codes, squared, while they stay
+        self._searched: tuple[tuple[int, int], list[Book]] | None = None  # while codes stay
+        self._lookups = 0  # of few vectors, since then
         self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
         self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
         self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
@@ -120,6 +126,8 @@ class ResidualVQ(Float32):
             return self.continuous(vectors)
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
+            if len(residual) <= FEW and (books := self._books()):
+                return torch.from_numpy(nearest_codes(books, residual.detach().numpy())).view(vectors.shape)
             latent = torch.zeros_like(residual)
             for book in range(self.num_quantizers):
                 code = self.codes[book][self._nearest(residual, book)]
@@ -133,6 +141,18 @@ class ResidualVQ(Float32):
         if self._lengths is None or self._lengths[0] != now:
             self._lengths = (now, self.codes.square().sum(-1))
         return (self._lengths[1][book] - 2 * vectors @ self.codes[book].T).argmin(-1)
+
+    def _books(self) -> list[Book]:
+        """The codebooks as few vectors look them up; none before that has been asked for often."""
+        if self.training or self.codes.device.type != "cpu" or self.codes.is_inference():
+            return []
+        now = (self.codes.data_ptr(), self.codes._version)
+        if self._searched is None or self._searched[0] != now:
+            self._searched, self._lookups = (now, []), 0
+        self._lookups += 1
+        if self._lookups == OFTEN:
+            self._searched[1].extend(Book.of(codes) for codes in self.codes)
+        return self._searched[1]
 
     # -- following -----------------------------------------------------------------------------
 
