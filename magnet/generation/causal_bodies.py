@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
-from magnet.generation.settling import settled_on
+from magnet.generation.settling import PACE, settled_on
 from magnet.motion.frames import from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -119,7 +119,7 @@ def _settled(world: World, made: Scene, stop: int) -> Scene:
     first = world.finalized * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
     new = world.by_frame(world.placed[rows] & ~world.known[rows])
-    before = world.given.slice(first - 1, first) if first else None
+    before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
     world.uncorrected = made.slice(made.frames - LEAD)
     unseen = world.known[rows].any(dim=0).to(new.device)
     made, world.correction = settled_on(made, before, new, unseen, world.options.settle, world.correction)

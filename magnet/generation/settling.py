@@ -21,17 +21,35 @@ BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
 """How a causal plan's next frames are corrected: what is held over fades soon where nothing asks for it."""
 
+PACE = 3
+"""Frames over which it is measured how fast somebody goes who is not seen any further."""
+
+GLIDE = 30.0
+"""Frames in which somebody who is expected to go on slows down to a third."""
+
 WORTH = 0.02
 """Metres that some joint must be moved for a person's block to be corrected: encoding it again costs about as much."""
 
 
-def frozen(scene: Scene, agents: Tensor, frame: int) -> Scene:
-    """The scene with some agents standing still from a frame on. agents (P,) bool"""
-    frames = torch.arange(scene.frames, device=scene.device).clamp(max=frame)
-    still = scene.frames_at(frames)
+def carried_on(scene: Scene, agents: Tensor, frame: int) -> Scene:
+    """The scene with some agents going on from a frame as they went until then. agents (P,) bool
+
+    They hold their pose and glide over the ground, ever slower (`GLIDE`): what somebody who sees no more expects of
+    them. The frames before tell how fast; where there are none they stand still.
+    """
+    frames = torch.arange(scene.frames, device=scene.device)
+    held = scene.frames_at(frames.clamp(max=frame))
+    steps = min(frame, PACE)
+    if steps:
+        place = scene.T_world_root[..., :3, 3]
+        pace = (place[:, frame] - place[:, frame - steps]) / steps * place.new_tensor([1.0, 0.0, 1.0])  # (B, P, 3)
+        far = GLIDE * (1 - torch.exp(-(frames - frame).clamp(min=0) / GLIDE))
+        root = held.T_world_root.clone()
+        root[..., :3, 3] += far[:, None, None] * pace[:, None]
+        held = held.replace(T_world_root=root)
     return scene.replace(
-        body_rot=torch.where(agents[:, None, None, None], still.body_rot, scene.body_rot),
-        T_world_root=torch.where(agents[:, None, None], still.T_world_root, scene.T_world_root),
+        body_rot=torch.where(agents[:, None, None, None], held.body_rot, scene.body_rot),
+        T_world_root=torch.where(agents[:, None, None], held.T_world_root, scene.T_world_root),
     )
 
 
@@ -41,7 +59,7 @@ def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead
     Args:
         scene: (B, T, P) bodies.
         new: (T, P) bool, who may be moved.
-        unseen: (P,) bool, whom the new ones may know no further than the first frames: they stand still from there on.
+        unseen: (P,) bool, whom the new ones may know no further than the first frames: they are carried on from there.
         how: `light` or `firm`.
         lead: first frames that are a past; 0: none, and whoever is unseen is not there.
         decentralized: the new ones do not see each other either.
@@ -51,7 +69,7 @@ def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead
     made, moving = shaped, new.any(dim=0)
     for who in [agents == agent for agent in agents[moving]] if decentralized else [moving]:
         hidden = unseen | (moving & ~who)
-        seen = frozen(shaped, hidden, lead - 1) if lead else shaped.replace(present=shaped.present & ~hidden)
+        seen = carried_on(shaped, hidden, lead - 1) if lead else shaped.replace(present=shaped.present & ~hidden)
         own = new & who
         one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), slides=0.0, drifting=False)
         far = (body.joints(one) - body.joints(seen)).norm(dim=-1).amax(dim=(1, 3))  # (B, P)
@@ -124,7 +142,7 @@ def settled_on(
 
     Args:
         scene: (B, T, P) bodies, uncorrected.
-        before: the frame before, as shown; None: there is none, and nobody else is there yet.
+        before: the last frames before, as shown; None: there are none, and nobody else is there yet.
         new: (T, P) bool, who may be moved.
         unseen: (P,) bool, of whom nobody knows more than `before`.
         how: `light` or `firm`.
@@ -141,8 +159,8 @@ def settled_on(
         if before is None:
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
-            still = before.replace(body=body.id, valid=None, given=None)
-            seen = frozen(cat_time([still, shaped]), hidden, 0).slice(1)
+            known = before.replace(body=body.id, valid=None, given=None)
+            seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
         one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, slides=0.0)
         offset[:, :, who] = one[:, :, who]
     made = corrected(shaped, offset)

@@ -13,6 +13,7 @@ from magnet.body import load_body
 from magnet.body.energy import CONTACT
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
+from magnet.generation.settling import GLIDE, PACE, carried_on
 from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
@@ -105,3 +106,40 @@ def test_people_of_the_shipped_model_are_out_of_each_other() -> None:
     plain, guided, settled = depth(), depth(body_guidance="firm"), depth(settle="firm")
     assert plain > 0.5, "two steps from nothing: people do run through each other"
     assert guided < 0.9 * plain and settled < 0.1 * plain
+
+
+def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
+    scene = random_scene(2, 24, 3, torch.Generator().manual_seed(0))
+    root = scene.T_world_root.clone()
+    root[:, :, 1, :3, 3] = torch.arange(24)[:, None] * torch.tensor([0.02, 0.01, -0.01])  # up as well
+    scene = scene.replace(T_world_root=root)
+    agents = torch.tensor([False, True, False])
+    made = carried_on(scene, agents, 8)
+    for before, after in ((scene.T_world_root, made.T_world_root), (scene.body_rot, made.body_rot)):
+        assert torch.equal(after[:, :9], before[:, :9])
+        assert torch.equal(after[:, :, ~agents], before[:, :, ~agents])
+    moved = made.T_world_root[:, 8:, 1, :3, 3] - root[:, 8:9, 1, :3, 3]
+    step = moved.diff(dim=1)
+    torch.testing.assert_close(step[:, 0], torch.tensor([0.02, 0.0, -0.01]).expand(2, 3), rtol=0.05, atol=1e-6)
+    assert (step[..., 0].diff(dim=1) < 0).all()  # ever slower
+    assert (moved[..., 0] < 0.02 * GLIDE).all()
+    assert torch.equal(made.body_rot[:, 8:, 1], scene.body_rot[:, 8:9, 1].expand(-1, 16, -1, -1, -1))
+
+
+def test_what_comes_after_does_not_tell_how_somebody_is_expected_to_go_on() -> None:
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(0))
+    agents = torch.tensor([False, True])
+    other = scene.replace(T_world_root=scene.T_world_root.clone(), body_rot=scene.body_rot.clone())
+    other.T_world_root[:, 9:, 1, :3, 3] += 1.0
+    other.body_rot[:, 9:, 1] = other.body_rot[:, 8:9, 1]
+    one, two = carried_on(scene, agents, 8), carried_on(other, agents, 8)
+    assert torch.equal(one.T_world_root[:, :, 1], two.T_world_root[:, :, 1])
+    assert torch.equal(one.body_rot[:, :, 1], two.body_rot[:, :, 1])
+
+
+@pytest.mark.parametrize("frame", [0, 1, PACE])
+def test_with_few_frames_before_somebody_stands_still_or_goes_on_by_those(frame) -> None:
+    scene = random_scene(1, 12, 2, torch.Generator().manual_seed(0))
+    made = carried_on(scene, torch.tensor([True, True]), frame)
+    still = made.T_world_root[:, frame:] - made.T_world_root[:, frame : frame + 1]
+    assert (still[..., [0, 2], 3].abs().amax() == 0) == (frame == 0)
