@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from magnet.denoiser import transformer
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer, block_causal, rotate, skipped
 from magnet.motion.tokens import TokenLayout
@@ -184,3 +185,19 @@ def test_with_a_skip_what_is_shown_clean_comes_back_and_what_noise_hides_is_the_
     assert torch.allclose(skipped(told, shown, levels, LAYOUT), clean, atol=1e-5)
     anything = skipped(noise, shown, levels, LAYOUT)
     assert torch.equal(anything[:, 0], clean[:, 0]) and torch.equal(anything[:, 3], noise[:, 3])
+
+
+@pytest.mark.parametrize("causal_block", [0, 2])
+def test_training_gives_the_gradients_that_flash_attention_gives(generator, causal_block):
+    noisy, levels = batch(generator)
+    present = torch.tensor([[True, False, True, False], [True, True, True, True]])
+    gradients = []
+    for training in (True, False):  # without dropout the modes differ in how attention is computed alone
+        model = build(dropout=0.0, causal_block=causal_block).train(training)
+        with mock.patch.object(transformer, "sdpa_kernel", wraps=transformer.sdpa_kernel) as kernel:
+            model(noisy, levels, present).square().mean().backward()
+        assert kernel.called == training
+        gradients.append([p.grad for p in model.parameters() if p.grad is not None])
+    assert len(gradients[0]) == len(gradients[1]) > 0
+    for plain, flash in zip(*gradients, strict=True):
+        assert torch.allclose(plain, flash, rtol=1e-4, atol=1e-6)
