@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -279,3 +281,29 @@ def test_flags_are_written_in_one_style_and_read_in_two(capsys: pytest.CaptureFi
     for words in (["--out", "a-b"], ["--ckpt-path=runs/a-b.ckpt"], ["--task", "in-betweening"], ["-x-y"], ["---"]):
         flag, *values = words
         assert [underscored(word) for word in words] == [flag.replace("ckpt-path", "ckpt_path"), *values]
+
+
+@pytest.mark.parametrize("command", ["test", "demo"])
+def test_sigterm_ends_a_command_at_once(command: str) -> None:
+    code = (
+        "import importlib, os, signal, sys, time\n"
+        "m = importlib.import_module('magnet.cli.main')\n"
+        "def run(command, arguments):\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    time.sleep(20)\n"
+        "    return 0\n"
+        f"m.run = run; sys.exit(m.main([{command!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], timeout=15, check=False)
+    assert done.returncode == 128 + signal.SIGTERM
+
+
+def test_a_training_is_left_to_save_its_checkpoint_and_handlers_are_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, seen = signal.getsignal(signal.SIGTERM), []
+    monkeypatch.setattr(
+        importlib.import_module("magnet.cli.main"), "run", lambda *_: seen.append(signal.getsignal(signal.SIGTERM)) or 0
+    )
+    assert [cli.main(["fit"]), cli.main(["test"])] == [0, 0]
+    assert seen[0] is before
+    assert seen[1] is not before
+    assert signal.getsignal(signal.SIGTERM) is before
