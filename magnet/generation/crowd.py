@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from magnet.generation.rollout import CHUNK, Rollout
+from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import from_9d, inverse, project_se2, to_9d, to_planar
 from magnet.motion.neighbours import CrowdLayout, CrowdViews, nearest_partners
@@ -34,6 +35,9 @@ BATCH = 32
 
 BOND = 1.2
 """Metres between two people, on average over the context, up to which they stay partners wherever they go."""
+
+BEHIND = 8
+"""Token steps before a block that its bodies are decoded with, to keep them out of each other."""
 
 MOST = 200
 """People of a crowd: more were not tried."""
@@ -107,6 +111,8 @@ class CrowdRollout(Rollout):
         people = scene.pad_agents(max(scene.agents, model.layout.agents))
         self._look_around(people, context)
         super().__init__(self.model, scene, task, context, frames, 1, options, generator, progress, stats, chunk, cond)
+        if self.crowd:
+            self.world.decode_rows = self._decode_rows
         if self.crowd and not bool((self.known[context // TOKEN_FRAMES - 1] | ~self.scene.present[0].cpu()).all()):
             raise ValueError(
                 "in a crowd everybody's start must be known, because partners are chosen by place; partner_inpainting "
@@ -217,6 +223,28 @@ class CrowdRollout(Rollout):
         """Mean and deviation of a pairwise transform's numbers, the same for all slots. (36,) each"""
         numbers = slice(self.viewer.layout.latent + PAIR, self.viewer.layout.latent + 2 * PAIR)
         return self.viewer.normalizer.mean[numbers], self.viewer.normalizer.std[numbers]
+
+    def _decode_rows(self, tokens: Tensor, first: int, stop: int) -> Decode:
+        """Decodes rows [first, stop), or the first of them, with those before and what is expected of those behind.
+
+        Alone they would be decoded to bodies whose hands and feet are up to 20 cm from where they are shown in the end.
+        """
+        layout, normalizer, tokenizer = self.viewer.layout, self.viewer.normalizer, self.viewer.tokenizer
+        low, begins = max(first - BEHIND, 0), self.first + stop
+        held = self.model.layout.unpack(normalizer.denormalize(tokens[:, low:first]))[0]
+        before = held, self.world.placed_deltas(low, first)
+        ahead = self._guessed(begins, max(self._guess_at + len(self._guess) - begins, 0))
+        latent, deltas, _ = layout.unpack(normalizer.denormalize(ahead[None]))
+        behind = tokenizer.requantize(latent) if self.viewer.quantized else latent, deltas
+
+        def decode(latent: Tensor, betas: Tensor, deltas: Tensor) -> Tensor:
+            rows = latent.shape[1]
+            parts = [before, (latent, deltas), *([behind] if rows == stop - first else [])]
+            latents, steps = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
+            poses = tokenizer.decode(latents, betas, steps)
+            return poses[:, (first - low) * TOKEN_FRAMES :][:, : rows * TOKEN_FRAMES]
+
+        return decode
 
     # -- the network sees views --------------------------------------------------------------------
 

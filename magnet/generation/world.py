@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
-from magnet.generation.separation import separated
+from magnet.generation.separation import Decode, separated
 from magnet.generation.settling import LEAD, settled_block, settled_chunk
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
@@ -75,6 +76,7 @@ class WorldState:
         self.correction: Tensor | None = None  # of the last two frames shown, see `settled_chunk`
         self.uncorrected: Scene | None = None  # those frames of a causal plan without it
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
+        self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
         self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
 
     def extend(self, given: Scene, known: Tensor) -> None:
@@ -148,7 +150,7 @@ class WorldState:
         low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
         self.T_world_can[:, frames] = separated(
-            self.model.tokenizer.decode,
+            self.decode_rows(tokens, low, stop),
             latent,
             self.placed_deltas(low, stop),
             self.T_world_can[:, frames],

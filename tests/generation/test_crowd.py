@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+import magnet
 from magnet.body.apart import APART, excess_depth, kept_apart, lifted
 from magnet.denoiser.module import Denoiser
 from magnet.generation.crowd import CrowdRollout, generate_crowd
@@ -112,6 +113,39 @@ def test_two_who_are_known_are_shown_where_they_stand_to_whoever_is_not(model: D
     task = registry.get("motion_control")(target=(0, 2, 4, 6))
     list(Watched(model, scene, task, 8, 16, QUICK, seeded()).chunks())
     assert sum(seen) > 0, "some egos are not known"
+
+
+def test_bodies_are_kept_apart_as_they_are_shown_in_the_end() -> None:
+    """A block decoded alone is of other poses than in the middle of its scene; those would be kept apart in vain."""
+    model, options = magnet.load("duet").denoiser, SamplerOptions.preset("steady", steps=3)
+    seen: list[tuple[int, torch.Tensor, torch.Tensor]] = []
+    errors: list[tuple[float, float]] = []
+
+    class Watched(CrowdRollout):
+        def _decode_rows(self, tokens: torch.Tensor, first: int, stop: int) -> Any:
+            near = super()._decode_rows(tokens, first, stop)
+
+            def decode(*rows: torch.Tensor) -> torch.Tensor:
+                poses = near(*rows)
+                seen.append((stop, poses[:, -TOKEN_FRAMES:], model.tokenizer.decode(*rows)[:, -TOKEN_FRAMES:]))
+                return poses
+
+            return decode
+
+        def _decoded(self, *rest: Any) -> Scene:
+            layout, rows = self.model.layout, self.tokens.shape[1]
+            latent = layout.unpack(model.normalizer.denormalize(self.tokens))[0]
+            shown = model.tokenizer.decode(latent, self.world.given.betas, self.world.placed_deltas(0, rows))
+            for stop, *both in seen:
+                if stop < rows - 2:  # the last ones have nothing behind them
+                    truth = shown[:, (stop - 1) * TOKEN_FRAMES : stop * TOKEN_FRAMES]
+                    errors.append(tuple(float((made - truth).abs().mean()) for made in both))  # type: ignore[arg-type]
+            return super()._decoded(*rest)
+
+    start = start_crowd(model, 9, options, seeded())
+    list(Watched(model, start, registry.get("joint_future")(), 32, 40, options, seeded()).chunks())
+    near, alone = torch.tensor(errors).mean(dim=0)
+    assert near < 0.7 * alone, (near, alone)
 
 
 @pytest.mark.slow
