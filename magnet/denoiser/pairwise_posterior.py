@@ -101,9 +101,9 @@ class PairwisePosterior(nn.Module):
         if key not in kept:
             if len(kept) == MOST_KEPT:
                 kept.pop(next(iter(kept)))
-            kept[key] = self._new_setting(levels, present, normalizer)
-        elif kept[key].quick is None:  # what is asked for once would not be worth it
-            kept[key] = replace(kept[key], quick=QuickSetting.of(kept[key], self.layout))
+            known = self._new_setting(levels, present, normalizer)
+            # At once, though what is asked for once is not worth it: what was asked before must not change any bit.
+            kept[key] = replace(known, quick=QuickSetting.of(known, self.layout))
         return kept[key]
 
     def _new_setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Known:
@@ -171,7 +171,7 @@ class PairwisePosterior(nn.Module):
 
 @dataclass(frozen=True)
 class Known(Setting):
-    """A setting, and the same for `quickly_fused` where it has been asked for before."""
+    """A setting, and the same for `quickly_fused` on a CPU."""
 
     quick: QuickSetting | None = None
 
