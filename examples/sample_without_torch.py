@@ -1,4 +1,4 @@
-"""Two people from nothing without torch: `magnet export-model duet.onnx`, then `python sample_without_torch.py`."""
+"""Two people from nothing without torch, by `magnet export-model duet.onnx --without_posterior` and then this."""
 
 import json
 import sys

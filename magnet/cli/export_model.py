@@ -9,10 +9,11 @@ from magnet.cli.flags import PlainParser
 
 EPILOG = """\
 OUT.onnx is the denoiser; OUT_decoder.onnx makes poses of its tokens, OUT_encoder.onnx tokens of poses. Each is run by
-onnxruntime before it is written and must give torch's numbers. What they take and give: docs/onnx.md.
+onnxruntime before it is written and must give torch's numbers. What they take and give: docs/onnx.md. A model with
+network.pairwise_posterior is exported only when --without_posterior says that it may be left out.
 
 for example:
-  magnet export-model duet.onnx
+  magnet export-model duet.onnx --without_posterior
   magnet export-model mine.onnx --ckpt_path runs/duet_denoiser/latest/checkpoints/last.ckpt
   python examples/sample_without_torch.py duet.onnx dance.npz
 """
@@ -30,7 +31,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
     parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")
     parser.add_argument(
-        "--without_posterior", action="store_true", help="the network alone, of a model with network.pairwise_posterior"
+        "--without_posterior",
+        action="store_true",
+        help="of a model with network.pairwise_posterior the network alone, which is all that ONNX can hold and is "
+        "less exact; changes nothing for other models",
     )
     options = parser.parse_args(list(arguments))
     from magnet.cli.errors import CommandError

@@ -77,8 +77,9 @@ class PortableDenoiser(nn.Module):
         super().__init__()
         if denoiser.posterior is not None:
             raise ValueError(
-                "network.pairwise_posterior: it solves linear systems, which ONNX has no operator for; "
-                "--without_posterior exports the network alone, whose deltas and pairwise transforms are less exact"
+                "this model has network.pairwise_posterior, which solves linear systems, and ONNX has no operator for "
+                "that. Give --without_posterior to write the network alone; its deltas and pairwise transforms are "
+                "less exact (docs/onnx.md)"
             )
         self.denoiser = [denoiser]  # in a list: only the transformer's weights belong to the file
         self.transformer = copy.copy(denoiser.transformer)
