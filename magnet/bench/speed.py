@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -37,14 +37,17 @@ class Case:
         task: name in the registry.
         people: agents P in a scene.
         batch: scenes B at once.
+        options: of the task, where they differ from its defaults.
     """
 
     task: str
     people: int
     batch: int
+    options: tuple[tuple[str, Any], ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.task}, {self.people} people, batch {self.batch}"
+        options = "".join(f", {name} {value}" for name, value in self.options)
+        return f"{self.task}, {self.people} people, batch {self.batch}{options}"
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def measure(
     Raises:
         ValueError: the task cannot be sampled so; says why.
     """
-    task = registry.get(case.task)()
+    task = registry.get(case.task)(**dict(case.options))
     context = 0 if case.task in FROM_NOTHING else CONTEXT
     scene = standing(case.batch, context + frames, case.people, model.device)
     options = dataclasses.replace(options, any_floor=True)
@@ -214,9 +217,24 @@ def memory_mib() -> float | None:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def cases(tasks: Sequence[str], people: Sequence[int], batches: Sequence[int]) -> list[Case]:
-    """Every combination that makes sense: tasks that make one agent from another need two."""
-    found = [Case(task, P, B) for task in tasks for P in people for B in batches]
+def cases(
+    tasks: Sequence[str], people: Sequence[int], batches: Sequence[int], options: Mapping[str, Any] | None = None
+) -> list[Case]:
+    """Every combination that makes sense: tasks that make one agent from another need two.
+
+    Of the `options` each task is given those that it has.
+
+    Raises:
+        ValueError: an option that none of the tasks has.
+    """
+    options = options or {}
+    has = {task: {each.name for each in dataclasses.fields(registry.get(task))} for task in tasks}
+    for name in options:
+        if not any(name in own for own in has.values()):
+            there = ", ".join(sorted(set().union(*has.values()))) or "none"
+            raise ValueError(f"--task.{name}: no such option; of {', '.join(tasks)} there are: {there}")
+    own = {task: tuple((name, value) for name, value in options.items() if name in has[task]) for task in tasks}
+    found = [Case(task, P, B, own[task]) for task in tasks for P in people for B in batches]
     return [case for case in found if case.people > 1 or case.task in ALONE]
 
 

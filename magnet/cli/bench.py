@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +18,13 @@ if TYPE_CHECKING:
 EPILOG = """\
 ms/eval is one run of the network on the whole batch; floor is its matrix products alone, timed in the same round, and
 x floor the ratio, which is what other machines and other days can be compared by. first is the time until the first
-frames. live is a partner who answers token by token, against the clock of the motion.
+frames. live is a partner who answers token by token, against the clock of the motion. --task.NAME VALUE sets an
+option of the tasks that have one of that name (magnet tasks lists them).
 
 for example:
   magnet bench --quick
   magnet bench --model paper --task joint_future --task motion_control --out paper.json
+  magnet bench --quick --task agentic_async --task.offset 0.5
   magnet bench --quick --compare before.json
 """
 COLUMNS = {
@@ -67,7 +69,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         CommandError: an option that makes no sense.
         ValueError: no such model, task or preset; says what there is.
     """
-    given = parser().parse_args(list(arguments))
+    of_tasks, others = task_options(arguments)
+    given = parser().parse_args(others)
     from magnet.cli.errors import CommandError
 
     for name in ("frames", "rounds", "steps", "threads"):
@@ -78,7 +81,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
     if given.threads is not None:
         torch.set_num_threads(given.threads)
-    found = run(given)
+    found = run(given, of_tasks)
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
@@ -104,7 +107,33 @@ def read(path: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def run(given: argparse.Namespace) -> dict[str, Any]:
+def task_options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Options of tasks, --task.NAME VALUE or --task.NAME=VALUE, and the other arguments.
+
+    Raises:
+        CommandError: an option without its value.
+    """
+    import yaml
+
+    from magnet.cli.errors import CommandError
+
+    found: dict[str, Any] = {}
+    others: list[str] = []
+    left = list(arguments)
+    while left:
+        word = left.pop(0)
+        if not word.startswith("--task."):
+            others.append(word)
+            continue
+        name, equals, text = word.removeprefix("--task.").partition("=")
+        if not equals and (not left or left[0].startswith("--")):
+            raise CommandError(f"{word}: expected a value after it")
+        value = yaml.safe_load(text if equals else left.pop(0))
+        found[name] = tuple(value) if isinstance(value, list) else value
+    return found, others
+
+
+def run(given: argparse.Namespace, of_tasks: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Measure and print, case by case. Returns everything that was measured, JSON-ready."""
     import torch
 
@@ -125,7 +154,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
     print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads} threads")
     print(row("", list(COLUMNS.values())), flush=True)
     found: dict[str, Any] = {"cases": {}, "live": None}
-    for case in cases(tasks, people, given.batch or usual["batch"]):
+    for case in cases(tasks, people, given.batch or usual["batch"], of_tasks):
         speed = dataclasses.asdict(measure(model, case, options, given.frames, given.rounds, clock=clock))
         found["cases"][str(case)] = speed
         print(row(str(case), [shown(speed[name]) for name in COLUMNS]), flush=True)
@@ -137,7 +166,7 @@ def run(given: argparse.Namespace) -> dict[str, Any]:
             f"percentile), jitter {live['jitter_ms']:.1f} ms, {live['late']} late of {live['period_ms']:.0f} ms"
         )
     about = {"model": given.model, "threads": threads, "frames": given.frames, "rounds": given.rounds}
-    about |= {"clock": given.clock}
+    about |= {"clock": given.clock, "task_options": dict(of_tasks or {})}
     return {**found, **about, "sampler": dataclasses.asdict(options), "machine": machine(), **provenance()}
 
 

@@ -27,7 +27,7 @@ class Dropout(nn.Module):
         if not self.training or not self.p:
             return x
         dropped = round(self.p * DRAWS)
-        if x.device.type != "cpu" or not 0 < dropped < DRAWS:
+        if x.device.type != "cpu" or not 0 < dropped < DRAWS or torch.compiler.is_compiling():
             return F.dropout(x, self.p)
         draws = torch.empty(-(-math.prod(x.shape) // 4), dtype=torch.int64).random_(-(2**63), None)
         kept = draws.view(torch.int16)[: x.numel()] >= dropped - DRAWS // 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,16 +21,16 @@ from magnet.denoiser.transformer import Transformer, TransformerBlock, block_cau
 from magnet.packing import Kept, linear_of, norm_of
 from magnet.sampling.noise import LEVELS
 
-if TYPE_CHECKING:
-    pass
-
 Precision = Literal["float32", "bf16"]
 
 
 class LeanBlock:
-    """`TransformerBlock` with packed weights, for tokens whose times are turned by given complex numbers."""
+    """`TransformerBlock` with packed weights, for tokens whose times are turned by given complex numbers.
 
-    def __init__(self, block: TransformerBlock, dtype: torch.dtype) -> None:
+    Only of the last one some tokens may be asked for: it keeps weights of queries beside those of keys and values.
+    """
+
+    def __init__(self, block: TransformerBlock, dtype: torch.dtype, last: bool) -> None:
         width = block.out.in_features
         self.heads, self.each = block.heads, width // block.heads
         weight, bias = block.qkv.weight.detach(), block.qkv.bias.detach()
@@ -42,8 +42,9 @@ class LeanBlock:
         channels = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
         weight, bias = weight[channels], bias[channels]
         self.qkv = linear_of(weight, bias, dtype)
-        self.query = linear_of(weight[:width], bias[:width], dtype)
-        self.key_value = linear_of(weight[width:], bias[width:], dtype)
+        if last:
+            self.query = linear_of(weight[:width], bias[:width], dtype)
+            self.key_value = linear_of(weight[width:], bias[width:], dtype)
         self.out = linear_of(block.out.weight, block.out.bias, dtype)
         first, last = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
         self.first, self.last = (linear_of(layer.weight, layer.bias, dtype) for layer in (first, last))
@@ -132,7 +133,8 @@ class LeanTransformer:
         self.entry = [
             linear_of(x.weight, x.bias, torch.float32) if isinstance(x, nn.Linear) else plain_layer(x) for x in layers
         ]
-        self.blocks = [LeanBlock(block, self.dtype) for block in network.blocks]  # type: ignore[arg-type]
+        blocks = list(network.blocks)
+        self.blocks = [LeanBlock(block, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
         self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
         self.condition = network.condition if o.cond_dim else None
 

@@ -62,3 +62,28 @@ def test_the_command_writes_what_it_measured_and_compares_it(tmp_path: Path, cap
     out.write_text("[]")
     assert cli.main([*words, "--compare", str(out)]) == 2
     assert cli.main([*words[:-1], "0"]) == 2
+
+
+def test_options_go_to_the_tasks_that_have_them(tmp_path: Path, capsys, monkeypatch) -> None:
+    """Turns that overlap by half take fewer evaluations; a task without turns is measured as it is."""
+    monkeypatch.setattr("magnet.cli.bench.load", lambda name: tiny_denoiser(max_agents=2))
+    out = tmp_path / "bench.json"
+    words = ["bench", "--quick", "--task", "agentic_async", "--task", "joint_future", "--frames", "8", "--rounds", "1"]
+    words += ["--steps", "4", "--live", "0", "--out", str(out)]
+    assert cli.main(words) == 0
+    plain = json.loads(out.read_text())["cases"]
+    assert cli.main([*words, "--task.offset", "0.5", "--task.order=[1, 0]"]) == 0
+    found = json.loads(out.read_text())
+    assert found["task_options"] == {"offset": 0.5, "order": [1, 0]}
+    joint, turns = "joint_future, 2 people, batch 1", "agentic_async, 2 people, batch 1"
+    each = {name: case["evaluations_per_frame"] for name, case in found["cases"].items()}
+    before = {name: case["evaluations_per_frame"] for name, case in plain.items()}
+    overlapped = f"{turns}, offset 0.5, order (1, 0)"
+    assert set(each) == {joint, overlapped}
+    assert each[joint] == before[joint]
+    assert each[overlapped] == 0.75 * before[turns]
+    capsys.readouterr()
+    assert cli.main([*words, "--task.offsett", "0.5"]) == 2
+    assert "offset" in capsys.readouterr().err
+    assert cli.main([*words, "--task.offset"]) == 2
+    assert cli.main([*words, "--task.offset", "2"]) == 2
