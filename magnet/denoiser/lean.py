@@ -30,7 +30,7 @@ class LeanBlock:
     Only of the last one some tokens may be asked for: it keeps weights of queries beside those of keys and values.
     """
 
-    def __init__(self, block: TransformerBlock, dtype: torch.dtype, last: bool) -> None:
+    def __init__(self, block: TransformerBlock, dtype: torch.dtype, asked: bool) -> None:
         width = block.out.in_features
         self.heads, self.each = block.heads, width // block.heads
         weight, bias = block.qkv.weight.detach(), block.qkv.bias.detach()
@@ -42,7 +42,7 @@ class LeanBlock:
         channels = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
         weight, bias = weight[channels], bias[channels]
         self.qkv = linear_of(weight, bias, dtype)
-        if last:
+        if asked:
             self.query = linear_of(weight[:width], bias[:width], dtype)
             self.key_value = linear_of(weight[width:], bias[width:], dtype)
         self.out = linear_of(block.out.weight, block.out.bias, dtype)
