@@ -144,9 +144,13 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
     """
     T_can_world = inverse(T_world_can)
     decoded_can_root, given_can_root = T_can_world @ decoded.T_world_root, T_can_world @ given.T_world_root
-    tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
-    turns = roma.rotmat_to_rotvec(given_can_root[..., :3, :3] @ tilt.transpose(-1, -2))
-    bends = roma.rotmat_to_rotvec(given.body_rot @ decoded.body_rot.transpose(-1, -2))
+    lift = decoded_can_root[..., :3, 3]
+    # Pelvis and other joints together: so few turns cost as much as their operators are many.
+    turns, goals = (
+        torch.cat([root[..., None, :3, :3], scene.body_rot], dim=3)
+        for root, scene in ((decoded_can_root, decoded), (given_can_root, given))
+    )
+    bends = roma.rotmat_to_rotvec(goals @ turns.transpose(-1, -2))
     moves = given_can_root[..., :3, 3] - lift
     last, agents = last_known(keep), torch.arange(keep.shape[1], device=keep.device)
     before, (stays, grows) = (last - 1).clamp_min(0), spring_weights(keep, blend)
@@ -157,8 +161,8 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
         shape = (*keep.shape, *[1] * (difference.dim() - 3))
         return stays.view(shape) * at + grows.view(shape) * (at - difference[:, before, agents])
 
-    body_rot = roma.rotvec_to_rotmat(left(bends)) @ decoded.body_rot
-    can_root = rigid(roma.rotvec_to_rotmat(left(turns)) @ tilt, lift + left(moves))
+    turned = roma.rotvec_to_rotmat(left(bends)) @ turns
+    body_rot, can_root = turned[..., 1:, :, :], rigid(turned[..., 0, :, :], lift + left(moves))
     there = decoded.present[:, None, :, None, None]
     T_world_root = torch.where(there, T_world_can @ can_root, decoded.T_world_root)
     return decoded.replace(
