@@ -69,6 +69,12 @@ class PairwisePosterior(nn.Module):
         Returns:
             (B, N, P, D). Latents, and the first frame's deltas, are `clean`'s; deltas shown clean are `noisy`'s.
         """
+        kinds = self._kinds(levels, present)
+        if len(kinds) > 1:  # a scene is the same to the bit in a batch of others that are shown otherwise
+            better = torch.empty_like(clean)
+            for some in kinds:
+                better[some] = self(clean[some], noisy[some], levels[some], present[some], normalizer)
+            return better
         known = self._setting(levels, present, normalizer)
         if known.quick is not None:
             return quickly_fused(clean, noisy, known.quick)
@@ -87,14 +93,26 @@ class PairwisePosterior(nn.Module):
         """Deltas and pairwise transforms of tokens, a view. (B, N, P, D) -> (B, N, P, P, 4, 9)"""
         return tokens[..., self.layout.latent :].unflatten(-1, (-1, TOKEN_FRAMES, 9))
 
+    def _keeps(self, levels: Tensor) -> bool:
+        return levels.device.type == "cpu" and not torch.is_grad_enabled() and not self.log_pair_yaw.is_inference()
+
+    def _kinds(self, levels: Tensor, present: Tensor) -> list[Tensor]:
+        """Numbers of scenes that share a setting, kind by kind; none where there is one, or more than people.
+
+        Views of agents who do not see each other are a few kinds; scenes of a validation are one each.
+        """
+        if not self._keeps(levels) or alike(levels, present):
+            return []
+        kind = torch.cat([levels.flatten(1), present], dim=1).unique(dim=0, return_inverse=True)[1]
+        count = int(kind.max()) + 1
+        return [(kind == number).nonzero()[:, 0] for number in range(count)] if count <= self.layout.agents else []
+
     def _setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Known:
         """What does not depend on tokens; kept while nothing is learnt, for samplers pass the same levels again.
 
         Samples of one batch have the same levels, and need it once. On a GPU, looking would have to wait for it.
         """
-        if levels.device.type != "cpu" or torch.is_grad_enabled() or self.log_pair_yaw.is_inference():
-            return self._new_setting(levels, present, normalizer)
-        if len(levels) > 1 and not bool((levels == levels[:1]).all() and (present == present[:1]).all()):
+        if not self._keeps(levels) or not alike(levels, present):
             return self._new_setting(levels, present, normalizer)
         levels, present, kept = levels[:1], present[:1], SETTINGS.of(self)
         key = (levels.numpy().tobytes(), present.numpy().tobytes(), *state_of([normalizer.mean, normalizer.std]))
@@ -174,6 +192,11 @@ class Known(Setting):
     """A setting, and the same for `quickly_fused` on a CPU."""
 
     quick: QuickSetting | None = None
+
+
+def alike(levels: Tensor, present: Tensor) -> bool:
+    """Whether all scenes of a batch have the same levels and people. levels (B, N, P), present (B, P)"""
+    return len(levels) == 1 or bool((levels == levels[:1]).all() and (present == present[:1]).all())
 
 
 SETTINGS: Kept[dict[tuple[object, ...], Known]] = Kept(lambda posterior: {})

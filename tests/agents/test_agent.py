@@ -55,8 +55,10 @@ def together(members: Sequence, tokens: int, link: Lossy, order=(1, 0, 2)) -> li
     return made
 
 
+@pytest.mark.parametrize("posterior", [False, True])
 @pytest.mark.parametrize("kind", TASKS)
-def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(denoiser, start, kind):
+def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind, posterior):
+    denoiser = tiny_denoiser(max_agents=4, window=8, network={"pairwise_posterior": posterior})
     task, frames = TASKS[kind], 4 * 12
     whole = generate(denoiser, start, task, 24, frames, 1, REFERENCE, torch.Generator().manual_seed(1)).slice(24)
     agents = group(denoiser, start, task)

@@ -343,6 +343,19 @@ def test_what_was_asked_before_changes_no_bit(model: Denoiser):
     assert torch.equal(first, again)
 
 
+def test_who_else_is_in_a_batch_changes_no_bit(model: Denoiser):
+    """Scenes at other levels, or of other people: as views of agents who do not see each other are."""
+    _, guess, noisy, levels, present = shown(model, 50)
+    levels = torch.where(torch.arange(3) == torch.arange(4)[:, None, None] % 3, 5, levels)
+    present[1, 0] = False
+    posterior = PairwisePosterior(model.layout)
+    with torch.no_grad():
+        together = posterior(guess, noisy, levels, present, model.normalizer)
+        for n in range(4):
+            one = [each[n : n + 1] for each in (guess, noisy, levels, present)]
+            assert torch.equal(together[n : n + 1], posterior(*one, model.normalizer))
+
+
 def test_deviations_can_be_learnt(model: Denoiser):
     truth, guess, noisy, levels, present = shown(model, 100)
     posterior = PairwisePosterior(model.layout)
