@@ -115,8 +115,9 @@ class CrowdRollout(Rollout):
             self.world.decode_rows = self._decode_rows
         if self.crowd and not bool((self.known[context // TOKEN_FRAMES - 1] | ~self.scene.present[0].cpu()).all()):
             raise ValueError(
-                "in a crowd everybody's start must be known, because partners are chosen by place; partner_inpainting "
-                "knows it with own_past"
+                "in a crowd everybody's start must be known, because partners are chosen by place: instead of "
+                "generation, joint_future goes on from what start_crowd makes, as `magnet predict --people` does where "
+                "no --task is given; partner_inpainting knows it with own_past"
             )
 
     def _look_around(self, scene: Scene, context: int) -> None:

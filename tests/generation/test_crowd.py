@@ -197,6 +197,7 @@ def test_what_is_not_made_for_crowds_is_refused(model: Denoiser) -> None:
 
     refused("generation", "context", context=0)
     refused("partner_inpainting", "own_past", fields={"target": (1,)})
+    refused("generation", "instead of generation, joint_future goes on")
     refused("agentic_sync", "square", people=18)
     refused("joint_future", "placement", placement="anchor")
     refused("joint_future", "settle", settle="light")
