@@ -18,11 +18,11 @@ from magnet import checkpoints, datamodules
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
 HELD_OUT = ("03", "05", "10", "15")
-SUBJECTS = ("02", "05", "17", "18", "55", "60", "61", "90", "143")
+SUBJECTS = ("02", "05", "17", "18", "55", "60", "61", "90", "131", "135", "143")
 ABOUT = {
     "trained on": {
         "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
-        "CMU motion capture, single people": "subjects 02 05 17 18 55 90 143, without 02_03 and 05_12",
+        "CMU motion capture, single people": "subjects 02 05 17 18 55 90 131 135 143, without 02_03, 05_12 and 135_08",
         "synthetic scenes": "magnet.datamodules.synthetic, training seeds",
     },
     "acknowledgement": (
@@ -48,7 +48,9 @@ def without_folders(value: Any) -> Any:
 def manifest() -> dict[str, str]:
     """Files of recordings, and their sha256, of the takes that were trained on."""
     held = (
-        {f"60_{take}.amc" for take in HELD_OUT} | {f"61_{take}.amc" for take in HELD_OUT} | {"02_03.amc", "05_12.amc"}
+        {f"60_{take}.amc" for take in HELD_OUT}
+        | {f"61_{take}.amc" for take in HELD_OUT}
+        | {"02_03.amc", "05_12.amc", "135_08.amc"}
     )
     lines = (line.split() for line in RECORDINGS.read_text().splitlines())
     return {name: digest for digest, name in lines if name not in held and re.split(r"[._]", name)[0] in SUBJECTS}

@@ -1,0 +1,61 @@
+"""The mean of the weights of denoisers that went on from the same one.
+
+    python scripts/average_weights.py OUT.ckpt A.ckpt B.ckpt ...
+
+Trainings that go on from one model with little data each end somewhere else in the same valley; their mean is often
+better than each (Wortsman et al. 2022, Model soups). What the checkpoints hold beside weights is the first one's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from magnet import checkpoints
+
+KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config", "magnet_version", "global_step")
+
+
+def mean_of(states: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Each tensor's mean; what is no floating point number must be the same in all.
+
+    Raises:
+        ValueError: names, shapes or whole numbers differ.
+
+    >>> mean_of([{"w": torch.tensor([0.0, 2.0])}, {"w": torch.tensor([2.0, 2.0])}])
+    {'w': tensor([1., 2.])}
+    """
+    first = states[0]
+    for state in states[1:]:
+        if {name: x.shape for name, x in state.items()} != {name: x.shape for name, x in first.items()}:
+            raise ValueError("the checkpoints are of models of other sizes")
+    made = {}
+    for name, x in first.items():
+        each = [state[name] for state in states]
+        if x.is_floating_point():
+            made[name] = torch.stack([one.double() for one in each]).mean(0).to(x.dtype)
+        elif all(torch.equal(one, x) for one in each):
+            made[name] = x
+        else:
+            raise ValueError(f"{name} differs and has no mean")
+    return made
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Read, average, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("checkpoints", type=Path, nargs="+")
+    given = parser.parse_args(arguments)
+    read: list[dict[str, Any]] = [checkpoints.read(path) for path in given.checkpoints]
+    made = {name: read[0][name] for name in KEPT if name in read[0]}
+    checkpoints.save(made | {"state_dict": mean_of([one["state_dict"] for one in read])}, given.out)
+    print(f"{given.out}: the mean of {len(read)} checkpoints")
+
+
+if __name__ == "__main__":
+    main()

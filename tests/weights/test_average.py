@@ -1,0 +1,50 @@
+"""The mean of the weights of denoisers, by the script that makes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet import checkpoints
+from magnet.denoiser.module import Denoiser
+from magnet.testing import tiny_denoiser
+from tests.scripts import module_at
+
+average = module_at(Path(__file__).resolve().parents[2] / "scripts" / "average_weights.py")
+
+
+def saved(model: Denoiser, path: Path) -> Path:
+    fields = {"state_dict": model.state_dict(), "hyper_parameters": dict(model.hparams)}
+    model.on_save_checkpoint(fields)
+    checkpoints.save(fields, path)
+    return path
+
+
+def moved(model: Denoiser, by: float) -> Denoiser:
+    with torch.no_grad():
+        model.transformer.out_proj.weight += by
+    return model
+
+
+def weight(model: Denoiser) -> Tensor:
+    return model.transformer.out_proj.weight
+
+
+def test_the_mean_is_a_model_half_way_with_the_same_tokenizer(tmp_path: Path) -> None:
+    first, second = tiny_denoiser(), moved(tiny_denoiser(), 2.0)
+    places = [saved(first, tmp_path / "a.ckpt"), saved(second, tmp_path / "b.ckpt")]
+    average.main([str(tmp_path / "mean.ckpt"), *map(str, places)])
+    made = Denoiser.load(tmp_path / "mean.ckpt")
+    torch.testing.assert_close(weight(made), weight(first) + 1.0)
+    for name, value in first.tokenizer.state_dict().items():
+        assert torch.equal(value, made.tokenizer.state_dict()[name]), name
+
+
+def test_models_of_other_sizes_have_no_mean() -> None:
+    with pytest.raises(ValueError, match="of other sizes"):
+        average.mean_of([{"w": torch.zeros(2)}, {"w": torch.zeros(3)}])
+    with pytest.raises(ValueError, match="count differs and has no mean"):
+        average.mean_of([{"count": torch.tensor(1)}, {"count": torch.tensor(2)}])
