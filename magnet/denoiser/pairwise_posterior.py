@@ -75,7 +75,7 @@ class PairwisePosterior(nn.Module):
             for some in kinds:
                 better[some] = self(clean[some], noisy[some], levels[some], present[some], normalizer)
             return better
-        known = self._setting(levels, present, normalizer)
+        known = self.setting(levels, present, normalizer)
         if known.quick is not None:
             return quickly_fused(clean, noisy, known.quick)
         where = known.people.where(*clean.shape[:2])
@@ -107,7 +107,7 @@ class PairwisePosterior(nn.Module):
         count = int(kind.max()) + 1
         return [(kind == number).nonzero()[:, 0] for number in range(count)] if count <= self.layout.agents else []
 
-    def _setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Known:
+    def setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Known:
         """What does not depend on tokens; kept while nothing is learnt, for samplers pass the same levels again.
 
         Samples of one batch have the same levels, and need it once. On a GPU, looking would have to wait for it.

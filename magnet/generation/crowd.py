@@ -270,7 +270,7 @@ class CrowdRollout(Rollout):
             made[some] = self.viewer.denoise(shown[some], each[some], there[some], extra, network).to(made)
         clean = self._read(made.float().unflatten(0, (R, V)))
         if self.crowd:
-            self._guess, self._guess_at = clean[0].detach(), self._begins
+            self._guess, self._guess_at = clean[0].detach(), self.begins
         return clean
 
     def _batches(self, levels: Tensor, present: Tensor) -> list[Tensor]:
@@ -314,7 +314,7 @@ class CrowdRollout(Rollout):
         (T_ego_one, *first), (T_ego_two, *second) = (self._seen_by(ego, who, noisy, levels) for who in (one, two))
         level = torch.maximum(levels[:, :, one], levels[:, :, two])
         T_world_can = self.world.T_world_can[0].unflatten(0, (-1, TOKEN_FRAMES)).transpose(1, 2)  # (n, P, 4, 4, 4)
-        row = torch.arange(levels.shape[1], device=device) + self._begins - self.first
+        row = torch.arange(levels.shape[1], device=device) + self.begins - self.first
         T_world_can = T_world_can[row.clamp(max=len(T_world_can) - 1)]  # what lies ahead is nobody's
         placed = inverse(T_world_can[:, one]) @ T_world_can[:, two]
         T_one_two = torch.where((level == 0)[..., None, None, None], placed, inverse(T_ego_one) @ T_ego_two)
@@ -331,7 +331,7 @@ class CrowdRollout(Rollout):
         slot = (self.model.layout.partners(ego.device)[ego] == who[:, None]).int().argmax(dim=1)
         numbers = self.viewer.layout.latent + PAIR * (1 + slot[:, None]) + torch.arange(PAIR, device=ego.device)
         said, level = noisy[:, :, ego[:, None], numbers], torch.maximum(levels[:, :, ego], levels[:, :, who])
-        guess = self._guessed(self._begins, noisy.shape[1])[:, ego[:, None], numbers]
+        guess = self._guessed(self.begins, noisy.shape[1])[:, ego[:, None], numbers]
         clean = torch.where(level[..., None] == 0, said, guess)
         share = alpha_bar(level)[..., None]
         noise = (said - share.sqrt() * clean) / (1 - share).clamp_min(1e-6).sqrt()

@@ -251,7 +251,7 @@ class Rollout:
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
-        self._ahead, self._begins = stage.ahead, stage.start
+        self._ahead, self.begins = stage.ahead, stage.start
         self._ask_for(stage)
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
@@ -327,7 +327,7 @@ class Rollout:
         if cond is None:
             return None
         if cond.ndim == 3:
-            cond = cond[:, self._begins : self._begins + width]
+            cond = cond[:, self.begins : self.begins + width]
             cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
         cond = cond.repeat_interleave(batch // len(cond), dim=0)
         if self.options.guidance.cond_weight:

@@ -126,7 +126,7 @@ class ResidualVQ(Float32):
             return self.continuous(vectors)
         with torch.autocast(vectors.device.type, enabled=False):
             residual = vectors.float().flatten(0, -2)
-            if len(residual) <= FEW and (books := self._books()):
+            if len(residual) <= FEW and (books := self.books()):
                 return torch.from_numpy(nearest_codes(books, residual.detach().numpy())).view(vectors.shape)
             latent = torch.zeros_like(residual)
             for book in range(self.num_quantizers):
@@ -142,7 +142,7 @@ class ResidualVQ(Float32):
             self._lengths = (now, self.codes.square().sum(-1))
         return (self._lengths[1][book] - 2 * vectors @ self.codes[book].T).argmin(-1)
 
-    def _books(self) -> list[Book]:
+    def books(self) -> list[Book]:
         """The codebooks as few vectors look them up; none before that has been asked for often."""
         if self.training or self.codes.device.type != "cpu" or self.codes.is_inference():
             return []

@@ -326,7 +326,7 @@ def test_the_quick_form_is_the_plain_one_to_rounding(model: Denoiser, people: li
         noisy, clean = torch.randn(2, scenes, *shape[1:], model.layout.width, generator=generator)
         levels = levels.expand(scenes, -1, -1)
         with torch.no_grad():
-            assert posterior._setting(levels, present, model.normalizer).quick is not None
+            assert posterior.setting(levels, present, model.normalizer).quick is not None
             quick = posterior(clean, noisy, levels, present, model.normalizer)
         plain = posterior(clean, noisy, levels, present, model.normalizer).detach()
         assert torch.allclose(quick, plain, rtol=1e-5, atol=2e-5)

@@ -101,7 +101,7 @@ def test_two_who_are_known_are_shown_where_they_stand_to_whoever_is_not(model: D
             both = (each[:, :, :, None] == 0) & (each[:, :, other] == 0)
             both &= (views.present[:, :, None] & views.present[:, other] & (views.pair < 0))[:, None]
             v, w, a, s = both.nonzero(as_tuple=True)
-            rows = (self._begins - self.first + w)[:, None] * TOKEN_FRAMES + torch.arange(TOKEN_FRAMES)
+            rows = (self.begins - self.first + w)[:, None] * TOKEN_FRAMES + torch.arange(TOKEN_FRAMES)
             one, two = views.people[v, a][:, None], views.people[v, other[a, s]][:, None]
             T_world_can = self.world.T_world_can[0]
             truth = to_9d(inverse(T_world_can[rows, one]) @ T_world_can[rows, two])

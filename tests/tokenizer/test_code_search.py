@@ -31,7 +31,7 @@ def test_few_vectors_get_the_nearest_codes_wherever_codes_and_vectors_lie(rank, 
     book = quantizer(generator, rank, aside)
     for _ in range(OFTEN):
         book.nearest(torch.zeros(1, 96))
-    assert len(book._books()) == 3
+    assert len(book.books()) == 3
     for spread in (0.1, 5.0):
         near = book.codes[0][:200] + spread * torch.randn(200, 96, generator=generator)
         for vectors in near.split(FEW):
@@ -68,12 +68,17 @@ def test_codes_that_change_are_searched_anew(generator):
         assert torch.equal(book.nearest(vectors), by_distances(book, vectors))
 
 
-def test_a_few_lookups_prepare_nothing(generator):
+def test_a_few_lookups_prepare_nothing(generator, monkeypatch):
+    prepared: list[Tensor] = []
+    made = Book.of
+    monkeypatch.setattr(Book, "of", lambda codes: prepared.append(codes) or made(codes))
     book = quantizer(generator, 10, 0.05)
     for _ in range(OFTEN - 1):
         book.nearest(torch.zeros(1, 96))
     book.nearest(torch.zeros(FEW + 1, 96))
-    assert book._searched is not None and not book._searched[1]
+    assert not prepared
+    book.nearest(torch.zeros(FEW, 96))
+    assert len(prepared) == 3
 
 
 def test_numbers_that_are_none_are_no_error(generator):
