@@ -179,7 +179,7 @@ class Denoiser(TokenModel):
     def take_over(self, path: str | Path) -> None:
         """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
         metres = self.noise.pairwise_metres
-        starting.start_from(path, self.transformer, self.tokenizer, self.normalizer, metres)
+        starting.start_from(path, self.transformer, self.tokenizer, self.normalizer, metres, self.posterior)
 
     def fit_normalizer(self, tokens: Tensor, there: Tensor) -> None:
         """Set how tokens are normalized from real ones, as `tokenize` returns them."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from magnet import checkpoints
+from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.statistics import with_pairwise_metres
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
@@ -52,6 +53,7 @@ def start_from(
     tokenizer: PoseTokenizer,
     normalizer: Normalizer,
     pairwise_metres: float = 0.0,
+    posterior: PairwisePosterior | None = None,
 ) -> None:
     """Take over another denoiser's transformer, and how tokens are normalized where both tokenizers are the same.
 
@@ -63,6 +65,7 @@ def start_from(
         tokenizer: the new model's; compared.
         normalizer: filled, where it can be.
         pairwise_metres: another scale of pairwise transforms; the weights are changed so that they make the same of it.
+        posterior: filled where the other denoiser has one; its deviations, in metres and radians, know no scale.
 
     Raises:
         ValueError: the checkpoint is of a model of other sizes.
@@ -79,6 +82,9 @@ def start_from(
             f"start_from: {path} does not fit this model: {reason}; sizes, --data.max_agents and --data.window_frames "
             "must be those of that checkpoint"
         ) from error
+    learnt = _part(state, "posterior.")
+    if posterior is not None and learnt:
+        posterior.load_state_dict(learnt)
     theirs, mine = _part(state, "tokenizer."), tokenizer.state_dict()
     same = theirs.keys() == mine.keys() and all(torch.equal(value, mine[name].cpu()) for name, value in theirs.items())
     if same:

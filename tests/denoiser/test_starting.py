@@ -40,6 +40,21 @@ def test_without_a_tokenizer_that_of_the_start_is_kept_and_how_tokens_are_normal
     assert equal(second.transformer, first.transformer) and equal(second.normalizer, first.normalizer)
 
 
+@pytest.mark.parametrize("has", [True, False])
+def test_a_posterior_is_taken_over_where_there_is_one(tmp_path: Path, has: bool) -> None:
+    first = tiny_denoiser(network={"pairwise_posterior": has})
+    with torch.no_grad():
+        for weight in first.posterior.parameters() if has else ():
+            weight += 0.1
+    path = saved(first, tmp_path / "first.ckpt")
+    second = tiny_denoiser(network={"pairwise_posterior": True})
+    fresh = {name: value.clone() for name, value in second.posterior.state_dict().items()}
+    second.take_over(path)
+    expected = first.posterior.state_dict() if has else fresh
+    assert fresh and all(torch.equal(value, expected[name]) for name, value in second.posterior.state_dict().items())
+    assert has != all(torch.equal(value, fresh[name]) for name, value in second.posterior.state_dict().items())
+
+
 def test_with_another_tokenizer_tokens_are_normalised_anew(tmp_path: Path) -> None:
     path = saved(tiny_denoiser(seed=1), tmp_path / "first.ckpt")
     second = tiny_denoiser(seed=2)
