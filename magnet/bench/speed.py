@@ -218,22 +218,13 @@ def memory_mib() -> float | None:
 
 
 def cases(
-    tasks: Sequence[str], people: Sequence[int], batches: Sequence[int], options: Mapping[str, Any] | None = None
+    tasks: Sequence[str],
+    people: Sequence[int],
+    batches: Sequence[int],
+    options: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> list[Case]:
-    """Every combination that makes sense: tasks that make one agent from another need two.
-
-    Of the `options` each task is given those that it has.
-
-    Raises:
-        ValueError: an option that none of the tasks has.
-    """
-    options = options or {}
-    has = {task: {each.name for each in dataclasses.fields(registry.get(task))} for task in tasks}
-    for name in options:
-        if not any(name in own for own in has.values()):
-            there = ", ".join(sorted(set().union(*has.values()))) or "none"
-            raise ValueError(f"--task.{name}: no such option; of {', '.join(tasks)} there are: {there}")
-    own = {task: tuple((name, value) for name, value in options.items() if name in has[task]) for task in tasks}
+    """Every combination that makes sense: tasks that make one agent from another need two. `options`: by task."""
+    own = {task: tuple((options or {}).get(task, {}).items()) for task in tasks}
     found = [Case(task, P, B, own[task]) for task in tasks for P in people for B in batches]
     return [case for case in found if case.people > 1 or case.task in ALONE]
 

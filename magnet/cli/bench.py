@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         CommandError: an option that makes no sense.
         ValueError: no such model, task or preset; says what there is.
     """
-    of_tasks, others = task_options(arguments)
+    of_tasks, others = task_flags(arguments)
     given = parser().parse_args(others)
     from magnet.cli.errors import CommandError
 
@@ -107,33 +108,47 @@ def read(path: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def task_options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Options of tasks, --task.NAME VALUE or --task.NAME=VALUE, and the other arguments.
-
-    Raises:
-        CommandError: an option without its value.
-    """
-    import yaml
-
-    from magnet.cli.errors import CommandError
-
-    found: dict[str, Any] = {}
+def task_flags(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
+    """The words of each option of tasks, `--task.NAME VALUE` or `--task.NAME=VALUE`, and the other arguments."""
+    found: dict[str, list[str]] = {}
     others: list[str] = []
-    left = list(arguments)
-    while left:
-        word = left.pop(0)
+    left = iter(arguments)
+    for word in left:
         if not word.startswith("--task."):
             others.append(word)
             continue
-        name, equals, text = word.removeprefix("--task.").partition("=")
-        if not equals and (not left or left[0].startswith("--")):
-            raise CommandError(f"{word}: expected a value after it")
-        value = yaml.safe_load(text if equals else left.pop(0))
-        found[name] = tuple(value) if isinstance(value, list) else value
+        name, equals, _ = word.removeprefix("--task.").partition("=")
+        found[name] = [word] if equals else [word, *itertools.islice(left, 1)]
     return found, others
 
 
-def run(given: argparse.Namespace, of_tasks: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What was asked of each task: those of the options that it has.
+
+    Raises:
+        CommandError: an option that none of the tasks has, or a value that does not fit.
+    """
+    from magnet.cli.errors import CommandError, no_such
+    from magnet.cli.tasks import parse_task, task_class
+
+    has = {task: {each.name for each in dataclasses.fields(task_class(task))} for task in tasks}
+    known = sorted(set().union(*has.values()))
+    for name in flags:
+        if name not in known:
+            raise CommandError(
+                no_such("option", f"--task.{name}", [f"--task.{each}" for each in known], "magnet tasks")
+            )
+    found = {}
+    for task, own in has.items():
+        said = [name for name in flags if name in own]
+        fields = (
+            parse_task(task, [word for name in said for word in flags[name]], command="bench").fields if said else {}
+        )
+        found[task] = {name: fields[name] for name in said}
+    return found
+
+
+def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[str, Any]:
     """Measure and print, case by case. Returns everything that was measured, JSON-ready."""
     import torch
 
@@ -145,16 +160,17 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, Any] | None = None) ->
 
     clock = time.process_time if given.clock == "cpu" else time.perf_counter
     usual = QUICK if given.quick else WHOLE
+    tasks = given.task or registry.names()
+    options_of = task_options(of_tasks, tasks)
     model = load(given.model).to(given.device)
     asked = {"steps": given.steps, "precision": given.precision}
     options = SamplerOptions.preset(given.sampler, **{name: v for name, v in asked.items() if v is not None})
-    tasks = given.task or registry.names()
     people = [P for P in given.people or usual["people"] if model.layout.agents >= P]
     threads = torch.get_num_threads()
     print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads} threads")
     print(row("", list(COLUMNS.values())), flush=True)
     found: dict[str, Any] = {"cases": {}, "live": None}
-    for case in cases(tasks, people, given.batch or usual["batch"], of_tasks):
+    for case in cases(tasks, people, given.batch or usual["batch"], options_of):
         speed = dataclasses.asdict(measure(model, case, options, given.frames, given.rounds, clock=clock))
         found["cases"][str(case)] = speed
         print(row(str(case), [shown(speed[name]) for name in COLUMNS]), flush=True)
@@ -166,7 +182,7 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, Any] | None = None) ->
             f"percentile), jitter {live['jitter_ms']:.1f} ms, {live['late']} late of {live['period_ms']:.0f} ms"
         )
     about = {"model": given.model, "threads": threads, "frames": given.frames, "rounds": given.rounds}
-    about |= {"clock": given.clock, "task_options": dict(of_tasks or {})}
+    about |= {"clock": given.clock, "task_options": dict(item for own in options_of.values() for item in own.items())}
     return {**found, **about, "sampler": dataclasses.asdict(options), "machine": machine(), **provenance()}
 
 

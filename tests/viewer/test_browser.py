@@ -151,3 +151,5 @@ def test_the_slider_goes_through_the_steps_of_denoising(page, panel, handshake, 
             # The window's new half is white at first, and full of colour at last.
             least, most = (0.2, 0.6) if step == 0 else (0.0, 0.05)
             wait(lambda least=least, most=most, name=name: least <= white(shot(page, f"levels_{name}", levels)) <= most)
+        assert differs(*images), "people stand where they stood after the first step"
+        assert white(shot(page, "levels_last", levels)) <= 0.05, "some of the last step's levels are over 0"
