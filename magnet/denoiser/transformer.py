@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from magnet.denoiser.dropout import Dropout
 from magnet.denoiser.options import TransformerOptions
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
@@ -89,10 +88,10 @@ class TransformerBlock(nn.Module):
         self.out = nn.Linear(width, width)
         self.norm_attention = nn.LayerNorm(width)
         self.mlp = nn.Sequential(
-            nn.Linear(width, mlp_ratio * width), nn.GELU(), Dropout(dropout), nn.Linear(mlp_ratio * width, width)
+            nn.Linear(width, mlp_ratio * width), nn.GELU(), nn.Dropout(dropout), nn.Linear(mlp_ratio * width, width)
         )
         self.norm_mlp = nn.LayerNorm(width)
-        self.drop = Dropout(dropout)
+        self.drop = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, time: Tensor, sees: Tensor | None = None) -> Tensor:
         """x (B, L, d), time (L,), sees (L, L) bool, whom each one sees; None: everybody -> (B, L, d)"""
