@@ -83,12 +83,11 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
-        moves: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """The noisy tokens that the next step starts from (smoothing changes them), and the guided prediction.
+        """The noisy tokens that the next step starts from where it denoises, and the guided prediction.
 
-        tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P), moves bool, the numbers that the step
-        denoises -> (B, W, P, D) twice
+        Smoothing changes the former. tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P) ->
+        (B, W, P, D) twice
         """
         if not self.smooth:
             return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout)
@@ -98,7 +97,7 @@ class Guidance:
             still = levels.clone(), present.clone(), mask_noise.clone()
             clean = self.predict(denoise, noisy, *still, layout)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
-        return torch.where(moves, tokens - self.smooth * slope, tokens), clean.detach()
+        return tokens - self.smooth * slope, clean.detach()
 
     def predict(
         self,

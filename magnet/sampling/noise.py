@@ -216,24 +216,11 @@ class NoiseStream:
             return torch.stack(each, dim=1)
         return torch.randn(2, B, P, D, generator=self.generator, device=self.device, dtype=self.dtype)
 
-    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
-        """Step noise of the denoising steps that leave these levels, for the token steps from `first` on.
-
-        levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)
-        """
-        B, P, D = self.shape
-        noise = torch.zeros(B, *levels.shape, device=self.device, dtype=self.dtype)
-        for row in moves.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
-            for level in levels[row][moves[row]].unique().tolist():
-                seeds = [derive(seed, first + row, level) for seed in self._seeds]
-                drawn = self._seeded(seeds, (B // len(seeds), P, D)).flatten(0, 1)
-                noise[:, row] = torch.where(levels[row] == level, drawn, noise[:, row])
-        return noise
-
     def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
-        """Step noise of a planned step: `step_noise` for the given (row, level, where (P, D)). -> (B, rows, P, D)
+        """New noise of a denoising step, for the token steps from `first` on. -> (B, rows, P, D)
 
-        Where nothing moves it may hold anything.
+        draws: the (row, level, which numbers (P, D), None: all) that it leaves; elsewhere it may hold anything. Noise
+        depends on token step, level and number alone.
         """
         B, P, D = self.shape
         noise = torch.empty(B, rows, P, D, device=self.device, dtype=self.dtype)
@@ -252,7 +239,3 @@ class NoiseStream:
         """One number, or one for each scene where each has a generator."""
         generators = self.generator if isinstance(self.generator, Sequence) else [self.generator]
         return [int(torch.randint(2**62, (), generator=g, device=self.device)) for g in generators]
-
-    def _seeded(self, seeds: list[int], shape: tuple[int, int, int]) -> Tensor:
-        draws = [torch.Generator(device=self.device).manual_seed(seed) for seed in seeds]
-        return torch.stack([torch.randn(shape, generator=g, device=self.device, dtype=self.dtype) for g in draws])

@@ -1,4 +1,4 @@
-"""A stage whose steps are planned once: what `run_stage` does, bit for bit, with less work in each step.
+"""The denoising steps of a stage, planned once.
 
 What follows from the plan alone (levels, factors of the solver, views) is worked out for all steps before the first
 one and kept for the next stage like it. Only token steps that the stage changes are touched.
@@ -37,12 +37,10 @@ class Views:
     """What each agent sees where some are hidden; agents that see the same share a view (V of them).
 
     Attributes:
-        levels: (S, V, W, P) int, as shown.
-        unknown: (V, W, P, 1 + slots) bool, shown as mask noise.
+        unknown: (V, W, P, 1 + slots) bool, shown as mask noise: their own noise would reveal what they become.
         source: (W, P, 1 + slots) int, the view that each group is read from.
     """
 
-    levels: Tensor
     unknown: Tensor
     source: Tensor
 
@@ -53,7 +51,7 @@ class StagePlan:
 
     Attributes:
         rows: which rows of the window.
-        levels: (S, W, P) int before each step.
+        levels: (S, V, W, P) int before each step, as each view is shown them; V is 1 where nobody is hidden.
         views: where somebody is hidden.
         numbers: (S, 6, rows, P, 1 + slots): share of the extrapolation; then the square roots of the signal and of the
             noise before; factors of old and new noise; the square root of the signal after.
@@ -86,39 +84,37 @@ def run_planned_stage(
     history: History | None = None,
     correct: Correct | None = None,
 ) -> Tensor:
-    """As `magnet.sampling.sampler.run_stage`, without smoothing guidance. tokens (B, W, P, D) -> (B, W, P, D)"""
+    """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
+
+    `first` is the row of `noise` that the window begins with; `history` is that of the window. Agents that see the same
+    share a view, and all views run as one batch.
+    """
     B, W, P, _ = tokens.shape
     eta = noise.eta if noise is not None else 0.0
     plan = plan_of(stage, layout, eta, history, tokens.device)
-    groups, rows = layout.groups(tokens.device), plan.rows
+    groups, rows, V = layout.groups(tokens.device), plan.rows, plan.levels.shape[1]
     tokens = tokens.clone()
-    part = tokens[:, rows]
-    views, shown = plan.views, tokens
+    part, views, shown_noise, hidden = tokens[:, rows], plan.views, mask_noise, None
     if views is not None:
-        V = views.levels.shape[1]
-        unknown, source = views.unknown[..., groups], views.source[rows][..., groups]
+        hidden, unknown, source = views.unknown[..., 0], views.unknown[..., groups], views.source[rows][..., groups]
         source = source.expand(B, 1, *source.shape)
         present = present[:, None].expand(B, V, P).flatten(0, 1)
-        hidden_noise = mask_noise[:, None].expand(B, V, *mask_noise.shape[1:]).flatten(0, 1)
-    for step in range(len(plan.levels)):
-        if views is None:
-            levels = plan.levels[step].expand(B, W, P)
-            clean = guidance.predict(denoise, shown, levels, present, mask_noise, layout)
-            if correct is not None:
-                clean = correct(clean, plan.levels[step][None], None, first)
-            clean = clean[:, rows]
-        else:
-            seen = torch.where(unknown, mask_noise[:, None], shown[:, None]).flatten(0, 1)
-            levels = views.levels[step].expand(B, V, W, P).flatten(0, 1)
-            each = guidance.predict(denoise, seen, levels, present, hidden_noise, layout)
-            if correct is not None:
-                each = correct(each, views.levels[step], views.unknown[..., 0], first)
-            clean = each.unflatten(0, (B, V))[:, :, rows].gather(1, source)[:, 0]
-        numbers, stays, ends = (
-            plan.numbers[step][..., groups],
-            plan.stays[step][..., groups],
-            plan.ends[step][..., groups],
-        )
+        shown_noise = mask_noise[:, None].expand(B, V, *mask_noise.shape[1:]).flatten(0, 1)
+
+    def read(each: Tensor) -> Tensor:
+        """What the stage changes, each number from its own view. (B V, W, P, D) -> (B, rows, P, D)"""
+        return each[:, rows] if views is None else each.unflatten(0, (B, V))[:, :, rows].gather(1, source)[:, 0]
+
+    for step, levels in enumerate(plan.levels):
+        numbers, stays, ends = (of[step][..., groups] for of in (plan.numbers, plan.stays, plan.ends))
+        shown = tokens
+        if views is not None:
+            shown = torch.where(unknown, mask_noise[:, None], tokens[:, None]).flatten(0, 1)
+        each = levels.expand(B, V, W, P).flatten(0, 1)
+        pushed, clean = guidance.apply(denoise, shown, each, present, shown_noise, layout)
+        if guidance.smooth:
+            part = torch.where(stays, part, read(pushed))
+        clean = read(clean if correct is None else correct(clean, levels, hidden, first))
         carry, signal, left, old, new, signal_after = numbers
         ahead = clean
         if history is not None:
@@ -178,10 +174,11 @@ def _plan(
             shown = torch.where(kinds, LEVELS, table[:, None])  # (S + 1, V, W, P)
             unknown = layout.group_levels(torch.where(kinds, LEVELS, 0)) == LEVELS
             source = views_to_read(concealed, view_of, layout)
-            views = Views(shown[:-1].to(device), unknown.to(device), source.to(device))
+            views = Views(unknown.to(device), source.to(device))
             each = layout.group_levels(shown)
             group = each.gather(1, source.expand(len(each), 1, *source.shape))[:, 0]
         else:
+            shown = table[:, None]
             group = layout.group_levels(table)
         group = group[:, rows]  # (S + 1, rows, P, 1 + slots)
         past = torch.full((count, P, slots), -1)
@@ -197,7 +194,7 @@ def _plan(
         stays, ends = group[:-1] == group[1:], group[1:] == 0
         return StagePlan(
             rows,
-            table[:-1].to(device),
+            shown[:-1].to(device),
             views,
             torch.stack(numbers).to(device),
             stays.to(device),
@@ -208,7 +205,13 @@ def _plan(
 
 
 def carried_share(now: Tensor, after: Tensor, past: Tensor) -> Tensor:
-    """How far `magnet.sampling.solvers.carried_on` extrapolates; 0 where it does not. (...) int each -> (...)"""
+    """How far a prediction is extrapolated, in changes since the last one; 0 where it is not. (...) int each -> (...)
+
+    It is DPM-Solver++(2M) (Lu et al. 2022, arXiv 2211.01095, algorithm 2, data prediction): a DDIM step with the
+    prediction extrapolated to the middle of the step. The first step of a number and the step to level 0 are those of
+    DDIM. Level K has an infinite log-SNR and counts as one step of the same length. The extrapolation is at most the
+    whole change, so that noise does not grow where levels of a token lie close together.
+    """
     length = half_log_snr(after) - half_log_snr(now)
     since = torch.where(past == LEVELS, length, half_log_snr(now) - half_log_snr(past.clamp_min(0)))
     share = (length / (2 * since)).clamp(max=1.0)

@@ -162,10 +162,6 @@ class OtherNoise(NoiseStream):
         self.row += count
         return torch.where(there, mine, init_noise), mask_noise
 
-    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
-        there = self.tokens[first : first + len(levels), :, None]
-        return torch.where(there, super().step_noise(first, levels, moves), self.plain.step_noise(first, levels, moves))
-
     def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
         there = self.tokens[first : first + rows, :, None]
         return torch.where(there, super().drawn(first, rows, draws), self.plain.drawn(first, rows, draws))

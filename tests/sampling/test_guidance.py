@@ -5,6 +5,8 @@ from torch import Tensor
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance, roughness
 from magnet.sampling.noise import LEVELS, add_noise
+from magnet.sampling.planned_stage import run_planned_stage
+from magnet.sampling.schedule import Stage
 
 PEOPLE = 3
 LAYOUT = TokenLayout(latent=4, agents=PEOPLE)
@@ -40,9 +42,11 @@ def run(given, **options) -> Tensor:
     return Guidance(**options).predict(model, tokens, levels, present, mask_noise, LAYOUT)
 
 
-def moves(levels: Tensor) -> Tensor:
-    """A step that takes all that is noisy on."""
-    return LAYOUT.spread(LAYOUT.group_levels(levels)) > 0
+def step(given, now: Tensor, after: Tensor, guidance: Guidance) -> Tensor:
+    """One denoising step. now, after (N, P) int"""
+    tokens, _, present, mask_noise = given
+    stage = Stage(0, torch.stack([now, after]).short())
+    return run_planned_stage(model, stage, tokens, mask_noise, present, LAYOUT, None, guidance)
 
 
 def test_without_guidance_nothing_changes(given):
@@ -154,7 +158,7 @@ def test_smoothing_follows_the_slope_through_the_denoiser(given):
     """Against finite differences in float64."""
     tokens, levels, present, mask_noise = given
     tokens = tokens.double()
-    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))
+    moved, clean = Guidance(smooth=0.1).apply(model, tokens, levels, present, mask_noise, LAYOUT)
     assert torch.equal(clean, model(tokens, levels, present))
     for place in ((0, 4, 0, 0), (1, 5, 2, 3), (0, 5, 1, -1)):
         shift = torch.zeros_like(tokens)
@@ -168,21 +172,20 @@ def test_smoothing_follows_the_slope_through_the_denoiser(given):
 def test_smoothing_goes_with_every_guidance_and_leaves_known_numbers_alone(given, kind):
     tokens, levels, present, mask_noise = given
     guidance = Guidance(kind, smooth=0.3)
-    moved, clean = guidance.apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))
+    moved, clean = guidance.apply(model, tokens, levels, present, mask_noise, LAYOUT)
     known = LAYOUT.spread(LAYOUT.group_levels(levels)) == 0
-    assert torch.equal(moved[known], tokens[known])
     assert not torch.allclose(moved[~known], tokens[~known])
     assert torch.equal(clean, Guidance(kind).predict(model, tokens, levels, present, mask_noise, LAYOUT))
+    stepped, plain = (step(given, levels[0], levels[0] // 2, each) for each in (guidance, Guidance(kind)))
+    assert torch.equal(stepped[known], tokens[known])
+    assert not torch.allclose(stepped[~known], plain[~known])
 
 
 def test_smoothing_works_in_inference_mode(given):
     with torch.inference_mode():
         inside = tuple(x + 0 for x in given)
-        moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT, moves(inside[1]))
-    tokens, levels, present, mask_noise = given
-    assert torch.equal(
-        moved, Guidance(smooth=0.3).apply(model, tokens, levels, present, mask_noise, LAYOUT, moves(levels))[0]
-    )
+        moved, _ = Guidance(smooth=0.3).apply(model, inside[0], *inside[1:], LAYOUT)
+    assert torch.equal(moved, Guidance(smooth=0.3).apply(model, given[0], *given[1:], LAYOUT)[0])
 
 
 def test_smoothing_makes_samples_smoother(generator):
@@ -208,12 +211,12 @@ def test_smoothing_makes_samples_smoother(generator):
 
 def test_smoothing_leaves_alone_what_the_step_does_not_denoise(given):
     """A token that stays at pure noise must stay noise, however many steps go by."""
-    tokens, levels, present, mask_noise = given
-    step = moves(levels)
-    step[:, 5] = False
-    moved, _ = Guidance(smooth=0.3).apply(model, tokens, levels, present, mask_noise, LAYOUT, step)
+    tokens, levels, _, _ = given
+    after = levels[0] // 2
+    after[5] = levels[0, 5]
+    moved = step(given, levels[0], after, Guidance(smooth=0.3))
     assert torch.equal(moved[:, 5], tokens[:, 5])
-    assert not torch.equal(moved[:, 4], tokens[:, 4])
+    assert not torch.equal(moved[:, 4], step(given, levels[0], after, Guidance())[:, 4])
 
 
 def test_half_denoised_tokens_below_the_context_level_keep_their_own(given):

@@ -123,23 +123,23 @@ def test_the_noise_of_a_step_hangs_on_its_place_alone(each):
 
     levels = torch.tensor([1000, 1000, 500, 0])[:, None, None].expand(4, 3, 5).clone()
     levels[2, 1] = 250
-    moves = levels > 0
+    draws = [(0, 1000, None), (1, 1000, None), (2, 500, levels[2] == 500), (2, 250, levels[2] == 250)]
     whole, parts = stream(), stream()
     parts.draw(6)
-    noise = whole.step_noise(10, levels, moves)
+    noise = whole.drawn(10, 4, draws)
     assert noise.shape == (2, 4, 3, 5)
-    assert torch.equal(noise[:, 1:], parts.step_noise(11, levels[1:], moves[1:]))
+    assert torch.equal(noise[:, 1:], parts.drawn(11, 3, [(row - 1, level, where) for row, level, where in draws[1:]]))
     assert (noise[:, 3] == 0).all()
     others = [noise[0, 0], noise[1, 0], noise[0, 1], noise[0, 2]]
     assert not any(torch.equal(a, b) for i, a in enumerate(others) for b in others[:i])
-    again = stream().step_noise(12, torch.full((1, 3, 5), 500), torch.ones(1, 3, 5, dtype=torch.bool))
+    again = stream().drawn(12, 1, [(0, 500, None)])
     assert torch.equal(noise[:, 2, 0], again[:, 0, 0])
 
 
 def test_with_a_generator_each_a_steps_noise_does_not_depend_on_the_batch():
-    levels = torch.full((2, 3, 5), 700)
-    both = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0).step_noise(0, levels, levels > 0)
-    alone = NoiseStream((1, 3, 5), seeded(2), eta=1.0).step_noise(0, levels, levels > 0)
+    draws = [(0, 700, None), (1, 700, None)]
+    both = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0).drawn(0, 2, draws)
+    alone = NoiseStream((1, 3, 5), seeded(2), eta=1.0).drawn(0, 2, draws)
     assert torch.equal(both[1:], alone)
 
 

@@ -13,10 +13,11 @@ from magnet.sampling import planned_stage
 from magnet.sampling.grid import Grid
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import NoiseStream
-from magnet.sampling.sampler import begin, run_stage
+from magnet.sampling.sampler import begin
 from magnet.sampling.schedule import MaskSchedule, Stage
 from magnet.sampling.solvers import History
 from magnet.tasks import registry
+from tests.sampling.plain import run_stage
 
 P, N, B = 3, 20, 2
 LAYOUT = TokenLayout(6, P)
@@ -51,11 +52,11 @@ def sampled(plan: MaskSchedule, plain: bool, guidance: Guidance, eta: float, ste
 
 
 @pytest.mark.parametrize("task", [*registry.names(), "half a turn"])
-@pytest.mark.parametrize("way", ["plain", "new noise", "guided", "history"])
+@pytest.mark.parametrize("way", ["plain", "new noise", "guided", "smoothed", "history"])
 @torch.no_grad()
 def test_every_task_is_sampled_as_by_the_plain_loop(task: str, way: str) -> None:
     plan = schedule("agentic_async", offset=0.5) if task == "half a turn" else schedule(task)
-    guidance = Guidance("self") if way == "guided" else Guidance()
+    guidance = {"guided": Guidance("self"), "smoothed": Guidance(smooth=0.05)}.get(way, Guidance())
     how = guidance, float(way != "plain"), way == "history"
     (plain, before), (planned, now) = sampled(plan, True, *how), sampled(plan, False, *how)
     assert torch.equal(plain, planned)

@@ -14,11 +14,12 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, ddim_levels, ddim_step, half_log_snr, log_snr_levels
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule
-from magnet.sampling.solvers import History, solver_step
+from magnet.sampling.solvers import History
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.joint import JointFuture
 from magnet.testing import mixing
+from tests.sampling.plain import solver_step
 
 # -- levels ------------------------------------------------------------------------------------
 

@@ -151,17 +151,11 @@ class Given:
         """How many draws come before those that hold a number of new noise each."""
         return len(self.noise) - len(self.levels) * self.noise[0, :, :, 0].numel()
 
-    def step_noise(self, first: int, levels: Tensor, moves: Tensor) -> Tensor:
-        """Draw `plain` + (level number, token, agent): 1 there, 0 everywhere else."""
-        N, P = self.noise.shape[1:3]
-        step_noise = torch.zeros_like(self.noise[:, first : first + len(levels)])
-        for row, agent in moves[..., 0].nonzero().tolist():
-            number = self.levels.index(int(levels[row, agent, 0]))
-            step_noise[self.plain + (number * N + first + row) * P + agent, row, agent] = 1.0
-        return step_noise
-
     def drawn(self, first: int, rows: int, draws: Sequence[tuple[int, int, Tensor | None]]) -> Tensor:
-        """The same, of a planned step's (row, level, which numbers of its agents)."""
+        """Draw `plain` + (level number, token, agent): 1 there, 0 everywhere else.
+
+        draws: (row, level, which numbers of its agents)
+        """
         N, P = self.noise.shape[1:3]
         step_noise = torch.zeros_like(self.noise[:, first : first + rows])
         for row, level, where in draws:
