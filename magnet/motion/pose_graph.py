@@ -29,54 +29,12 @@ RUN = 4
 
 
 @dataclass(frozen=True)
-class Planar:
-    """Turns about the vertical and moves over the ground, with how sure they are.
-
-    Attributes:
-        yaw: (...) radians.
-        ground: (..., 2) metres, (x, z).
-        yaw_precision: (...) 1 / rad^2; 0 where nothing is known.
-        ground_precision: (...) 1 / m^2.
-        yaw_smoothness, ground_smoothness: (...) of deltas: precision of the change of a delta's error from the frame
-            before, 1 / rad^2 and 1 / m^2; that of the first frame is not read. None: errors are independent.
-    """
-
-    yaw: Tensor
-    ground: Tensor
-    yaw_precision: Tensor
-    ground_precision: Tensor
-    yaw_smoothness: Tensor | None = None
-    ground_smoothness: Tensor | None = None
-
-
-def solve_pose_graph(deltas: Planar, pairs: Planar, start_yaw: Tensor, start_ground: Tensor) -> tuple[Tensor, Tensor]:
+class PoseGraph:
     """Headings and positions that fit deltas and pairwise transforms best, each by its precision.
 
     Minimises the squared differences between consecutive poses and the deltas, their changes from frame to frame, and
     the differences between the agents of a frame and the pairwise transforms. With pairwise precisions of 0 it is the
-    plain integration of the deltas.
-
-    Args:
-        deltas: (B, T, P): T_prev_now of each agent; the first leads away from the start.
-        pairs: (B, T, P, P - 1): T_self_partner, in the order of `partners`.
-        start_yaw: (B, P) headings before the first frame. How firmly they hold is the first delta's precision.
-        start_ground: (B, P, 2) positions before the first frame.
-
-    Returns:
-        yaw (B, T, P) and ground (B, T, P, 2), in float64.
-    """
-    smooth = [0 * deltas.yaw_precision if s is None else s for s in (deltas.yaw_smoothness, deltas.ground_smoothness)]
-    graph = PoseGraph.of(
-        torch.stack([deltas.yaw_precision, deltas.ground_precision]).double(),
-        torch.stack(smooth).double(),
-        torch.stack([pairs.yaw_precision, pairs.ground_precision]).double(),
-    )
-    return graph.solve(deltas.yaw, deltas.ground, pairs.yaw, pairs.ground, start_yaw, start_ground)
-
-
-@dataclass(frozen=True)
-class PoseGraph:
-    """All of `solve_pose_graph` that depends on precisions only, to be solved with any deltas and pairwise transforms.
+    plain integration of the deltas. This is all that depends on precisions only.
 
     Attributes:
         tied: (2, B, T, P, P - 1) precisions of pairwise transforms, of yaws and of ground positions. B may be 1, for
@@ -89,7 +47,14 @@ class PoseGraph:
 
     @classmethod
     def of(cls, held: Tensor, smooth: Tensor, tied: Tensor) -> PoseGraph:
-        """held, smooth (2, B, T, P) precisions of deltas and of their changes, tied as above; all float64."""
+        """From precisions in float64, 1 / rad^2 and 1 / m^2; 0 where nothing is known.
+
+        Args:
+            held: (2, B, T, P) of deltas; the first one's is how firmly the start holds.
+            smooth: (2, B, T, P) of the change of a delta's error from the frame before; 0: errors are independent. That
+                of the first frame is not read.
+            tied: as above.
+        """
         return cls(tied, factor(*_in_twos(*_bands(held, smooth, tied))))
 
     def solve(
@@ -103,7 +68,17 @@ class PoseGraph:
         yaw_pull: Tensor | float = 0.0,
         ground_pull: Tensor | float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """As `solve_pose_graph`. (x, z) is one complex number here, which a turn by a yaw multiplies by exp(-i yaw).
+        """The least-squares answer. (x, z) is one complex number here, which a turn by a yaw multiplies by exp(-i yaw).
+
+        Args:
+            delta_yaw, delta_ground: (B, T, P) radians and (B, T, P, 2) metres (x, z), T_prev_now of each agent; the
+                first leads away from the start.
+            pair_yaw, pair_ground: (B, T, P, P - 1) and (B, T, P, P - 1, 2), T_self_partner in the order of `partners`.
+            start_yaw, start_ground: (B, P) and (B, P, 2), before the first frame.
+            yaw_pull, ground_pull: see below.
+
+        Returns:
+            yaw (B, T, P) and ground (B, T, P, 2), in float64.
 
         Deltas that were observed a second time, `held` being the sum of both precisions: the pull is the second
         precision times how far that observation is from the first, yaw (B, T, P), ground (B, T, P) complex. Then the

@@ -1,6 +1,6 @@
 """The closed-form solve against a general least-squares solver."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,28 @@ from scipy.optimize import least_squares
 
 from magnet.motion.frames import from_planar, inverse, pairwise, partners, to_planar
 from magnet.motion.planar import rotate_ground
-from magnet.motion.pose_graph import GAUGE, Planar, factor, solve_pose_graph
+from magnet.motion.pose_graph import GAUGE, PoseGraph, factor
+
+
+@dataclass(frozen=True)
+class Planar:
+    """Turns and moves, as deltas (B, T, P) or pairwise transforms (B, T, P, P - 1), with how sure they are."""
+
+    yaw: torch.Tensor
+    ground: torch.Tensor
+    yaw_precision: torch.Tensor
+    ground_precision: torch.Tensor
+    yaw_smoothness: torch.Tensor | float = 0.0
+    ground_smoothness: torch.Tensor | float = 0.0
+
+
+def solve_pose_graph(
+    deltas: Planar, pairs: Planar, start_yaw: torch.Tensor, start_ground: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    held = torch.stack([deltas.yaw_precision, deltas.ground_precision])
+    smooth = [0 * each + s for each, s in zip(held, (deltas.yaw_smoothness, deltas.ground_smoothness), strict=True)]
+    graph = PoseGraph.of(held, torch.stack(smooth), torch.stack([pairs.yaw_precision, pairs.ground_precision]))
+    return graph.solve(deltas.yaw, deltas.ground, pairs.yaw, pairs.ground, start_yaw, start_ground)
 
 
 def paths(B: int, T: int, P: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

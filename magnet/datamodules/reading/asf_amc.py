@@ -77,9 +77,7 @@ def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecordin
             that is not a number, NaN, a truncated file or one without frames; names file and line.
     """
     path = Path(path)
-    values = parse_regular(path, skeleton)
-    if values is None:
-        values = parse_any(path, skeleton)
+    values = parse_amc(path, skeleton)
     column, T, K = 0, len(values), len(skeleton.names)
     root, angles = np.zeros((T, 3)), np.zeros((T, K, 3))
     for k, dofs in enumerate(skeleton.dofs):
@@ -98,46 +96,8 @@ def read_amc(path: str | Path, skeleton: AsfSkeleton, fps: float) -> AmcRecordin
     return AmcRecording(skeleton, root, local, float(fps), path)
 
 
-def parse_regular(path: Path, skeleton: AsfSkeleton) -> Floats | None:
-    """All values (T, D) of a file whose frames all list the skeleton's bones in one order; else None."""
-    try:
-        words = path.read_text(encoding="latin-1").split()
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{path}: no such file") from error
-    wide = 1 + sum(1 + count for count in skeleton.moving.values())
-    try:
-        first = words.index("1")
-    except ValueError:
-        return None
-    if (len(words) - first) % wide or len(words) == first:
-        return None
-    T = (len(words) - first) // wide
-    names: dict[str, int] = {}
-    at = 1
-    while at < wide:
-        name = words[first + at]
-        if name not in skeleton.moving or name in names:
-            return None
-        names[name] = at
-        at += 1 + skeleton.moving[name]
-    if at != wide:
-        return None
-    for position, expected in [(0, None), *((at, name) for name, at in names.items())]:
-        found = words[first + position :: wide]
-        if found != ([str(t + 1) for t in range(T)] if expected is None else [expected] * T):
-            return None
-    columns = [names[name] + 1 + i for name, count in skeleton.moving.items() for i in range(count)]
-    values = np.empty((T, len(columns)))
-    try:
-        for i, column in enumerate(columns):
-            values[:, i] = words[first + column :: wide]
-    except ValueError:
-        return None
-    return values if np.isfinite(values).all() else None
-
-
-def parse_any(path: Path, skeleton: AsfSkeleton) -> Floats:
-    """The same line by line: takes bones in any order, and says where a file is wrong."""
+def parse_amc(path: Path, skeleton: AsfSkeleton) -> Floats:
+    """All values (T, D) of a file, whose frames may list the skeleton's bones in any order."""
     moving = skeleton.moving
     starts, width = {}, 0
     for name, count in moving.items():

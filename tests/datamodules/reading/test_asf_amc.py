@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import AmcRecording, parse_any, parse_regular, read_amc, together
+from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, together
 from magnet.datamodules.reading.cmu_glitches import repaired
 from magnet.motion.runs import true_runs
 from tests.datamodules.slow_cmu import slow_ends
@@ -68,13 +68,6 @@ def test_a_large_file_is_read_within_a_second(cmu_root: Path) -> None:
     before = time.process_time()
     read_amc(cmu_root / "salsa/60_08.amc", skeleton, 60)
     assert time.process_time() - before < 1.0
-
-
-def test_reading_line_by_line_gives_the_same_values(files: tuple[Path, Path]) -> None:
-    skeleton = read_asf(files[0])
-    fast = parse_regular(files[1], skeleton)
-    assert fast is not None
-    np.testing.assert_array_equal(fast, parse_any(files[1], skeleton))
 
 
 def test_bones_may_come_in_another_order_in_a_later_frame(files: tuple[Path, Path]) -> None:
