@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -27,9 +27,7 @@ from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
-
-if TYPE_CHECKING:
-    from magnet.tasks.base import Task
+from magnet.tasks.base import Task
 
 Player = Literal["page", "film"]
 

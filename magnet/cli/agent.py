@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 
 if TYPE_CHECKING:
@@ -66,7 +67,6 @@ def main(arguments: Sequence[str] = ()) -> int:
     """
     given = parser().parse_args(list(arguments))
     from magnet.agents import zeromq
-    from magnet.cli.errors import CommandError
 
     if given.make_keys:
         if given.keys is None:
@@ -100,8 +100,6 @@ def peers(connect: Sequence[str], names: Sequence[str], me: str) -> dict[str, st
     Raises:
         CommandError: not of the form NAME=ADDRESS, or nobody of the scene.
     """
-    from magnet.cli.errors import CommandError
-
     found = {}
     for each in connect:
         name, equals, address = each.partition("=")
@@ -118,7 +116,6 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
 
     from magnet.agents.agent import Agent, Player
     from magnet.api import read
-    from magnet.cli.errors import CommandError
     from magnet.denoiser.module import Denoiser
     from magnet.sampling.options import SamplerOptions
     from magnet.tasks.agentic import AgenticAsync, AgenticSync

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnet.cli.flags import PlainParser
+from magnet.cli.errors import CommandError, no_such
+from magnet.cli.flags import PlainParser, taken_out
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -70,10 +70,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         CommandError: an option that makes no sense.
         ValueError: no such model, task or preset; says what there is.
     """
-    of_tasks, others = task_flags(arguments)
+    taken, others = taken_out(arguments, r"--task\.")
+    of_tasks = {words[0].removeprefix("--task.").partition("=")[0]: words for words in taken}
     given = parser().parse_args(others)
-    from magnet.cli.errors import CommandError
-
     for name in ("frames", "rounds", "steps", "threads"):
         if getattr(given, name) is not None and getattr(given, name) < 1:
             raise CommandError(f"--{name} is {getattr(given, name)}, expected at least 1")
@@ -98,8 +97,6 @@ def read(path: Path) -> dict[str, Any]:
     Raises:
         CommandError: no such file, or not of this command.
     """
-    from magnet.cli.errors import CommandError
-
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         found["cases"].items()
@@ -108,27 +105,12 @@ def read(path: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def task_flags(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """The words of each option of tasks, `--task.NAME VALUE` or `--task.NAME=VALUE`, and the other arguments."""
-    found: dict[str, list[str]] = {}
-    others: list[str] = []
-    left = iter(arguments)
-    for word in left:
-        if not word.startswith("--task."):
-            others.append(word)
-            continue
-        name, equals, _ = word.removeprefix("--task.").partition("=")
-        found[name] = [word] if equals else [word, *itertools.islice(left, 1)]
-    return found, others
-
-
 def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[str, dict[str, Any]]:
     """What was asked of each task: those of the options that it has.
 
     Raises:
         CommandError: an option that none of the tasks has, or a value that does not fit.
     """
-    from magnet.cli.errors import CommandError, no_such
     from magnet.cli.tasks import parse_task, task_class
 
     has = {task: {each.name for each in dataclasses.fields(task_class(task))} for task in tasks}

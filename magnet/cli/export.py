@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
+from magnet.cli.errors import CommandError
 
 if TYPE_CHECKING:
     from magnet.motion.scene import Scene
@@ -71,7 +72,6 @@ def main(arguments: Sequence[str] = ()) -> int:
     """
     options = parser().parse_args(list(arguments))
     from magnet.body import on_floor
-    from magnet.cli.errors import CommandError
     from magnet.export import formats
     from magnet.export.bones import BoneOptions
 
@@ -124,8 +124,6 @@ def only(scene: Scene, people: Sequence[int]) -> Scene:
         CommandError: nobody of that number is there.
     """
     import torch
-
-    from magnet.cli.errors import CommandError
 
     there = scene.present.any(dim=0).nonzero()[:, 0].tolist()
     if missing := [p for p in people if p not in there]:

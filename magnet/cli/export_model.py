@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 
 EPILOG = """\
@@ -37,8 +38,6 @@ def main(arguments: Sequence[str] = ()) -> int:
         "less exact; changes nothing for other models",
     )
     options = parser.parse_args(list(arguments))
-    from magnet.cli.errors import CommandError
-
     out = Path(options.out)
     if out.suffix.lower() != ".onnx":
         raise CommandError(f"{out.name}: got {out.suffix or 'no suffix'}, expected .onnx")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import itertools
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,6 +26,19 @@ def valued(flags: Sequence[str]) -> Iterator[tuple[str, str]]:
         name, equals, value = argument.partition("=")
         if name.startswith("--"):
             yield name, value if equals else after
+
+
+def taken_out(arguments: Sequence[str], named: str) -> tuple[list[list[str]], list[str]]:
+    """Flags that begin as a pattern says, as `--task.`, each with its value; and all other words."""
+    taken: list[list[str]] = []
+    others: list[str] = []
+    rest = iter(arguments)
+    for word in rest:
+        if re.match(named, word):
+            taken.append([word] if "=" in word else [word, *itertools.islice(rest, 1)])
+        else:
+            others.append(word)
+    return taken, others
 
 
 def spec_of(value: Any) -> Options:

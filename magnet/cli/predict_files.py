@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
+from magnet.cli.flags import taken_out
 
 if TYPE_CHECKING:
     from magnet.api import Model
@@ -89,7 +90,10 @@ def main(arguments: Sequence[str]) -> int:
     if meant(arguments) and arguments[0].startswith("--help"):
         parser().print_help()
         return 0
-    groups, words = split_groups(arguments)
+    groups, words = {}, arguments
+    for name in ("task", "sampler"):
+        taken, words = taken_out(words, rf"--{name}\.")
+        groups[name] = list(itertools.chain.from_iterable(taken))
     options = parser().parse_args(words)
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
@@ -115,20 +119,6 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
-
-
-def split_groups(arguments: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """Flags with their values of the groups `task` and `sampler`, and all other words."""
-    groups: dict[str, list[str]] = {"task": [], "sampler": []}
-    others: list[str] = []
-    rest = iter(arguments)
-    for word in rest:
-        group = next((name for name in groups if word.startswith(f"--{name}.")), None)
-        if group is None:
-            others.append(word)
-        else:
-            groups[group] += [word] if "=" in word else [word, *itertools.islice(rest, 1)]
-    return groups, others
 
 
 def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, tuple[int, ...]]:

@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
+from magnet.cli.errors import CommandError
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -56,7 +57,6 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body.apart import APART
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.cli import refine_plot
-    from magnet.cli.errors import CommandError
     from magnet.export import formats
 
     out = scene_files.path_to_write(options.out)

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 
 if TYPE_CHECKING:
@@ -54,7 +55,6 @@ def path_to_write(out: str) -> Path:
     Raises:
         CommandError: it is not.
     """
-    from magnet.cli.errors import CommandError
     from magnet.export import formats
 
     path = Path(out)
@@ -71,7 +71,6 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
         CommandError: there are no scenes.
         ValueError: files that cannot be read; says what to do.
     """
-    from magnet.cli.errors import CommandError
     from magnet.export import formats
 
     got = formats.read(options.inputs, options.body, reading)

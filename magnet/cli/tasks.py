@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,6 +13,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
+from magnet.cli.flags import taken_out
 from magnet.plugins import Registered
 from magnet.tasks import Task, registry
 from magnet.version import __version__
@@ -77,19 +77,13 @@ def task_class(name: str) -> type:
         raise CommandError(str(error)) from error
 
 
-def split_flags(flags: Iterable[str]) -> tuple[list[str], list[str]]:
+def split_flags(flags: Sequence[str]) -> tuple[list[str], list[str]]:
     """A command line's `--task.FIELD VALUE`, and the rest of it without `--task NAME`."""
+    taken, others = taken_out(flags, r"--task([.=]|$)")
     fields: list[str] = []
-    others: list[str] = []
-    rest = iter(flags)
-    for flag in rest:
-        name, equals, _ = flag.partition("=")
-        if name != "--task" and not name.startswith("--task."):
-            others.append(flag)
-            continue
-        words = [flag] if equals else [flag, *itertools.islice(rest, 1)]
-        if name not in ("--task", "--task.class_path"):
-            fields += [words[0].replace("--task.init_args.", "--task.", 1), *words[1:]]
+    for flag, *value in taken:
+        if flag.partition("=")[0] not in ("--task", "--task.class_path"):
+            fields += [flag.replace("--task.init_args.", "--task.", 1), *value]
     return fields, others
 
 

@@ -23,11 +23,12 @@ import operator
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from magnet.denoiser.module import Denoiser
 from magnet.denoiser.transformer import Transformer, block_causal, rotate
 from magnet.files import write_whole
 from magnet.motion.scene import FPS
@@ -35,9 +36,6 @@ from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_f
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.module import Tokenizer
 from magnet.version import __version__
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
 
 OPSET = 18
 """Of the files: ONNX 1.13 of December 2022 and later read it."""

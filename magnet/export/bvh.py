@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 
@@ -26,15 +27,7 @@ TIPS: dict[int, tuple[float, float, float]] = {
 """Metres from a leaf joint to its End Site, which only says how long the last bone is drawn."""
 
 
-class Jointed(Protocol):
-    """What writing a skeleton needs of a body model: its joints at rest."""
-
-    id: str
-
-    def rest_joints(self, betas: Tensor) -> Tensor: ...
-
-
-def save_bvh(scene: Scene, path: str | Path, body: Jointed, *, unit: Unit = "m") -> list[Path]:
+def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") -> list[Path]:
     """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
 
     All people keep their places in the one world of the scene, y up. Joints carry SMPL-X's names; the root's position

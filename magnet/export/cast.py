@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,16 +25,6 @@ LIGHT = 800
 """Vertices of a light body in pictures, of 13,492; its triangles are made four, so that it looks round."""
 
 
-class Posable(Protocol):
-    """What drawing needs of a body model (`magnet.body.Body` is one)."""
-
-    faces: Tensor  # (F, 3)
-
-    def joints(self, scene: Scene) -> Tensor: ...
-
-    def vertices(self, scene: Scene) -> Tensor: ...
-
-
 @dataclass(frozen=True)
 class Cast:
     """The people of one picture: T moments of the P agents who are present."""
@@ -43,7 +33,7 @@ class Cast:
     colours: Array  # (T, P, 3), 0 to 255
     known: NDArray[np.bool_]  # (T, P)
     scene: Scene  # B = 1, present agents only
-    body: Posable
+    body: Body
     style: Style
 
     @property
@@ -83,7 +73,7 @@ class Cast:
             add_mesh(canvas, self.vertices(frame), self.body.faces.cpu().numpy(), colours)
 
 
-def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None) -> Cast:
+def cast(scene: Scene, body: Body, style: Style, known: Tensor | None = None) -> Cast:
     """One scene (B = 1) made ready for drawing. known: (T, P) bool, what is drawn pink.
 
     Raises:
@@ -111,7 +101,7 @@ def cast(scene: Scene, body: Posable, style: Style, known: Tensor | None = None)
     return Cast(joints, np.where(marked[..., None], pink, own), marked, shown, body, style)
 
 
-def default_body(scene: Scene) -> Posable:
+def default_body(scene: Scene) -> Body:
     """The packaged open body, for scenes that belong to it.
 
     Raises:

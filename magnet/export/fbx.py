@@ -10,8 +10,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from magnet.body import Body
 from magnet.export.bones import BoneOptions
-from magnet.export.glb import Skinned, save_glb
+from magnet.export.glb import save_glb
 from magnet.motion.scene import Scene
 
 SCRIPT = Path(__file__).with_name("as_fbx.py")
@@ -37,7 +38,7 @@ def blender() -> list[str]:
     raise ImportError(NEEDS)
 
 
-def save_fbx(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions = BoneOptions()) -> Path:
+def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as FBX, everybody skinned and animated, with a keyframe for every frame.
 
     Returns:

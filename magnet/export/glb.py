@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import roma
@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
@@ -26,19 +27,7 @@ INFLUENCES = 4
 """Joints that move one vertex; what engines take."""
 
 
-class Skinned(Protocol):
-    """What a skinned mesh needs of a body model (`magnet.body.Body` is one)."""
-
-    id: str
-    v_template: Tensor  # (V, 3)
-    shapedirs: Tensor  # (V, 3, 10)
-    weights: Tensor  # (V, 22)
-    faces: Tensor  # (F, 3)
-
-    def rest_joints(self, betas: Tensor) -> Tensor: ...
-
-
-def save_glb(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions = BoneOptions()) -> Path:
+def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
 
     Each person present is a node `person_0`, `person_1` ... with a bone on the floor and the 22 joints below it, and a
@@ -84,7 +73,7 @@ def save_glb(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions =
     return path
 
 
-def slots_to_write(scene: Scene, body: Skinned) -> list[int]:
+def slots_to_write(scene: Scene, body: Body) -> list[int]:
     """Slots of the people in a scene.
 
     Raises:
@@ -102,18 +91,18 @@ def _animation(name: str) -> dict[str, Any]:
     return {"name": name, "samplers": [], "channels": []}
 
 
-def standing(body: Skinned, betas: Tensor) -> Tensor:
+def standing(body: Body, betas: Tensor) -> Tensor:
     """Joints at rest of somebody who stands on the floor. betas (10,) -> (22, 3) float64"""
     return body.rest_joints(betas).detach().cpu().double() + _raised(_resting(body, betas))
 
 
-def standing_vertices(body: Skinned, betas: Tensor) -> NDArray[np.float64]:
+def standing_vertices(body: Body, betas: Tensor) -> NDArray[np.float64]:
     """Vertices at rest of somebody who stands on the floor. betas (10,) -> (V, 3)"""
     vertices = _resting(body, betas)
     return (vertices + _raised(vertices)).numpy()
 
 
-def _resting(body: Skinned, betas: Tensor) -> Tensor:
+def _resting(body: Body, betas: Tensor) -> Tensor:
     """Vertices of a body in its own frame. -> (V, 3) float64"""
     return body.v_template.detach().cpu().double() + body.shapedirs.detach().cpu().double() @ betas.double()
 
@@ -171,7 +160,7 @@ class _Gltf:
             item |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
         return self.add("accessors", item)
 
-    def skin_of(self, body: Skinned) -> dict[str, int]:
+    def skin_of(self, body: Body) -> dict[str, int]:
         """The part of the skin that does not depend on a person's shape: faces, and which joints move which vertex."""
         joints, weights = influences(body.weights.detach().cpu().double().numpy())
         faces = body.faces.detach().cpu().numpy()
@@ -182,7 +171,7 @@ class _Gltf:
             "WEIGHTS_0": self.accessor(weights, SHORT, "VEC4", VERTEX_DATA, normalized=True),
         }
 
-    def shape_of(self, body: Skinned, betas: Tensor) -> dict[str, int]:
+    def shape_of(self, body: Body, betas: Tensor) -> dict[str, int]:
         """The mesh at rest of one shape, standing on the floor."""
         vertices = standing_vertices(body, betas)
         normals = vertex_normals(vertices, body.faces.detach().cpu().numpy())

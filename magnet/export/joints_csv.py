@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Protocol
 
-from torch import Tensor
-
+from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.motion.scene import Scene
-
-
-class Posed(Protocol):
-    """What a table of joints needs of a body model."""
-
-    def joints(self, scene: Scene) -> Tensor: ...
-
 
 COLUMNS = ("scene", "frame", "time_s", "person", *(f"{name}_{axis}_m" for name in JOINT_NAMES for axis in "xyz"))
 """scene, frame and person count from 0 (a person by slot); time in seconds; world joints in metres, y up."""
 
 
-def save_csv(scene: Scene, path: str | Path, body: Posed) -> Path:
+def save_csv(scene: Scene, path: str | Path, body: Body) -> Path:
     """Write one row a frame and person present, all B scenes in one table; see `COLUMNS`. Returns the path written.
 
     >>> import tempfile

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
 
+from magnet.body import Body
 from magnet.files import load_npz
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
@@ -18,15 +18,7 @@ from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 SMPLX_JOINTS = 55
 
 
-class Shaped(Protocol):
-    """What these files need of a body model: its joints at rest."""
-
-    id: str
-
-    def rest_joints(self, betas: Tensor) -> Tensor: ...
-
-
-def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = False) -> list[Path]:
+def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = False) -> list[Path]:
     """Write one scene (B = 1, present agents) with SMPL-X's conventional keys.
 
     poses (P, T, 165) axis-angle in radians, fingers, jaw and eyes at rest; transl and its other name trans (P, T, 3) =
@@ -73,7 +65,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Shaped, *, apart: bool = Fa
     return paths
 
 
-def load_smplx(path: str | Path, body: Shaped, up: str | None = None) -> Scene:
+def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
     """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several. -> Scene with B = 1, float32
 
     Also read: AMASS's names (`trans`, `mocap_framerate`, `root_orient` and `pose_body`), more or fewer than ten betas

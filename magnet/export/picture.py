@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from magnet.export.cast import Posable, Scenes, Style, cast, default_body, known_frames, panels
+from magnet.body import Body
+from magnet.export.cast import Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.drawing import INK, Camera, Size, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
 
@@ -20,7 +21,7 @@ def contact_sheet(
     *,
     context_frames: int,
     frames: Sequence[int] | None = None,
-    body: Posable | None = None,
+    body: Body | None = None,
     style: Style = "body",
     cell: Size = (240, 240),
     title: str | None = None,

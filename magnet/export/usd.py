@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.export.glb import (
     INFLUENCES,
-    Skinned,
     influences,
     linear,
     slots_to_write,
@@ -32,7 +32,7 @@ NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
 ROOT = "root"
 
 
-def save_usd(scene: Scene, path: str | Path, body: Skinned, bones: BoneOptions = BoneOptions()) -> Path:
+def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as UsdSkel: metres, y up, a time code for every frame of the scene.
 
     Each person present is `/scene/person_0` ... with a skeleton of 22 joints, on the floor at rest, its animation and a
@@ -133,7 +133,7 @@ def joint_paths(names: Sequence[str], above: Sequence[str] = ()) -> list[str]:
     return [*above, *paths]
 
 
-def _skin(stage: Any, root: Any, vertices: NDArray[np.float64], body: Skinned, slot: int) -> None:
+def _skin(stage: Any, root: Any, vertices: NDArray[np.float64], body: Body, slot: int) -> None:
     """A person's mesh at rest, bound to its skeleton."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 

@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from magnet.export.cast import Cast, Posable, Scenes, Style, cast, default_body, known_frames, panels
+from magnet.body import Body
+from magnet.export.cast import Cast, Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.drawing import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
 from magnet.export.figures import add_ghosts, add_shadows
 from magnet.motion.scene import FPS, Scene
@@ -31,7 +32,7 @@ def render_video(
     path: str | Path,
     *,
     context_frames: int,
-    body: Posable | None = None,
+    body: Body | None = None,
     style: Style = "skeleton",
     fps: float = FPS,
     size: Size = (640, 480),
@@ -93,7 +94,7 @@ class Film:
         self,
         scenes: Scenes,
         context_frames: int,
-        body: Posable | None,
+        body: Body | None,
         style: Style,
         fps: float,
         size: Size,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -14,15 +12,13 @@ from magnet.body.fit import clearance
 from magnet.body.fitted_capsules import fit_capsules
 from magnet.body.settle_wishes import standing
 from magnet.generation.separation import open_body_on
+from magnet.generation.world import WorldState
 from magnet.motion.frames import from_9d, partners, posed, project_se2, to_planar
 from magnet.motion.placement import place
 from magnet.motion.planar import rotate_ground
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.grid import Grid
 from magnet.sampling.plans import token_levels
-
-if TYPE_CHECKING:
-    from magnet.generation.world import WorldState
 
 LAST = 3
 """Tokens are guided in the last third of their denoising steps."""

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.base import Task
 from magnet.tokenizer.carried import Carried
 from magnet.tokenizer.lean import Growing
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.tasks.base import Task
 
 
 def occupied(scene: Scene) -> int:

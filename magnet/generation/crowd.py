@@ -9,11 +9,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
@@ -25,10 +25,7 @@ from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token
 from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage, initial_levels
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.tasks.base import Task
+from magnet.tasks.base import Task
 
 BATCH = 32
 """Views that run through the network at a time, to bound memory."""

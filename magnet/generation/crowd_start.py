@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 
 from magnet.checks import require_number, require_whole
+from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_agents, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import Generation
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
 
 SPACING = 3.0
 """Metres from the middle of a group to that of the next, where nothing is said."""

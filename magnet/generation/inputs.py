@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
+from magnet.denoiser.module import Denoiser
 from magnet.generation.conditioning import label
 from magnet.motion.scene import Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
 
 ROUNDED = 0.05
 """What a rotation's columns may be off: half precision and careless interpolation are not refused, scales are."""

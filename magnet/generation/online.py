@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
 from magnet.generation.rollout import CHUNK, Generators, Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.tasks.base import Task
+from magnet.tasks.base import Task
 
 
 class OnlineRollout(Rollout):

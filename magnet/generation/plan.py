@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
-
-if TYPE_CHECKING:
-    from magnet.tasks.base import Task
+from magnet.tasks.base import Task
 
 
 class PlannedStage(NamedTuple):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from magnet.denoiser.lean import Memory, lean
+from magnet.denoiser.module import Denoiser
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
@@ -36,10 +36,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.tasks.base import Task
+from magnet.tasks.base import Task
 
 CHUNK, FEW = 64, 8
 """Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk; and that are encoded at a

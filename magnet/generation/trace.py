@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from magnet.checks import require_whole
+from magnet.denoiser.module import Denoiser
+from magnet.export.trace import DenoisingTrace
 from magnet.generation.causal_bodies import own_view
 from magnet.generation.rollout import Rollout
+from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time, require_one, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage, initial_levels
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.generation.world import WorldState
-    from magnet.sampling.options import SamplerOptions
-    from magnet.tasks.base import Task
-
-from magnet.export.trace import DenoisingTrace
+from magnet.tasks.base import Task
 
 
 def record(

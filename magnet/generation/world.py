@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
@@ -29,12 +29,9 @@ from magnet.motion.frames import (
 from magnet.motion.placement import Placement, place
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.sampling.options import SamplerOptions
 
 
 class WorldState:

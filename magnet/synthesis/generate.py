@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import torch
 
+from magnet.body import Body
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import FPS, Scene
 from magnet.synthesis.couplings import COUPLINGS
-from magnet.synthesis.people import RestBody, gather, uniform
+from magnet.synthesis.people import gather, uniform
 from magnet.synthesis.planning import PAD, Truth
 from magnet.synthesis.pose import embody
 from magnet.threads import one_thread
@@ -28,7 +29,7 @@ class CoupledScene:
     truth: Truth
 
 
-def synthesize(coupling: str, people: int, frames: int, generator: torch.Generator, body: RestBody) -> CoupledScene:
+def synthesize(coupling: str, people: int, frames: int, generator: torch.Generator, body: Body) -> CoupledScene:
     """One scene (B = 1) of people coupled in a known way, at 30 fps; the same generator state, the same scene.
 
     Args:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from magnet.body import Body
 from magnet.body.joints import HEAD, L_ELBOW, L_SHOULDER, L_WRIST, R_ELBOW, R_SHOULDER, R_WRIST, SHOULDERS, TOES
 from magnet.motion.scene import FPS
 
@@ -16,16 +16,6 @@ PALM = 0.08
 """Metres from the wrist to the middle of the palm."""
 SOLE = 0.028
 """Metres from the ball-of-foot joint down to the sole of a resting foot."""
-
-
-class RestBody(Protocol):
-    """What is needed of a body model: its id and its joints at rest."""
-
-    id: str
-
-    def rest_joints(self, betas: Tensor) -> Tensor:
-        """(..., 10) -> (..., 22, 3)"""
-        ...
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,7 @@ def number(generator: torch.Generator, low: float, high: float) -> float:
     return float(uniform(generator, low, high))
 
 
-def gather(count: int, generator: torch.Generator, body: RestBody) -> People:
+def gather(count: int, generator: torch.Generator, body: Body) -> People:
     """Draw P different people: shapes N(0, 1) clipped at 2, manner uniform in human ranges."""
     betas = torch.randn(count, 10, generator=generator, dtype=torch.float64).clamp(-2, 2).float()
     rest = body.rest_joints(betas).detach().cpu().double()

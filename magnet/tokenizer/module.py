@@ -6,13 +6,14 @@ import copy
 import inspect
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import lightning as L
 import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from magnet.body import Body
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token
@@ -32,9 +33,6 @@ from magnet.tokenizer.usage import CodeUse, by_quantizer
 from magnet.tokenizer.vqvae import VQVAE
 from magnet.training.optim import adamw_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
-
-if TYPE_CHECKING:
-    from magnet.body import Body
 
 __all__ = ["RawPose", "Tokenizer"]
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
+
+from magnet.body import Body
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,14 +27,6 @@ TURN = 0.3
 """Smallest cosine between a triangle's normals before and after a collapse."""
 
 
-class Meshed(Protocol):
-    """What is asked of a body model (`magnet.body.Body` is one)."""
-
-    v_template: Tensor  # (V, 3)
-    faces: Tensor  # (F, 3)
-    weights: Tensor  # (V, 22)
-
-
 @dataclass(frozen=True)
 class Light:
     """Which vertices of a body stay, and the triangles between these."""
@@ -46,7 +38,7 @@ class Light:
 _made: dict[tuple[bytes, int], Light] = {}
 
 
-def light(body: Meshed, vertices: int = VERTICES) -> Light:
+def light(body: Body, vertices: int = VERTICES) -> Light:
     """A body's mesh collapsed to about so many vertices; made once for all copies of a body."""
     points = body.v_template.detach().cpu().double().numpy()
     weights = body.weights.detach().cpu().double().numpy()
