@@ -99,11 +99,7 @@ def corrected(scene: Scene, offset: Tensor) -> Scene:
     body_rot[..., limbs, :, :] = turns[..., 1:, :, :] @ scene.body_rot[..., limbs, :, :]
     root = scene.T_world_root
     T_world_root = rigid(turns[..., 0, :, :] @ root[..., :3, :3], root[..., :3, 3] + offset[..., :3])
-    changed = (offset != 0).any(dim=-1)[..., None, None]
-    return scene.replace(
-        body_rot=torch.where(changed[..., None], body_rot, scene.body_rot),
-        T_world_root=torch.where(changed, T_world_root, root),
-    )
+    return scene.with_poses((offset != 0).any(dim=-1), body_rot, T_world_root)
 
 
 def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tensor) -> Tensor:

@@ -105,11 +105,9 @@ def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Ten
         tilt = fade_rotation(tilt, given_at[..., :3, :3], decoded_at[..., :3, :3], fade)
         lift = lift + fade[..., None] * (given_at - decoded_at)[..., :3, 3]
     there = decoded.present[:, None, :, None, None]
-    blended = torch.where(there, T_world_can @ rigid(tilt, lift), T_world_root)
-    return decoded.replace(
-        body_rot=torch.where(keep[..., None, None, None], given.body_rot, body_rot),
-        T_world_root=torch.where(keep[..., None, None], given.T_world_root, blended),
-    )
+    T_world_root = torch.where(there, T_world_can @ rigid(tilt, lift), T_world_root)
+    blended = decoded.replace(body_rot=body_rot, T_world_root=T_world_root)
+    return blended.with_poses(keep, given.body_rot, given.T_world_root)
 
 
 def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
@@ -165,10 +163,8 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
     body_rot, can_root = turned[..., 1:, :, :], rigid(turned[..., 0, :, :], lift + left(moves))
     there = decoded.present[:, None, :, None, None]
     T_world_root = torch.where(there, T_world_can @ can_root, decoded.T_world_root)
-    return decoded.replace(
-        body_rot=torch.where(keep[..., None, None, None], given.body_rot, body_rot),
-        T_world_root=torch.where(keep[..., None, None], given.T_world_root, T_world_root),
-    )
+    blended = decoded.replace(body_rot=body_rot, T_world_root=T_world_root)
+    return blended.with_poses(keep, given.body_rot, given.T_world_root)
 
 
 def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:

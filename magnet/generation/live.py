@@ -341,13 +341,9 @@ class Live:
                 goals = with_keyframes(goals, [self._toward(past, agent, last) for agent in steered])
             made = self.sample(goals, task, CONTEXT, length).replace(given=goals.given)
             source = made.slice(0, CONTEXT + frames)
-        chosen = agents[None, None, :, None, None]
         assert scene.given is not None and source.given is not None
-        return scene.replace(
-            body_rot=torch.where(chosen[..., None], source.body_rot, scene.body_rot),
-            T_world_root=torch.where(chosen, source.T_world_root, scene.T_world_root),
-            given=torch.where(agents, source.given, scene.given),
-        )
+        made = scene.with_poses(agents, source.body_rot, source.T_world_root)
+        return made.replace(given=torch.where(agents, source.given, scene.given))
 
     def _toward(self, past: Scene, agent: int, frame: int) -> Keyframe:
         """A keyframe of one agent: the most upright of its last poses, moved towards its goal as far as it may get."""

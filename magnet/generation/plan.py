@@ -116,9 +116,4 @@ def _repeated(stages: list[Stage], period: int, shift: int, causal: bool) -> Pla
 
 def _moved(a: Stage, b: Stage) -> int | None:
     """By how many rows `b` is later than `a`, if it is the same stage otherwise; else None."""
-    alike = a.ahead == b.ahead and a.levels.shape == b.levels.shape and torch.equal(a.levels, b.levels)
-    if a.visibility is None or b.visibility is None:
-        alike = alike and a.visibility is b.visibility
-    else:
-        alike = alike and torch.equal(a.visibility, b.visibility)
-    return b.start - a.start if alike else None
+    return b.start - a.start if a.same_but_start(b) else None

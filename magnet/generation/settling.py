@@ -47,10 +47,7 @@ def carried_on(scene: Scene, agents: Tensor, frame: int) -> Scene:
         root = held.T_world_root.clone()
         root[..., :3, 3] += far[:, None, None] * pace[:, None]
         held = held.replace(T_world_root=root)
-    return scene.replace(
-        body_rot=torch.where(agents[:, None, None, None], held.body_rot, scene.body_rot),
-        T_world_root=torch.where(agents[:, None, None], held.T_world_root, scene.T_world_root),
-    )
+    return scene.with_poses(agents, held.body_rot, held.T_world_root)
 
 
 def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead: int, decentralized: bool) -> Scene:
@@ -74,10 +71,7 @@ def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead
         one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), slides=0.0, drifting=False)
         far = (body.joints(one) - body.joints(seen)).norm(dim=-1).amax(dim=(1, 3))  # (B, P)
         own = own & (far > WORTH)[:, None]
-        made = made.replace(
-            body_rot=torch.where(own[..., None, None, None], one.body_rot, made.body_rot),
-            T_world_root=torch.where(own[..., None, None], one.T_world_root, made.T_world_root),
-        )
+        made = made.with_poses(own, one.body_rot, one.T_world_root)
     return made.replace(body=scene.body)
 
 
@@ -107,10 +101,7 @@ def settled_block(
     """
     there = known.repeat_interleave(TOKEN_FRAMES, dim=0)
     made = posed(decode(latent, given.betas, deltas), T_world_can, given)
-    made = made.replace(
-        body_rot=torch.where(there[..., None, None, None], given.body_rot, made.body_rot),
-        T_world_root=torch.where(there[..., None, None], given.T_world_root, made.T_world_root),
-    )
+    made = made.with_poses(there, given.body_rot, given.T_world_root)
     moving = new.repeat_interleave(TOKEN_FRAMES, dim=0)
     return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 

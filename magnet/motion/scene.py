@@ -196,6 +196,14 @@ class Scene:
         keep = self.present[:, None, :, None, None]
         return self.replace(T_world_root=torch.where(keep, moved, self.T_world_root))
 
+    def with_poses(self, where: Tensor, body_rot: Tensor, T_world_root: Tensor) -> Scene:
+        """The same with other poses in some places. where: (B, T, P) bool, or what broadcasts to it"""
+        where = where[..., None, None]
+        return self.replace(
+            body_rot=torch.where(where[..., None], body_rot, self.body_rot),
+            T_world_root=torch.where(where, T_world_root, self.T_world_root),
+        )
+
     def save(self, path: str | Path) -> Path:
         """Write all B scenes to one npz that needs no unpickling. Returns the path written."""
         path = Path(path)

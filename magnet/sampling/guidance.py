@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
 
-from magnet.checks import require_number, require_whole
+from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
@@ -48,8 +48,7 @@ class Guidance:
     cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"kind: got {self.kind!r}, expected {' or '.join(get_args(Kind))}")
+        require_choice("kind", self.kind, Kind)
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
         require_number("cond_weight", self.cond_weight, least=0)

@@ -99,12 +99,10 @@ class SamplerOptions:
     def __post_init__(self) -> None:
         if not isinstance(self.guidance, Guidance):
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
-        require_choice("placement", self.placement, Placement)
-        require_choice("apart", self.apart, Separation)
-        require_choice("body_guidance", self.body_guidance, Separation)
-        require_choice("settle", self.settle, Separation)
-        require_choice("solver", self.solver, Solver)
-        require_choice("precision", self.precision, Precision)
+        choices = {"placement": Placement, "solver": Solver, "precision": Precision}
+        choices |= dict.fromkeys(("apart", "body_guidance", "settle"), Separation)
+        for name, known in choices.items():
+            require_choice(name, getattr(self, name), known)
         require_whole("steps", self.steps, 1, LEVELS)
         require_whole("stride", self.stride, 1)
         if self.pyramid_offset is not None:

@@ -52,6 +52,14 @@ class Stage:
         rows = (self.levels[0] != self.levels[-1]).any(dim=1).nonzero()[:, 0]
         return (self.start + int(rows[0]), self.start + int(rows[-1]) + 1) if len(rows) else (self.stop, self.stop)
 
+    def same_but_start(self, other: Stage) -> bool:
+        """Whether another stage does the same, wherever its window begins."""
+        if self.ahead != other.ahead or not torch.equal(self.levels, other.levels):
+            return False
+        if self.visibility is None or other.visibility is None:
+            return self.visibility is other.visibility
+        return torch.equal(self.visibility, other.visibility)
+
     @property
     def decentralized(self) -> bool:
         """Whether some agent does not see what this stage generates of another."""

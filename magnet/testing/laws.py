@@ -155,10 +155,7 @@ def _check_plan(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 
 def _same_stage(a: Stage, b: Stage) -> bool:
-    if (a.visibility is None) != (b.visibility is None) or (a.start, a.ahead) != (b.start, b.ahead):
-        return False
-    alike = a.visibility is None or b.visibility is None or torch.equal(a.visibility, b.visibility)
-    return alike and torch.equal(a.levels, b.levels)
+    return a.start == b.start and a.same_but_start(b)
 
 
 def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:

@@ -141,11 +141,7 @@ class Run:
 
 def replaced(scene: Scene, other: Scene, tokens: Tensor) -> Scene:
     """A scene that goes on otherwise: as the other in some tokens. tokens (N, P) bool"""
-    there = tokens.repeat_interleave(TOKEN_FRAMES, dim=0)[None, :, :, None, None]
-    return scene.replace(
-        body_rot=torch.where(there[..., None], other.body_rot, scene.body_rot),
-        T_world_root=torch.where(there, other.T_world_root, scene.T_world_root),
-    )
+    return scene.with_poses(tokens.repeat_interleave(TOKEN_FRAMES, dim=0), other.body_rot, other.T_world_root)
 
 
 class OtherNoise(NoiseStream):

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.body.capsules import capsule_segments
+from magnet.body.capsules import capsule_segments, nearest_points
 from magnet.body.joints import WRISTS
 from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.metrics.body_depth import DEEP
 from magnet.metrics.penetration import TOUCH, penetration_depth
-from magnet.metrics.skating import PRESETS, TOES
+from magnet.metrics.skating import PRESETS, toe_steps
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -24,11 +24,9 @@ HANDS_TOUCH = 0.2
 
 def standing(before: Array, now: Array, fps: float) -> tuple[Mask, Mask]:
     """Which toes stand, and which of these slide, by the rules of the metric FS. (P, 22, 3) x 2 -> (P, 2) bool x 2"""
-    height, speed = PRESETS["default"]
-    toes = now[:, TOES]
-    low = (toes[..., 1] < height) & (before[:, TOES][..., 1] < height)
-    moved = np.linalg.norm((toes - before[:, TOES])[..., [0, 2]], axis=-1) * fps
-    return low, low & (moved > speed)
+    height, fast = PRESETS["default"]
+    speed, low = toe_steps(torch.from_numpy(np.stack([before, now])), fps, height)
+    return low[0].numpy(), (low & (speed > fast))[0].numpy()
 
 
 def touching(joints: Array) -> Array:
@@ -54,21 +52,11 @@ def penetrations(joints: Array) -> tuple[Array, Array, Array]:
     n, i, j = depth.nonzero(as_tuple=True)
     a, b, radius = capsule_segments(one)
     c, d, _ = capsule_segments(other)
-    place = nearest(a[n, i], b[n, i], c[n, j], d[n, j])
-    return place.numpy(), torch.maximum(radius[i], radius[j]).numpy(), depth[n, i, j].numpy()
+    first, second = nearest_points(a[n, i], b[n, i], c[n, j], d[n, j])
+    return ((first + second) / 2).numpy(), torch.maximum(radius[i], radius[j]).numpy(), depth[n, i, j].numpy()
 
 
 def depth_colours(depths: Array) -> Array:
     """Amber where bodies just count as in each other, at 5 cm, and red from 10 cm on. (M,) metres -> (M, 3)"""
     share = np.clip((depths - TOUCH) / (DEEP - TOUCH), 0.0, 1.0)[:, None]
     return (1 - share) * np.array(SLIDES, dtype=float) + share * np.array(COLLIDES, dtype=float)
-
-
-def nearest(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, d: torch.Tensor, parts: int = 12) -> torch.Tensor:
-    """A place between the nearest points of segments a-b and c-d, to a twelfth of their length. (M, 3) x 4 -> (M, 3)"""
-    share = torch.linspace(0, 1, parts + 1)[:, None]
-    on_first = a[:, None] + share * (b - a)[:, None]  # (M, parts + 1, 3)
-    on_second = c[:, None] + share * (d - c)[:, None]
-    best = torch.cdist(on_first, on_second).flatten(1).argmin(dim=1)
-    each = torch.arange(len(a))
-    return (on_first[each, best // (parts + 1)] + on_second[each, best % (parts + 1)]) / 2

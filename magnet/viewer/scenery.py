@@ -140,7 +140,7 @@ class Marks:
     def contacts(self, before: Array, now: Array) -> tuple[int, int]:
         """Joints of the frame before and of this one, (P, 22, 3). -> feet that stand, hands that touch"""
         stands, slides = marks.standing(before, now, self.fps)
-        feet = now[:, marks.TOES][stands] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.008, 0.0])
+        feet = now[:, TOES][stands] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.008, 0.0])
         colours = np.where(slides[stands][:, None], np.array(SLIDES), np.array(STANDS))
         self.feet.show(feet, colours)
         hands = marks.touching(now)

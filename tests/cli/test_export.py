@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from magnet import cli
 from magnet.body import JOINT_NAMES, PARENTS, load_body, on_floor
 from magnet.export import save_bvh
-from magnet.export.page.rig import world_rotations
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -81,10 +80,11 @@ def test_a_skeleton_of_other_names_pose_unit_and_axis_comes_in(naming, metres, u
     local = Rotation.from_rotvec(spread).as_matrix()
     betas = scene.betas[0, 0]
     eye = torch.eye(4)
+    rest = body.rest_joints(betas)
     rest_at = body.forward_kinematics(torch.from_numpy(local[1:]).float(), eye, betas)
     paths = []
     for p in range(2):
-        turned = world_rotations(scene)[0, :, p].double().numpy()
+        turned = body.bone_chain(scene.body_rot[0, :, p], scene.T_world_root[0, :, p], rest)[0].double().numpy()
         rest_world = np.stack(list(walked(local)))
         arrays = [turned, rest_world, rest_at.double().numpy(), scene.T_world_root[0, :, p, :3, 3].double().numpy()]
         path = stored.with_name(f"{naming}_{p}.bvh")

@@ -114,17 +114,11 @@ def bone_poses(body: Body, scene: Scene) -> tuple[Array, Array]:
     -> turns (T, P, 22, 4) as unit quaternions w x y z, places (T, P, 22, 3) metres; float32
     """
     with torch.no_grad():
-        turns = roma.rotmat_to_unitquat(world_rotations(scene)[0])[..., [3, 0, 1, 2]]
         places = body.joints(scene)[0]
+        rest = body.rest_joints(scene.betas[:, None])
+        turns = body.bone_chain(scene.body_rot, scene.T_world_root, rest)[0][0]
+        turns = roma.rotmat_to_unitquat(turns)[..., [3, 0, 1, 2]]
     return turns.float().cpu().numpy(), places.float().cpu().numpy()
-
-
-def world_rotations(scene: Scene) -> Tensor:
-    """World rotations of all joints. -> (B, T, P, 22, 3, 3)"""
-    found = [scene.T_world_root[..., :3, :3]]
-    for joint in range(1, BODY_JOINTS):
-        found.append(found[PARENTS[joint]] @ scene.body_rot[..., joint - 1, :, :])
-    return torch.stack(found, dim=-3)
 
 
 def bend(rig: Rig, turns: Array, places: Array) -> Array:

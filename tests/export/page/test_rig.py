@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import roma
 import torch
 
 from magnet.body import Body
 from magnet.export.limbs import CAPSULES, STICKS, limbs, turn_to
-from magnet.export.page.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest, world_rotations
+from magnet.export.page.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest
 from magnet.motion.scene import Scene
 
 MILLIMETRE = 1e-3
@@ -67,10 +68,10 @@ def test_turn_to_takes_z_to_the_direction() -> None:
     assert (np.linalg.det(R) > 0).all()
 
 
-def test_world_rotations_of_a_body_at_rest_are_its_pelvis_rotation(duet: Scene) -> None:
+def test_bones_of_a_body_at_rest_are_turned_as_its_pelvis_is(duet: Scene, body: Body) -> None:
     still = duet.replace(body_rot=torch.eye(3).expand_as(duet.body_rot))
-    rotations = world_rotations(still)
-    torch.testing.assert_close(rotations, still.T_world_root[..., None, :3, :3].expand_as(rotations))
+    rotations = roma.unitquat_to_rotmat(torch.from_numpy(bone_poses(body, still)[0])[..., [1, 2, 3, 0]])
+    torch.testing.assert_close(rotations, still.T_world_root[0, ..., None, :3, :3].expand_as(rotations))
 
 
 @pytest.mark.parametrize("style", VIEWS)
