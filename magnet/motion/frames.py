@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.planar import rotate_ground
-from magnet.motion.rotations import about_y, about_y_of, from_6d, to_6d, yaw_of
+from magnet.motion.rotations import from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
 
 UPRIGHT = 1e-3
@@ -27,20 +27,28 @@ UPRIGHT = 1e-3
 def inverse(T_a_b: Tensor) -> Tensor:
     """T_b_a of a rigid transform, exact and cheaper than a matrix inverse. (..., 4, 4) -> (..., 4, 4)
 
-    >>> T_world_ann = rigid(about_y(torch.tensor(1.0)), torch.tensor([2.0, 0.0, 3.0]))
+    >>> T_world_ann = from_planar(torch.tensor(1.0), torch.tensor([2.0, 3.0]))
     >>> torch.allclose(inverse(T_world_ann) @ T_world_ann, torch.eye(4), atol=1e-6)
     True
     """
     R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
-    return rigid(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
+    return _with_last_row(torch.cat([R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])], dim=-1))
 
 
 def rigid(R_a_b: Tensor, t_a_b: Tensor) -> Tensor:
     """T_a_b from a rotation and the origin of b in a. (..., 3, 3), (..., 3) -> (..., 4, 4)"""
-    top = torch.cat([R_a_b, t_a_b[..., None]], dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
-    return torch.cat([top, bottom], dim=-2)
+    return _with_last_row(torch.cat([R_a_b, t_a_b[..., None]], dim=-1))
+
+
+def _with_last_row(top: Tensor) -> Tensor:
+    """(..., 3, 4) -> (..., 4, 4)"""
+    return torch.cat([top, _last_row(top.dtype, top.device).expand(*top.shape[:-2], 1, 4)], dim=-2)
+
+
+@functools.cache
+def _last_row(dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # or training, later, could not use it
+        return torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=dtype, device=device)
 
 
 def to_9d(T_a_b: Tensor) -> Tensor:
@@ -49,7 +57,8 @@ def to_9d(T_a_b: Tensor) -> Tensor:
     >>> to_9d(rigid(torch.eye(3), torch.tensor([0.5, 0.0, 2.0])))
     tensor([1.0000, 0.0000, 0.0000, 0.0000, 1.0000, 0.0000, 0.5000, 0.0000, 2.0000])
     """
-    return torch.cat([to_6d(T_a_b[..., :3, :3]), T_a_b[..., :3, 3]], dim=-1)
+    columns = T_a_b[..., :3, :].transpose(-1, -2)
+    return torch.cat([columns[..., :2, :], columns[..., 3:, :]], dim=-2).flatten(-2)
 
 
 def from_9d(nine: Tensor) -> Tensor:
@@ -60,22 +69,23 @@ def from_9d(nine: Tensor) -> Tensor:
 def to_planar(T_a_b: Tensor) -> tuple[Tensor, Tensor]:
     """Yaw (...) in radians and ground position (..., 2) as (x, z) in metres; height and tilt are dropped.
 
-    >>> yaw, ground = to_planar(rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0])))
+    >>> yaw, ground = to_planar(from_planar(torch.tensor(0.3), torch.tensor([1.0, 2.0])))
     >>> yaw, ground
     (tensor(0.3000), tensor([1., 2.]))
     """
-    return yaw_of(T_a_b[..., :3, :3]), T_a_b[..., [0, 2], 3]
+    return yaw_of(T_a_b[..., :3, :3]), T_a_b[..., 0:3:2, 3]
 
 
 def from_planar(yaw: Tensor, ground: Tensor) -> Tensor:
     """Inverse of `to_planar`. (...), (..., 2) -> (..., 4, 4)"""
-    return _on_ground(about_y(yaw), ground)
+    return _on_ground(yaw.sin(), yaw.cos(), ground)
 
 
-def _on_ground(rotation: Tensor, ground: Tensor) -> Tensor:
-    """(..., 3, 3), (..., 2) -> (..., 4, 4)"""
-    x, z = ground.unbind(-1)
-    return rigid(rotation, torch.stack([x, torch.zeros_like(x), z], dim=-1))
+def _on_ground(sin: Tensor, cos: Tensor, ground: Tensor) -> Tensor:
+    """The transform of a turn about the vertical and a place, number by number. (...), (...), (..., 2) -> (..., 4, 4)"""
+    zero, one, (x, z) = torch.zeros_like(sin), torch.ones_like(sin), ground.unbind(-1)
+    rows = [cos, zero, sin, x, zero, one, zero, zero, -sin, zero, cos, z, zero, zero, zero, one]
+    return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
 
 
 # -- from a scene to what tokens hold ----------------------------------------------------------
@@ -88,17 +98,18 @@ def canonical_frame(T_world_root: Tensor) -> Tensor:
     axis would flip. For a person lying exactly on the side it comes from the forward axis, then horizontal. Each frame
     is computed alone, so that it does not depend on which others are known.
 
-    >>> T_world_root = rigid(about_y(torch.tensor(0.3)), torch.tensor([1.0, 0.9, 2.0]))  # a pelvis 0.9 m up
+    >>> T_world_root = from_planar(torch.tensor(0.3), torch.tensor([1.0, 2.0]))
+    >>> T_world_root[1, 3] = 0.9  # a pelvis 0.9 m up
     >>> canonical_frame(T_world_root)[:3, 3]
     tensor([1., 0., 2.])
     """
     left, forward = T_world_root[..., :3, 0], T_world_root[..., :3, 2]
-    upright = left[..., [0, 2]].norm(dim=-1) >= UPRIGHT
+    upright = left[..., 0:3:2].norm(dim=-1) >= UPRIGHT
     sine = torch.where(upright, -left[..., 2], forward[..., 0])
     cosine = torch.where(upright, left[..., 0], forward[..., 2])
     # No angle is taken: sines, unlike roots, may be rounded otherwise in another place of a batch.
     length = (sine * sine + cosine * cosine).sqrt().clamp_min(1e-12)
-    return _on_ground(about_y_of(sine / length, cosine / length), T_world_root[..., [0, 2], 3])
+    return _on_ground(sine / length, cosine / length, T_world_root[..., 0:3:2, 3])
 
 
 def canonical_deltas(T_world_can: Tensor) -> Tensor:

@@ -56,12 +56,7 @@ def vee(rotation: Tensor) -> Tensor:
 
 def about_y(yaw: Tensor) -> Tensor:
     """Rotation about the vertical axis. (...) radians -> (..., 3, 3)"""
-    return about_y_of(yaw.sin(), yaw.cos())
-
-
-def about_y_of(sin: Tensor, cos: Tensor) -> Tensor:
-    """`about_y` of the angle with this sine and cosine. (...), (...) -> (..., 3, 3)"""
-    zero, one = torch.zeros_like(sin), torch.ones_like(sin)
+    sin, cos, zero, one = yaw.sin(), yaw.cos(), torch.zeros_like(yaw), torch.ones_like(yaw)
     rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
