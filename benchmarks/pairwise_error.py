@@ -20,7 +20,7 @@ from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.evaluation.results import machine
-from magnet.motion.planar import yaw_ground
+from magnet.motion.frames import from_9d, to_planar
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS, add_noise
@@ -48,12 +48,16 @@ def plans(window: int) -> dict[str, tuple[Tensor, slice]]:
 
 def errors(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor, part: slice) -> tuple[float, float, float]:
     """Mean errors: of pairwise transforms in centimetres and degrees, of deltas in millimetres. (B, N, P, D) x 2"""
-    pairs = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2]) for x in (tokens, truth)]
+    pairs = [
+        to_planar(from_9d(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[2])) for x in (tokens, truth)
+    ]
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(pairs[0][0].shape)
     turned = pairs[0][0] - pairs[1][0]
     turned = torch.atan2(turned.sin(), turned.cos()).abs()[there]
     moved = (pairs[0][1] - pairs[1][1]).norm(dim=-1)[there]
-    deltas = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[1])[1] for x in (tokens, truth)]
+    deltas = [
+        to_planar(from_9d(model.layout.unpack(model.normalizer.denormalize(x[:, part]))[1]))[1] for x in (tokens, truth)
+    ]
     stepped = (deltas[0] - deltas[1]).norm(dim=-1)[present[:, None, :, None].expand(deltas[0].shape[:-1])]
     return 100 * float(moved.mean()), float(turned.mean().rad2deg()), 1000 * float(stepped.mean())
 

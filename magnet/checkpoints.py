@@ -174,13 +174,13 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
     # Between the two files' renames a checkpoint has no checksum, never another one's.
     _, digest = write_whole(
         path.parent,
-        lambda _: path.name,
+        path.name,
         lambda out: torch.save(checkpoint, out),
         ready=lambda _: beside.unlink(missing_ok=True),
         advice=advice,
     )
     line = f"{digest}  {path.name}\n".encode()
-    write_whole(path.parent, lambda _: beside.name, lambda out: out.write(line), advice=advice)
+    write_whole(path.parent, beside.name, line, advice=advice)
 
 
 def _read_folder(folder: Path) -> dict[str, Any]:
@@ -218,22 +218,6 @@ def _config_hash(config: dict[str, Any]) -> str:
     """Of all that a config.json says but this hash itself."""
     said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
-
-
-def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
-    """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
-
-    Raises:
-        ValueError: the tokenizer's codes mean something else: it has other codes, statistics or another encoder.
-    """
-    state = dict(checkpoint["state_dict"])
-    for name, value in tokenizer["state_dict"].items():
-        own = f"tokenizer.{name}"
-        if name.startswith("vqvae.decoder."):
-            state[own] = value
-        elif name.startswith(("vqvae.", "quantizer.codes")) and not torch.equal(state[own], value):
-            raise ValueError(f"this decoder belongs to other codes than the denoiser's: {name} differs")
-    return checkpoint | {"state_dict": state, "tokenizer_hyper_parameters": dict(tokenizer["hyper_parameters"])}
 
 
 def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None = None, half: bool = True) -> Path:

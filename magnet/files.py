@@ -97,8 +97,8 @@ class HashedFile:
 
 def write_whole(
     folder: Path,
-    name: Callable[[str], str],
-    write: Callable[[Any], object],
+    name: str | Callable[[str], str],
+    content: bytes | Callable[[Any], object],
     ready: Callable[[str], object] | None = None,
     advice: str = "choose another folder; then run the same command again, which keeps what is finished",
 ) -> tuple[str, str]:
@@ -106,8 +106,8 @@ def write_whole(
 
     Args:
         folder: where; it exists.
-        name: sha256 to the file's name.
-        write: is given something to call `write(bytes)` of.
+        name: the file's, or what makes it of the sha256.
+        content: all bytes, or what is given something to call `write(bytes)` of.
         ready: is called with the sha256 once the file is whole, before it takes its place.
         advice: what to do where the disk is full.
 
@@ -121,7 +121,7 @@ def write_whole(
             with os.fdopen(handle, "wb") as file:
                 hashed = HashedFile(file)
                 try:
-                    write(hashed)
+                    hashed.write(content) if isinstance(content, bytes) else content(hashed)
                 except Exception as error:
                     raise hashed.failed or error from error
                 file.flush()
@@ -130,12 +130,13 @@ def write_whole(
             os.chmod(aside, 0o644)
             if ready is not None:
                 ready(digest)
-            os.replace(aside, folder / name(digest))
+            called = name if isinstance(name, str) else name(digest)
+            os.replace(aside, folder / called)
     except BaseException:
         Path(aside).unlink(missing_ok=True)
         raise
     sync(folder)
-    return name(digest), digest
+    return called, digest
 
 
 def sync(folder: Path) -> None:

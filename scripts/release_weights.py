@@ -14,6 +14,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from magnet import checkpoints, datamodules
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
@@ -62,6 +64,22 @@ def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:
     return {key: json.loads(record.read_text())} if record and record.exists() else {}
 
 
+def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
+    """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
+
+    Raises:
+        ValueError: the tokenizer's codes mean something else: it has other codes, statistics or another encoder.
+    """
+    state = dict(checkpoint["state_dict"])
+    for name, value in tokenizer["state_dict"].items():
+        own = f"tokenizer.{name}"
+        if name.startswith("vqvae.decoder."):
+            state[own] = value
+        elif name.startswith(("vqvae.", "quantizer.codes")) and not torch.equal(state[own], value):
+            raise ValueError(f"this decoder belongs to other codes than the denoiser's: {name} differs")
+    return checkpoint | {"state_dict": state, "tokenizer_hyper_parameters": dict(tokenizer["hyper_parameters"])}
+
+
 def main() -> None:
     """Read, write, say how large it is."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -73,7 +91,7 @@ def main() -> None:
     about = ABOUT | {"recordings": manifest()} | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
     checkpoint = checkpoints.read(given.checkpoint)
     if given.decoder:
-        checkpoint = checkpoints.with_decoder(checkpoint, checkpoints.read(given.decoder))
+        checkpoint = with_decoder(checkpoint, checkpoints.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
     folder = checkpoints.write(checkpoint, given.folder / given.name, without_folders(about))

@@ -19,9 +19,8 @@ import functools
 import io
 import json
 import logging
-import operator
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -176,13 +175,9 @@ def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path
         if not off <= MOST_OFF:
             raise ValueError(f"{file.name}: onnxruntime's numbers differ from torch's by {off:.2g}; nothing is written")
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file.parent, _always(file.name), operator.methodcaller("write", content))
+        write_whole(file.parent, file.name, content)
         written[file] = off
     return written
-
-
-def _always(name: str) -> Callable[[str], str]:
-    return lambda _: name
 
 
 def _difference(content: bytes, inputs: Mapping[str, Tensor], wanted: Sequence[Tensor]) -> float:

@@ -83,7 +83,7 @@ def read_bvh(path: str | Path) -> Bvh:
             if channel.endswith("position"):
                 moved[axis] = values[:, column]
             else:
-                local[:, k] = local[:, k] @ _about(axis, np.radians(values[:, column]))
+                local[:, k] = local[:, k] @ about(axis, np.radians(values[:, column]))
             column += 1
         if moved:
             place[:, k] = _placed(offsets[k], moved, T)
@@ -100,14 +100,14 @@ def _placed(offset: Floats, moved: dict[int, Floats], frames: int) -> Floats:
     return channels + offset if added else channels
 
 
-def _about(axis: int, radians: Floats) -> Floats:
-    """Rotation about x, y or z. (T,) -> (T, 3, 3)"""
+def about(axis: int, radians: Floats) -> Floats:
+    """Rotation about x (0), y or z. (...) -> (..., 3, 3)"""
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.zeros((len(radians), 3, 3))
-    matrix[:, axis, axis] = 1.0
-    matrix[:, i, i] = matrix[:, j, j] = np.cos(radians)
-    matrix[:, j, i] = np.sin(radians)
-    matrix[:, i, j] = -matrix[:, j, i]
+    matrix = np.zeros((*radians.shape, 3, 3))
+    matrix[..., axis, axis] = 1.0
+    matrix[..., i, i] = matrix[..., j, j] = np.cos(radians)
+    matrix[..., j, i] = np.sin(radians)
+    matrix[..., i, j] = -matrix[..., j, i]
     return matrix
 
 

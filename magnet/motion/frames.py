@@ -159,17 +159,6 @@ def pairwise(T_world_can: Tensor, partner: Tensor | None = None) -> Tensor:
     return inverse(T_world_can)[..., None, :, :] @ T_world_partner
 
 
-def propagate_pairwise(T_self_partner: Tensor, deltas: Tensor) -> Tensor:
-    """Each frame's pairwise transform as the frame before and the deltas imply it (right side of paper Eq. 11).
-
-    T_self_partner (..., T, P, P - 1, 4, 4), deltas (..., T, P, 4, 4) -> (..., T - 1, P, P - 1, 4, 4),
-    to be compared with frames 1 to T - 1. On real motion the two are equal.
-    """
-    now = deltas[..., 1:, :, :, :]
-    step_partner = now[..., partners(now.shape[-3], now.device), :, :]
-    return inverse(now)[..., None, :, :] @ T_self_partner[..., :-1, :, :, :, :] @ step_partner
-
-
 def pose_features(scene: Scene) -> Tensor:
     """What the tokenizer sees of a body: 21 joint rotations in 6-D and T_can_root in 9-D. -> (B, T, P, 135)"""
     T_can_root = inverse(canonical_frame(scene.T_world_root)) @ scene.T_world_root

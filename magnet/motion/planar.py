@@ -46,8 +46,3 @@ def unit_ground(nine: Tensor) -> tuple[Tensor, Tensor]:
     """Unit (cos, sin) of the yaw and ground position of a transform in 9-D. (..., 9) -> (..., 2) x 2"""
     unit = torch.stack([nine[..., 0], -nine[..., 2]], dim=-1)
     return F.normalize(unit, dim=-1, eps=1e-6), nine[..., [6, 8]]
-
-
-def yaw_ground(nine: Tensor) -> tuple[Tensor, Tensor]:
-    """Yaw and ground position of a transform in 9-D that is about planar. (..., 9) -> (...), (..., 2)"""
-    return torch.atan2(-nine[..., 2], nine[..., 0]), nine[..., [6, 8]]

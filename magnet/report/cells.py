@@ -145,7 +145,7 @@ class Store:
         text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
         path = self.path(cell)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path.parent, lambda _: path.name, lambda file: file.write(text.encode()))
+        write_whole(path.parent, path.name, text.encode())
         self.kept[cell.name] = json.loads(text)
         return self.kept[cell.name]
 

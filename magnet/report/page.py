@@ -189,4 +189,4 @@ def _safe(name: str) -> str:
 
 def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path.parent, lambda _: path.name, lambda file: file.write(text.encode()))
+    write_whole(path.parent, path.name, text.encode())

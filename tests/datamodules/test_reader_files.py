@@ -16,7 +16,7 @@ import pytest
 
 from magnet import cli
 from magnet.datamodules import registry
-from magnet.datamodules.fakes.remocap import write_fits
+from magnet.datamodules.fakes.remocap import scenes, write_fitted_scenes
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob, content, take_key
 from tests.cases import some_slow
@@ -141,7 +141,7 @@ def test_a_users_list_needs_none_of_the_data_sets_own(
     monkeypatch.chdir(tmp_path)
     registry.reader(name).write_fake(Path("dl"), 1 if name == "duobox" else 4, 100)
     if root == "fits":
-        write_fits(Path("fits"), frames=60)
+        write_fitted_scenes(Path("fits"), scenes(4, 60, 0))
     takes = registry.reader(name)(root).found()
     used = {path for take in takes for path in take.files}
     for path in [path for path in Path(root).rglob("*") if path.suffix in (".txt", ".csv") and path not in used]:

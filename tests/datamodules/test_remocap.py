@@ -25,7 +25,7 @@ TOTAL = fake.length(FRAMES)
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("fits")
-    fake.write_fits(root, takes=4, frames=FRAMES)
+    fake.write_fitted_scenes(root, fake.scenes(4, FRAMES, 0))
     return root
 
 

@@ -10,13 +10,13 @@ from magnet.motion.frames import (
     from_9d,
     from_planar,
     pairwise,
-    propagate_pairwise,
     to_9d,
 )
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, pairwise_by_token, scene_transforms
 from magnet.sampling.noise import alpha_bar
+from tests.equations import propagate_pairwise
 
 LAYOUT = TokenLayout(latent=8, agents=3)
 

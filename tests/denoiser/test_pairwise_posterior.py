@@ -9,12 +9,12 @@ from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import KNOTS, SHARPEST, SHARPEST_DELTA, PairwisePosterior
-from magnet.motion.frames import from_9d, propagate_pairwise
-from magnet.motion.planar import yaw_ground
+from magnet.motion.frames import from_9d, to_planar
 from magnet.motion.pose_graph import GAUGE
 from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
 from magnet.testing import random_scene, reordered, tiny_denoiser
+from tests.equations import propagate_pairwise
 
 Shown = tuple[Tensor, Tensor, Tensor]
 
@@ -44,7 +44,7 @@ def shown(model: Denoiser, level: int, people: int = 3, off: float = 0.1, seed: 
 def error(model: Denoiser, tokens: Tensor, truth: Tensor, present: Tensor) -> float:
     """Mean distance in metres between where partners are seen and where they are."""
     there = model.layout.group_present(present)[:, None, :, 1:, None].expand(-1, tokens.shape[1], -1, -1, 4)
-    each = [yaw_ground(model.layout.unpack(model.normalizer.denormalize(x))[2])[1] for x in (tokens, truth)]
+    each = [to_planar(from_9d(model.layout.unpack(model.normalizer.denormalize(x))[2]))[1] for x in (tokens, truth)]
     return float((each[0] - each[1]).norm(dim=-1)[there].mean())
 
 
@@ -137,7 +137,7 @@ def test_absent_people_change_nothing(model: Denoiser):
 def test_both_ends_say_the_same_of_a_pair(model: Denoiser):
     _, guess, noisy, levels, present = shown(model, 100)
     better = PairwisePosterior(model.layout)(guess, noisy, levels, present, model.normalizer)
-    yaw, ground = yaw_ground(model.layout.unpack(model.normalizer.denormalize(better))[2])  # (B, N, P, 2, 4)
+    yaw, ground = to_planar(from_9d(model.layout.unpack(model.normalizer.denormalize(better))[2]))  # (B, N, P, 2, 4)
     assert torch.allclose(torch.cos(yaw[:, :, 0, 0] + yaw[:, :, 1, 0]), torch.ones(()), atol=1e-4)
     assert torch.allclose(ground[:, :, 0, 0].norm(dim=-1), ground[:, :, 1, 0].norm(dim=-1), atol=1e-4)
 
@@ -260,7 +260,9 @@ def test_it_is_the_answer_of_a_dense_least_squares(model: Denoiser, people: list
 
     def planar(tokens: Tensor) -> np.ndarray:
         _, deltas, pairs = layout.unpack(tokens[:1].double())
-        yaw, ground = yaw_ground(torch.cat([by_frame(deltas)[:, :, :, None], pairwise_by_frame(pairs)], dim=3)[0])
+        yaw, ground = to_planar(
+            from_9d(torch.cat([by_frame(deltas)[:, :, :, None], pairwise_by_frame(pairs)], dim=3)[0])
+        )
         each, whole = torch.cat([yaw[..., None], ground], dim=-1).numpy(), np.zeros((32, 3, 3, 3))
         for p in range(3):
             whole[:, p, [p, *(q for q in range(3) if q != p)]] = each[:, p]

@@ -5,9 +5,10 @@ import torch
 
 from magnet.denoiser.options import SelfForcing
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
-from magnet.motion.frames import canonical_frame, from_9d, inverse, propagate_pairwise
+from magnet.motion.frames import canonical_frame, from_9d, inverse
 from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.testing import random_scene, tiny_denoiser
+from tests.equations import propagate_pairwise
 
 PAST = 4
 N = 8

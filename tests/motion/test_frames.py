@@ -15,7 +15,6 @@ from magnet.motion.frames import (
     partners,
     pose_features,
     posed,
-    propagate_pairwise,
     rigid,
     to_9d,
     to_planar,
@@ -24,6 +23,7 @@ from magnet.motion.placement import place
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_frame, pairwise_by_frame, scene_transforms
 from magnet.testing import random_scene
+from tests.equations import propagate_pairwise
 
 PLACEMENTS = ["integrate", "anchor", "fuse"]
 

@@ -1,10 +1,12 @@
 import json
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
 
 from magnet import checkpoints
+from tests.scripts import module_at
 
 
 @pytest.fixture
@@ -88,10 +90,11 @@ def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoi
     checkpoint["state_dict"] |= {f"tokenizer.{name}": value for name, value in old.items()}
     new = {"vqvae.decoder.b": torch.randn(3), "quantizer.ema_count": torch.randn(3)}
     tokenizer = {"state_dict": old | new, "hyper_parameters": {"decoder_only": True}}
-    state = checkpoints.with_decoder(checkpoint, tokenizer)["state_dict"]
+    with_decoder = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").with_decoder
+    state = with_decoder(checkpoint, tokenizer)["state_dict"]
     changed = [name for name, value in state.items() if not torch.equal(checkpoint["state_dict"][name], value)]
     assert changed == ["tokenizer.vqvae.decoder.b"]
     for name in ("vqvae.encoder.a", "vqvae.pose.mean", "quantizer.codes"):
         other = tokenizer["state_dict"] | {name: torch.randn(3)}
         with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
-            checkpoints.with_decoder(checkpoint, tokenizer | {"state_dict": other})
+            with_decoder(checkpoint, tokenizer | {"state_dict": other})

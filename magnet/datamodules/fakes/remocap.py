@@ -129,11 +129,6 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
             _write_person(folder, shown, person)
 
 
-def write_fits(out: Path, takes: int = 4, frames: int = 90, seed: int = 0) -> None:
-    """Write ready fits of the same takes: NUMBER.npz with arrays (2, T, ..)."""
-    write_fitted_scenes(out, scenes(takes, frames, seed))
-
-
 def write_fitted_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
     """Ready fits of any motions by take."""
     out.mkdir(parents=True, exist_ok=True)

@@ -192,7 +192,7 @@ class ConvertedTake:
             for array in (text, self.betas, self.rows):
                 np.lib.format.write_array(out, array, allow_pickle=False)
 
-        write_whole(path.parent, lambda _: path.name, write)
+        write_whole(path.parent, path.name, write)
 
     def saved(self, path: Path) -> ConvertedTake:
         """Write it, and return it without its rows."""

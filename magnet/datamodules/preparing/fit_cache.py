@@ -103,9 +103,9 @@ class FitCache:
             report = {"take": take.name, **report_of(fitted)}
             scene = fitted.fit.scene.replace(names=(take.name,))
             content = _saved(scene)
-            write_whole(self.folder, lambda _: target.name, lambda out: out.write(content), advice=ADVICE)
+            write_whole(self.folder, target.name, content, advice=ADVICE)
         text = json.dumps(report, indent=1).encode()
-        write_whole(self.folder, lambda _: target.with_suffix(".json").name, lambda out: out.write(text), advice=ADVICE)
+        write_whole(self.folder, target.with_suffix(".json").name, text, advice=ADVICE)
 
 
 def _saved(scene: Scene) -> bytes:

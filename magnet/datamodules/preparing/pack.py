@@ -105,7 +105,7 @@ def pack(
         "notes": [{"note": note, "takes": takes} for note, takes in by_first(notes)],
         "persons": [{"persons": names, "takes": takes} for names, takes in by_first(persons) if names],
     }
-    write_whole(out, lambda _: MANIFEST, lambda file: file.write(as_json(manifest)))
+    write_whole(out, MANIFEST, as_json(manifest))
     return places
 
 

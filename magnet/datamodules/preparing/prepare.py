@@ -271,7 +271,7 @@ def remembered(state: Path, old: StoreReader | None) -> dict[str, Any]:
 
 def remember(state: Path, folder: StoreReader, done: dict[str, Any]) -> None:
     facts = {"manifest": file_hash(folder.path / MANIFEST), "takes": done}
-    write_whole(state, lambda _: "state.json", lambda out: out.write(as_json(facts)))
+    write_whole(state, "state.json", as_json(facts))
 
 
 OURS = re.compile(r"((train|val|test)-\d{5}|clips|betas)-[0-9a-f]{8}\.(npy|json)|\.new-.*")

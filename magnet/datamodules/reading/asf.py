@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from magnet.datamodules.reading.arrays import AGAIN
 from magnet.errors import DataError
+from magnet.export.bvh_read import about
 
 Floats = NDArray[np.float64]
 
@@ -39,22 +41,10 @@ class AsfSkeleton:
         return {name: len(dofs) for name, dofs in zip(self.names, self.dofs, strict=True) if dofs}
 
 
-def rotation_about(letter: str, radians: Floats) -> Floats:
-    """Rotation about x, y or z. (...) -> (..., 3, 3)"""
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[letter]
-    matrix = np.zeros((*radians.shape, 3, 3))
-    matrix[..., :, :] = np.eye(3)
-    cos, sin = np.cos(radians), np.sin(radians)
-    matrix[..., i, i], matrix[..., i, j], matrix[..., j, i], matrix[..., j, j] = cos, -sin, sin, cos
-    return matrix
-
-
 def euler(radians: Floats, order: str) -> Floats:
     """Rotation about fixed axes in `order`, which "xyz" makes Rz Ry Rx. (..., 3) of x, y, z -> (..., 3, 3)"""
-    matrix = rotation_about(order[0], radians[..., "xyz".index(order[0])])
-    for letter in order[1:]:
-        matrix = rotation_about(letter, radians[..., "xyz".index(letter)]) @ matrix
-    return matrix
+    axes = map("xyz".index, order)
+    return functools.reduce(lambda turned, axis: about(axis, radians[..., axis]) @ turned, axes, np.eye(3))
 
 
 # -- reading -----------------------------------------------------------------------------------
