@@ -297,7 +297,9 @@ class Model:
         targets = _slots("agent", agent)
         if not targets:
             raise ValueError("agent: got none; name who is to be filled in")
-        scene = self._with_room(scene, max(targets) + 1)
+        if max(targets) >= self.most_people:
+            raise ValueError(f"agent {max(targets)}: the model takes agents 0 to {self.most_people - 1}")
+        scene = scene.pad_agents(max(*targets, scene.agents - 1) + 1)
         slots = list(targets)
         present, betas = scene.present.clone(), torch.where(scene.present[..., None], scene.betas, 0.0)
         if shape is not None:
@@ -380,11 +382,6 @@ class Model:
             require_whole("seed", seed, most=2**63 - 1)
         generator.manual_seed(seed) if seed is not None else generator.seed()
         return generator
-
-    def _with_room(self, scene: Scene, slots: int) -> Scene:
-        if slots > self.most_people:
-            raise ValueError(f"agent {slots - 1}: the model takes agents 0 to {self.most_people - 1}")
-        return scene.pad_agents(max(slots, scene.agents))
 
 
 def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,9 +121,3 @@ def _replace_at(options: Options, path: list[str], value: str) -> None:
     named = old.get("class_path") if isinstance(old, dict) else None
     if isinstance(old, list) or (isinstance(named, str) and not value.startswith("{") and not same_class(named, value)):
         del within[path[-1]]
-
-
-def known_path(classes: Mapping[str, type], name: str) -> str:
-    """The dotted path of a class by its short name; a dotted path is itself."""
-    kind = classes.get(name)
-    return name if kind is None else f"{kind.__module__}.{kind.__qualname__}"

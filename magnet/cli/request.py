@@ -75,7 +75,11 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
-    task = chosen_task(command, fields, settled) if command in SAMPLING else None
+    task = None
+    if command in SAMPLING:
+        specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
+        named = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
+        task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
     layers = [each.text() for each in settled.layers if each.options]
     return Request(command, words, layers, checkpoint, folder, settled.classes, task)
 
@@ -99,17 +103,6 @@ def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
         return None
     folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
     return checkpoint_config.find_checkpoint(name, folders)
-
-
-def chosen_task(command: str, flags: list[str], settled: class_options.Settled) -> TaskChoice:
-    """What is sampled: the task that wins, its options from files and above them from flags.
-
-    Raises:
-        CommandError: no such task or option, or a value that does not fit.
-    """
-    name = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
-    below = [class_options.spec_of(layer.options.pop("task", None)).get("init_args") or {} for layer in settled.layers]
-    return parse_task(name, flags, below, command)
 
 
 def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:

@@ -245,7 +245,9 @@ def show_task(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         raise CommandError(f"say which task: magnet tasks show NAME; there are {', '.join(registry.names())}")
     name, *rest = arguments
-    task, shown = parse_shown(name, rest)
+    kind = task_class(name)
+    fields = read_fields(show_parser(kind), rest, (), f"magnet tasks show {name} --help")
+    task, shown = kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
     grid = Grid(*sizes, noise_sampling=shown.noise_sampling)
     schedule = task.schedule(grid)
@@ -267,14 +269,3 @@ def show_parser(task: type | None) -> ArgumentParser:
     parser = task_parser(task, prog="magnet tasks show NAME", description="Draw a task's schedule.")
     parser.add_class_arguments(Shown, as_group=False)
     return parser
-
-
-def parse_shown(name: str, arguments: list[str]) -> tuple[Task, Shown]:
-    """The task and the sizes that a command line asks for.
-
-    Raises:
-        CommandError: no such task, an option that neither has, or a value that does not fit.
-    """
-    kind = task_class(name)
-    fields = read_fields(show_parser(kind), arguments, (), f"magnet tasks show {name} --help")
-    return kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})

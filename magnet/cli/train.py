@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, class_options, optimizers, outputs, run_folder
+from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_folder
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
@@ -214,7 +214,9 @@ class MagnetCLI(LightningCLI):
 
     def _default_class(self, parser: Parser, key: str, otherwise: str | None) -> None:
         """Make the class that wins the default, so that no other class's defaults come first."""
-        path = class_options.known_path(parser.classes[key], self.request.classes.get(key, otherwise or ""))
+        name = self.request.classes.get(key, otherwise or "")
+        kind = parser.classes[key].get(name)
+        path = name if kind is None else f"{kind.__module__}.{kind.__qualname__}"
         try:
             there = checkpoint_config.class_named(path) is not None
         except ImportError:

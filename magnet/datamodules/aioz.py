@@ -67,7 +67,8 @@ class AIOZReader(Reader):
         names = {take.name for take in self.found()}
         if (self.root / LIST).is_file():
             names &= set(map(_listed, open_names(self.root / LIST)))
-        return {name: hashed_split(_video(name)) for name in names}
+        # Sequences are named after their video, first and last frame: x_100_400 is of x.
+        return {name: hashed_split(re.sub(r"_\d+_\d+$", "", name)) for name in names}
 
     def read(self, take: Take) -> Recording:
         """All dancers at 30 fps, y up, of the mean shape."""
@@ -106,11 +107,6 @@ class AIOZReader(Reader):
 def _listed(line: str) -> str:
     """The first column without an extension."""
     return line.split(",")[0].strip().removesuffix(".pkl")
-
-
-def _video(name: str) -> str:
-    """A sequence is named after its video, first and last frame: x_100_400 -> x."""
-    return re.sub(r"_\d+_\d+$", "", name)
 
 
 @register_data()

@@ -96,13 +96,9 @@ def plan_views(groups: list[Array], camera: Camera, size: Size, fps: float) -> l
     groups: for each picture (T, M, 22, 3) joints of all who must be seen. size: pixels. -> for each group T views.
     """
     first = groups[0]
-    if all(joints.shape[0] == first.shape[0] and _starts_alike(joints, first) for joints in groups):
+    if all(joints.shape == first.shape and np.abs(joints[0] - first[0]).max() < 0.1 for joints in groups):
         return _plan(groups, camera, size, fps)
     return [_plan([joints], camera, size, fps)[0] for joints in groups]
-
-
-def _starts_alike(a: Array, b: Array) -> bool:
-    return a.shape == b.shape and bool(np.abs(a[0] - b[0]).max() < 0.1)
 
 
 def _plan(groups: list[Array], camera: Camera, size: Size, fps: float) -> list[list[View]]:

@@ -65,7 +65,8 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     counts = keep[frames] & scene.present[:, None]  # (B, F, P)
     if not bool(counts.any()):
         return
-    _refuse(~_finite(part) & counts, frames, scene, "is not finite: leave such frames out, or fill them in")
+    finite = part.body_rot.flatten(3).isfinite().all(-1) & part.T_world_root.flatten(3).isfinite().all(-1)  # (B, F, P)
+    _refuse(~finite & counts, frames, scene, "is not finite: leave such frames out, or fill them in")
     _refuse(
         ~_rigid(part) & counts,
         frames,
@@ -85,11 +86,6 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
             "model's floor: move them there with magnet.on_floor(scene) or magnet export --on_floor; if they really "
             "are off the floor, give any_floor=True (--sampler.any_floor true)"
         )
-
-
-def _finite(scene: Scene) -> Tensor:
-    """(B, T, P) bool"""
-    return scene.body_rot.flatten(3).isfinite().all(-1) & scene.T_world_root.flatten(3).isfinite().all(-1)
 
 
 def _rigid(scene: Scene) -> Tensor:

@@ -42,12 +42,6 @@ def pearson(sums: Tensor) -> Correlation:
     return Correlation(value.clamp(-1, 1), moves)
 
 
-def paired_coordinates(joints: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """The same 63 coordinates of both of two people. (..., P, 22, 3), (Q,) x 2 -> (..., Q, 63) x 2"""
-    flat = without_pelvis(joints).flatten(-2)
-    return flat[..., first, :], flat[..., second, :]
-
-
 class MotionInteraction(MotionMetric):
     """`mi`: difference between the agents' correlation as generated and as recorded; 0 is best.
 
@@ -100,8 +94,10 @@ class MotionInteraction(MotionMetric):
         pair = second * (second - 1) // 2 + first
         taken = futures.truth.new_zeros(len(pair), 2, *((2,) if self.per_clip else (63, 6)))
         for which, joints in [(1, futures.truth), *((0, sample) for sample in futures.generated)]:
-            x, y = paired_coordinates(joints, first, second)
-            sums = correlation_sums(x, y, counts[..., None], dim=1)  # (B, Q, 63, 6)
+            flat = without_pelvis(joints).flatten(-2)  # (B, T, P, 63)
+            sums = correlation_sums(
+                flat[..., first, :], flat[..., second, :], counts[..., None], dim=1
+            )  # (B, Q, 63, 6)
             if self.per_clip:
                 correlation = pearson(sums)  # (B, Q, 63)
                 some = counts.any(dim=1)[:, :, None]

@@ -16,17 +16,6 @@ from magnet.motion.tokens import TOKEN_FRAMES
 ORDERS = {"border_acceleration": 2, "border_jerk": 3}
 
 
-def pelvis_difference(joints: Tensor, order: int) -> Tensor:
-    """Length of the pelvis's second or third difference. (..., T, P, 22, 3) -> (..., T - order, P) metres"""
-    return joints[..., 0, :].diff(n=order, dim=-3).norm(dim=-1)
-
-
-def at_borders(frames: int, order: int, stride: int = TOKEN_FRAMES) -> Tensor:
-    """Which differences have frames of two tokens; the first token begins at frame 0. -> (frames - order,) bool"""
-    first = torch.arange(max(frames - order, 0))
-    return first // stride != (first + order) // stride
-
-
 class TokenBorders(MotionMetric):
     """`border_acceleration` and `border_jerk`: those of the pelvis at token borders, divided by those inside tokens.
 
@@ -68,9 +57,10 @@ class TokenBorders(MotionMetric):
         for n, order in enumerate(ORDERS.values()):
             if futures.frames <= order:
                 continue
-            length = pelvis_difference(futures.generated, order)  # (S, B, T - order, P)
+            length = futures.generated[..., 0, :].diff(n=order, dim=-3).norm(dim=-1)  # (S, B, T - order, P)
             counts = futures.spans(order + 1)
-            border = at_borders(futures.frames, order, self.stride).to(counts.device)[:, None]
+            first = torch.arange(futures.frames - order, device=counts.device)
+            border = (first // self.stride != (first + order) // self.stride)[:, None]  # spans frames of two tokens
             for where, there in enumerate((counts & ~border, counts & border)):
                 self.sums[n, where, 0] += torch.where(there, length, 0.0).sum()
                 self.sums[n, where, 1] += there.sum() * futures.samples

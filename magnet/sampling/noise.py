@@ -194,7 +194,9 @@ class NoiseStream:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
         require_number("eta", self.eta, 0, 1)
         # Drawn once, so that the noise of a step depends on its place alone, not on the order of the calls.
-        self._seeds = self._draw_seeds() if self.eta else []
+        each = self.generator if isinstance(self.generator, Sequence) else [self.generator]
+        drawn = (torch.randint(2**62, (), generator=g, device=self.device) for g in each if self.eta)
+        self._seeds = [int(seed) for seed in drawn]  # one number, or one for each scene where each has a generator
         self._again = torch.Generator(device=self.device)  # seeded anew for each draw
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
@@ -234,8 +236,3 @@ class NoiseStream:
                 new = torch.randn(each, P, D, generator=self._again, device=self.device, dtype=self.dtype)
                 noise[scenes, row] = new if where is None else torch.where(where, new, noise[scenes, row])
         return noise
-
-    def _draw_seeds(self) -> list[int]:
-        """One number, or one for each scene where each has a generator."""
-        generators = self.generator if isinstance(self.generator, Sequence) else [self.generator]
-        return [int(torch.randint(2**62, (), generator=g, device=self.device)) for g in generators]

@@ -386,13 +386,9 @@ class Tokenizer(L.LightningModule):
             ValueError: the file is no such checkpoint, or a weight's shape does not fit its fields; says which.
         """
         fields, state = read_checkpoint(path)
-        fields = {name: value for name, value in fields.items() if name in _fields()}
-        tokenizer = cls(**fields)
+        known = inspect.signature(Tokenizer.__init__).parameters
+        tokenizer = cls(**{name: value for name, value in fields.items() if name in known})
         expected = tokenizer.state_dict()
         check_weights(Path(path), state, expected, shaping(tokenizer.hparams))
         tokenizer.load_state_dict({name: state[name] for name in expected})
         return tokenizer.eval()
-
-
-def _fields() -> list[str]:
-    return list(inspect.signature(Tokenizer.__init__).parameters)[1:]

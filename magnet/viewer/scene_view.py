@@ -90,7 +90,9 @@ class SceneView:
             self.shades.clear()
         if (render.style == "body") == self.plainly_lit:
             self.plainly_lit = not self.plainly_lit
-            light_up(self.server, self.plainly_lit)
+            plain = self.plainly_lit  # ambient light is much cheaper than an environment map without a GPU
+            self.server.scene.configure_environment_map(None if plain else "city")  # viser's own, which it sends whole
+            self.server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)
 
     def _people_in(self, style: Style, ghosts: bool) -> PeopleView:
         if (style, ghosts) not in self.mesh_cache:
@@ -146,9 +148,3 @@ class SceneView:
     def set_visible(self, on: bool) -> None:
         """Leave the stage, or come back."""
         self.root.visible = on
-
-
-def light_up(server: Any, plain: bool) -> None:
-    """Light from an environment map, or ambient light, which is much cheaper without a GPU."""
-    server.scene.configure_environment_map(None if plain else "city")  # viser's own choice, which it sends whole
-    server.scene.add_light_ambient("/even_light", intensity=EVEN, visible=plain)

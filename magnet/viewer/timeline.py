@@ -62,7 +62,8 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
                     f'<svg x="{100 * (frame + 2) / frames:.2f}%" y="{top + TRACK / 2}" overflow="visible">'
                     f'<path d="M0 -6L6 0L0 6L-6 0Z" fill="{KEY}" stroke="white"/></svg>'
                 )
-    for second in range(0, int(frames / fps) + 1, _every(frames / fps)):
+    every = next((step for step in (1, 2, 5, 10, 30, 60, 300) if frames / fps / step <= 12), 600)  # some ten marks
+    for second in range(0, int(frames / fps) + 1, every):
         left = 100 * second * fps / frames
         parts.append(f'<text x="{left:.2f}%" y="{height + 9}" font-size="10" fill="#8a92a3">{second} s</text>')
     bar(now, now + max(frames / 500, 0.4), 0, height, NOW)
@@ -70,11 +71,6 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
         f'<div style="padding:6px {EDGE}px 0"><svg width="100%" height="{height + 12}" '
         f'role="img" aria-label="timeline">{"".join(parts)}</svg></div>'
     )
-
-
-def _every(seconds: float) -> int:
-    """Seconds between two marks, so that some ten fit."""
-    return next((step for step in (1, 2, 5, 10, 30, 60, 300) if seconds / step <= 12), 600)
 
 
 class Timeline:

@@ -97,7 +97,9 @@ def download_cmu(
         raise ValueError(f"base_url: got {base_url!r}, expected an address that begins with http:// or https://")
     base_url, folder, retries = base_url.rstrip("/"), Path(out).expanduser(), retries or Retries()
     folder.mkdir(parents=True, exist_ok=True)
-    manifest, tested = _read_manifest(folder / MANIFEST), known_hashes()
+    listed = folder / MANIFEST
+    manifest = _hashes(listed.read_text(encoding="utf-8", errors="replace")) if listed.is_file() else {}
+    tested = known_hashes()
     fetched: list[str] = []
     kept: list[str] = []
     unlike: list[str] = []
@@ -322,10 +324,6 @@ def _whole(path: Path, known: str | None) -> bool:
     if not path.is_file():
         return False
     return file_hash(path) == known if known else not unsound(path, path.suffix)
-
-
-def _read_manifest(path: Path) -> dict[str, str]:
-    return _hashes(path.read_text(encoding="utf-8", errors="replace")) if path.is_file() else {}
 
 
 def _hashes(text: str) -> dict[str, str]:
