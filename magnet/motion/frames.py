@@ -82,7 +82,7 @@ def from_planar(yaw: Tensor, ground: Tensor) -> Tensor:
 
 
 def _on_ground(sin: Tensor, cos: Tensor, ground: Tensor) -> Tensor:
-    """The transform of a turn about the vertical and a place, number by number. (...), (...), (..., 2) -> (..., 4, 4)"""
+    """A turn about the vertical and a place, number by number. (...), (...), (..., 2) -> (..., 4, 4)"""
     zero, one, (x, z) = torch.zeros_like(sin), torch.ones_like(sin), ground.unbind(-1)
     rows = [cos, zero, sin, x, zero, one, zero, zero, -sin, zero, cos, z, zero, zero, zero, one]
     return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
