@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from magnet.motion.frames import partners
 from magnet.motion.planar import conjugate, multiply, rotate_by, unit_ground
-from magnet.motion.tokens import TokenLayout, by_frame, pairwise_by_frame
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
 from magnet.tokenizer.losses import masked_mean
 
@@ -93,6 +93,28 @@ def near_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, 
     error = _soft_length(away, FINE_GROUND) + _soft_length(angle, FINE_YAW)
     signal = alpha_bar(levels[..., 1:])[..., None]
     return masked_mean(signal * error / (NEAR + true_shift.norm(dim=-1)), there[..., 1:, None])
+
+
+SHAKE_GROUND, SHAKE_YAW = 0.002, 0.01
+"""Metres and radians a frame by which deltas of recordings change from one frame to the next, roughly."""
+
+
+def shake_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor) -> Tensor:
+    """Error of how deltas change from frame to frame, also from token to token (ours).
+
+    A millimetre of noise in a delta is little beside what deltas differ by, and makes people tremble: beside what they
+    change by from frame to frame it is much. Huber loss in units of `SHAKE_GROUND` and `SHAKE_YAW`.
+
+    clean, truth (B, N, P, D) in real units, there as in `token_losses` -> ()
+    """
+    turn, shift = unit_ground(by_frame(layout.unpack(clean)[1]))  # (B, T, P, 2) each
+    true_turn, true_shift = unit_ground(by_frame(layout.unpack(truth)[1]))
+    yaw = multiply(conjugate(true_turn), turn)[..., 1:]
+    error = torch.cat([(shift - true_shift) / SHAKE_GROUND, yaw / SHAKE_YAW], dim=-1)[:, 1:]  # the first is arbitrary
+    counts = there[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)[:, 1:]
+    change = error[:, 1:] - error[:, :-1]
+    huber = F.smooth_l1_loss(change, torch.zeros_like(change), reduction="none").mean(-1)
+    return masked_mean(huber, counts[:, 1:] & counts[:, :-1])
 
 
 def _soft_length(square: Tensor, fine: float) -> Tensor:

@@ -14,7 +14,7 @@ from magnet.checks import require_choice
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.levels import draw_levels
-from magnet.denoiser.losses import consistency_losses, near_loss, snr_weights, token_losses
+from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
@@ -27,7 +27,7 @@ from magnet.precision import dtype_of
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.training.optim import adamw_cosine
+from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
 
 Target = Literal["quantized", "continuous"]
@@ -52,7 +52,7 @@ class Denoiser(TokenModel):
         noise: noise levels in training.
         loss: weights of the terms.
         self_forcing: training on a past that the model has made itself.
-        optimizer: AdamW.
+        optimizer: AdamW, or Muon for matrices.
         compile: compile the transformer's blocks for training; worth it on a GPU, not on a CPU.
         seed: all training noise follows from it.
     """
@@ -229,8 +229,11 @@ class Denoiser(TokenModel):
         snr = snr_weights(group_levels, weight.snr_gamma) if weight.weighting == "min_snr" else None
         losses = token_losses(clean, truth, layout, there, snr)
         total = weight.latent * losses["latent"] + weight.delta * losses["delta"]
+        predicted = self.normalizer.denormalize(clean)
+        if weight.shake:
+            losses["shake"] = shake_loss(predicted, tokens, layout, there)
+            total = total + weight.shake * losses["shake"]
         if layout.slots:
-            predicted = self.normalizer.denormalize(clean)
             rotation, translation = consistency_losses(predicted, layout, there)
             losses["consistency"] = rotation + translation
             ramp = min(1.0, (self.global_step + 1) / max(weight.consistency_warmup, 1)) if self.training else 1.0
@@ -280,4 +283,4 @@ class Denoiser(TokenModel):
         if self.posterior is not None:
             parts.append(self.posterior)
         trained = [parameter for part in parts for parameter in part.parameters()]
-        return adamw_cosine(self, trained, self.optimizer)
+        return warmup_cosine(self, trained, self.optimizer)

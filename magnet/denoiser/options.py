@@ -106,6 +106,7 @@ class DenoiserLoss:
         consistency_warmup: training steps over which lambda_3 grows from 0.
         near: error of pairwise transforms in which centimetres near a partner count (ours); see
             `magnet.denoiser.losses.near_loss`.
+        shake: error of how deltas change from frame to frame (ours); see `magnet.denoiser.losses.shake_loss`.
         unfused: weight of the same three terms on the network's own deltas and pairwise transforms, where
             `network.pairwise_posterior` replaces them (ours).
         joint: distance of the decoded joints, in metres (ours); see `magnet.denoiser.body_losses`.
@@ -124,6 +125,7 @@ class DenoiserLoss:
     consistency: float = 0.1
     consistency_warmup: int = 1000
     near: float = 0.0
+    shake: float = 0.0
     unfused: float = 0.5
     joint: float = 0.0
     velocity: float = 0.0

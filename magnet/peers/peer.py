@@ -24,7 +24,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive, step_generator
 from magnet.tasks.base import Task
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.training.optim import adamw_cosine
+from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
 
 
@@ -138,7 +138,7 @@ class Peer(TokenModel):
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()
-        return adamw_cosine(self, [each for each in self.parameters() if each.requires_grad], self.optimizer)
+        return warmup_cosine(self, [each for each in self.parameters() if each.requires_grad], self.optimizer)
 
     # -- answering -------------------------------------------------------------------------------
 

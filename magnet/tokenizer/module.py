@@ -31,7 +31,7 @@ from magnet.tokenizer.quantizer import KMEANS_VECTORS, ResidualVQ
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_quantizer
 from magnet.tokenizer.vqvae import VQVAE
-from magnet.training.optim import adamw_cosine
+from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
 
 __all__ = ["RawPose", "Tokenizer"]
@@ -364,7 +364,7 @@ class Tokenizer(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         trained = self.vqvae.decoder if self.hparams["decoder_only"] else self.vqvae
-        return adamw_cosine(self, trained.parameters(), self.optimizer)
+        return warmup_cosine(self, trained.parameters(), self.optimizer)
 
     # -- freezing and loading ------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The optimiser that both networks use (paper A.3)."""
+"""The optimizer that both networks use (paper A.3)."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import nn
 
+from magnet.training.muon import MuonAdamW
 from magnet.training.options import OptimizerOptions
 
 
-def adamw_cosine(
+def warmup_cosine(
     module: LightningModule, parameters: Iterable[nn.Parameter], options: OptimizerOptions
 ) -> dict[str, Any]:
-    """AdamW whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
+    """AdamW, or Muon for matrices, whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
 
     In a run without an end the rate is constant after the warm-up.
     """
-    optimizer = torch.optim.AdamW(
-        parameters, lr=options.learning_rate, weight_decay=options.weight_decay, fused=module.device.type == "cuda"
-    )
+    lr, decay = options.learning_rate, options.weight_decay
+    optimizer: torch.optim.Optimizer
+    if options.muon:
+        optimizer = MuonAdamW(parameters, lr, decay, options.muon)
+    else:
+        optimizer = torch.optim.AdamW(parameters, lr, weight_decay=decay, fused=module.device.type == "cuda")
     total, warmup = module.trainer.estimated_stepping_batches, options.warmup_steps
 
     def rate(step: int) -> float:

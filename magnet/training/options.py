@@ -21,15 +21,18 @@ class OptimizerOptions:
         learning_rate: the highest, paper A.3.
         weight_decay: paper A.3.
         warmup_steps: training steps until the rate is at its highest; the paper does not say.
+        muon: matrices step by Muon, this many times as far as by AdamW; 0: by AdamW, as in the paper.
     """
 
     learning_rate: float = 2e-4
     weight_decay: float = 1e-4
     warmup_steps: int = 0
+    muon: float = 0.0
 
     def __post_init__(self) -> None:
         require_number("learning_rate", self.learning_rate, least=0)
         require_number("weight_decay", self.weight_decay, least=0)
+        require_number("muon", self.muon, least=0)
         require_whole("warmup_steps", self.warmup_steps, 0)
 
 

@@ -3,7 +3,18 @@ import math
 import pytest
 import torch
 
-from magnet.denoiser.losses import FINE_GROUND, FINE_YAW, NEAR, consistency_losses, near_loss, snr_weights, token_losses
+from magnet.denoiser.losses import (
+    FINE_GROUND,
+    FINE_YAW,
+    NEAR,
+    SHAKE_GROUND,
+    SHAKE_YAW,
+    consistency_losses,
+    near_loss,
+    shake_loss,
+    snr_weights,
+    token_losses,
+)
 from magnet.motion.frames import (
     canonical_deltas,
     canonical_frame,
@@ -110,6 +121,40 @@ def test_weights_count_each_group_of_a_token_by_its_own(scene: Scene):
     assert losses["pairwise"].item() == pytest.approx(1.5 * 0.5 / 6)
     ones = token_losses(truth + 2.0, truth, LAYOUT, there, torch.ones_like(weights))
     assert ones == token_losses(truth + 2.0, truth, LAYOUT, there)
+
+
+def moved_deltas(
+    tokens: torch.Tensor, agent: int, frames: slice, metres: float = 0.0, yaw: float = 0.0
+) -> torch.Tensor:
+    """Tokens with the deltas of an agent's frames turned, and moved along x."""
+    latent, deltas, pairs = LAYOUT.unpack(tokens)
+    by_frame = deltas.transpose(2, 3).flatten(1, 2).clone()
+    turned = from_9d(by_frame[:, frames, agent]) @ from_planar(torch.tensor(yaw), torch.zeros(2))
+    by_frame[:, frames, agent] = to_9d(turned)
+    by_frame[:, frames, agent, 6] += metres
+    return LAYOUT.pack(latent, by_frame.unflatten(1, (-1, 4)).transpose(2, 3), pairs)
+
+
+def test_the_shake_loss_counts_how_errors_of_deltas_change_across_tokens_as_well(scene: Scene):
+    truth, there = packed(scene), everybody(scene)
+    counted = (scene.frames - 2) * 3 * 3  # changes, agents and numbers; the first frame's deltas are arbitrary
+    four, two = 4 * SHAKE_GROUND, 2 * SHAKE_YAW
+    for frame in (3, 4, 9):  # the last of a token, the first of one, any
+        once = moved_deltas(truth, 1, slice(frame, frame + 1), four)
+        # There and back again, by four units each, of which Huber counts all but a half.
+        assert shake_loss(once, truth, LAYOUT, there) == pytest.approx(2 * 3.5 / counted, rel=1e-3)
+    for_good = moved_deltas(truth, 1, slice(8, None), four)
+    assert shake_loss(for_good, truth, LAYOUT, there) == pytest.approx(3.5 / counted, rel=1e-3)
+    turned = moved_deltas(truth, 0, slice(9, 10), yaw=two)
+    assert shake_loss(turned, truth, LAYOUT, there) == pytest.approx(2 * 1.5 / counted, rel=1e-3)
+
+
+def test_the_shake_loss_leaves_the_first_frame_and_the_absent_out(scene: Scene):
+    truth, there = packed(scene), everybody(scene)
+    assert shake_loss(truth, truth, LAYOUT, there) == 0
+    assert shake_loss(moved_deltas(truth, 1, slice(0, 1), 0.3), truth, LAYOUT, there) == 0
+    there[:, :, 1] = False
+    assert shake_loss(moved_deltas(truth, 1, slice(6, 7), 0.3), truth, LAYOUT, there) == 0
 
 
 def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_shown(scene: Scene, generator):

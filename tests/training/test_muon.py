@@ -1,0 +1,93 @@
+"""Muon for matrices, AdamW for the rest, as one optimizer."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from magnet.training.muon import MuonAdamW
+
+
+def small_net() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(6, 12), nn.LayerNorm(12), nn.GELU(), nn.Linear(12, 3))
+
+
+def loss_of(net: nn.Module) -> Tensor:
+    x = torch.randn(32, 6, generator=torch.Generator().manual_seed(1))
+    return (net(x) - x[:, :3].sin()).square().mean()
+
+
+def steps(net: nn.Module, optimizer: torch.optim.Optimizer, count: int) -> list[float]:
+    losses = []
+    for _ in range(count):
+        optimizer.zero_grad()
+        loss = loss_of(net)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
+
+
+@pytest.mark.parametrize("faster", [1.0, 3.0])
+def test_a_step_is_the_one_of_torchs_two_optimizers(faster: float) -> None:
+    ours, theirs = small_net(), small_net()
+    optimizer = MuonAdamW(ours.parameters(), lr=1e-2, weight_decay=0.1, faster=faster)
+    matrices = [p for p in theirs.parameters() if p.ndim == 2]
+    others = [p for p in theirs.parameters() if p.ndim != 2]
+    muon = torch.optim.Muon(matrices, lr=faster * 1e-2, weight_decay=0.1 / faster, adjust_lr_fn="match_rms_adamw")
+    adamw = torch.optim.AdamW(others, lr=1e-2, weight_decay=0.1)
+    for _ in range(3):
+        steps(ours, optimizer, 1)
+        loss = loss_of(theirs)
+        theirs.zero_grad()
+        loss.backward()
+        muon.step()
+        adamw.step()
+    for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_it_learns() -> None:
+    net = small_net()
+    losses = steps(net, MuonAdamW(net.parameters(), lr=1e-2), 60)
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_it_goes_on_from_its_state_as_if_it_had_not_stopped() -> None:
+    net = small_net()
+    optimizer = MuonAdamW(net.parameters(), lr=1e-2)
+    steps(net, optimizer, 3)
+    again, state = copy.deepcopy(net), copy.deepcopy(optimizer.state_dict())
+    steps(net, optimizer, 3)
+    resumed = MuonAdamW(again.parameters(), lr=1e-2)
+    resumed.load_state_dict(state)
+    steps(again, resumed, 3)
+    for a, b in zip(net.parameters(), again.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_schedule_sets_the_rates_of_both() -> None:
+    net = small_net()
+    optimizer = MuonAdamW(net.parameters(), lr=1e-2)
+    torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.0)
+    before = copy.deepcopy(net.state_dict())
+    steps(net, optimizer, 2)
+    for name, value in net.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_a_closure_is_run_with_gradients() -> None:
+    net = small_net()
+    optimizer = MuonAdamW(net.parameters(), lr=1e-2)
+
+    def closure() -> float:
+        optimizer.zero_grad()
+        loss = loss_of(net)
+        loss.backward()
+        return loss.item()
+
+    assert optimizer.step(closure) == pytest.approx(loss_of(small_net()).item())
