@@ -98,7 +98,12 @@ def main(arguments: Sequence[str]) -> int:
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     outs = [scene_files.path_to_write(out) for out in options.out]
-    model = load_model(options, sampler_of(options.sampler or "default", groups["sampler"]))
+    from magnet.api import Model
+    from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.denoiser.module import Denoiser
+
+    sampler = sampler_of(options.sampler or "default", groups["sampler"])
+    model = Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
     if options.sampler is None and (options.people or 0) > model.most_people:
         model = dataclasses.replace(model, sampler=sampler_of("steady", groups["sampler"]))
     scene, body, added = read_people(options, model)
@@ -198,19 +203,6 @@ def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
     for key, value in options.items():
         found |= flat(value, f"{within}{key}.") if isinstance(value, dict) else {f"{within}{key}": value}
     return found
-
-
-def load_model(options: argparse.Namespace, sampler: SamplerOptions) -> Model:
-    """The model that samples.
-
-    Raises:
-        CommandError: there is none of that name.
-    """
-    from magnet.api import Model
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.denoiser.module import Denoiser
-
-    return Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
 
 
 def lengths(

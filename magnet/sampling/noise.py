@@ -19,7 +19,7 @@ LEVELS = 1000
 OFFSET = 0.008
 
 
-def alpha_bar(levels: Tensor, K: int = LEVELS) -> Tensor:
+def alpha_bar(levels: Tensor) -> Tensor:
     """Share of the signal's variance left at a noise level: cosine schedule. (...) int in 0..K -> (...) float32
 
     The paper's formula is 0.99984 at level 0; divided by that, level 0 is clean bit for bit. Level K is
@@ -28,21 +28,21 @@ def alpha_bar(levels: Tensor, K: int = LEVELS) -> Tensor:
     >>> alpha_bar(torch.tensor([0, 500, 1000]))  # all of the signal, about half of its variance, none
     tensor([1.0000, 0.4938, 0.0000])
     """
-    return _shares(K, levels.device)[levels]
+    return _shares(levels.device)[levels]
 
 
 @functools.cache
-def _shares(K: int, device: torch.device) -> Tensor:
+def _shares(device: torch.device) -> Tensor:
     """`alpha_bar` of every level: looking it up is far cheaper than a cosine for every number of a token."""
-    angle = (torch.arange(K + 1, dtype=torch.float64) / K + OFFSET) / (1 + OFFSET) * (math.pi / 2)
+    angle = (torch.arange(LEVELS + 1, dtype=torch.float64) / LEVELS + OFFSET) / (1 + OFFSET) * (math.pi / 2)
     share = (angle.cos() / angle[0].cos()) ** 2
-    share[K] = 0.0
+    share[LEVELS] = 0.0
     return share.float().to(device)
 
 
-def add_noise(clean: Tensor, noise: Tensor, levels: Tensor, K: int = LEVELS) -> Tensor:
+def add_noise(clean: Tensor, noise: Tensor, levels: Tensor) -> Tensor:
     """Forward process, paper Eq. 7. clean, noise (..., D); levels (..., D) or broadcastable -> (..., D)"""
-    alpha = alpha_bar(levels, K)
+    alpha = alpha_bar(levels)
     return alpha.sqrt() * clean + (1 - alpha).sqrt() * noise
 
 
@@ -53,7 +53,6 @@ def ddim_step(
     after: Tensor,
     eta: float = 0.0,
     step_noise: Tensor | None = None,
-    K: int = LEVELS,
 ) -> Tensor:
     """One DDIM step from levels `now` down to `after`, given the predicted clean value (Song et al. 2021, Eq. 12, 16).
 
@@ -64,14 +63,13 @@ def ddim_step(
         now, after: (..., D) int or broadcastable.
         eta: how much of the noise that is left is new: 0 none, the deterministic step; 1 as in ancestral sampling.
         step_noise: (..., D) new standard normal noise; needed where eta is not 0.
-        K: number of levels.
 
     >>> clean, noise = torch.tensor([2.0]), torch.tensor([1.0])
     >>> noisy = add_noise(clean, noise, torch.tensor([800]))
     >>> ddim_step(noisy, clean, now=torch.tensor([800]), after=torch.tensor([0]))  # at level 0: what was predicted
     tensor([2.])
     """
-    a_now, a_after = alpha_bar(now, K), alpha_bar(after, K)
+    a_now, a_after = alpha_bar(now), alpha_bar(after)
     # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
     left = (1 - a_now).clamp_min(1e-12)
     noise = (noisy - a_now.sqrt() * clean) / left.sqrt()
@@ -84,7 +82,7 @@ def ddim_step(
     return torch.where(now == after, noisy, torch.where(after == 0, clean, moved))
 
 
-def shifted(levels: Tensor, shift: float, K: int = LEVELS) -> Tensor:
+def shifted(levels: Tensor, shift: float) -> Tensor:
     """Levels moved toward noise: `shift` u / (1 + (shift - 1) u) of u = level / K; 0 and K stay. (...) int -> same
 
     A token describes a pose with hundreds of redundant numbers, so the pose can be recognised at all but the highest
@@ -93,11 +91,11 @@ def shifted(levels: Tensor, shift: float, K: int = LEVELS) -> Tensor:
     """
     if shift == 1.0:
         return levels
-    share = levels.double() / K
-    return (K * shift * share / (1 + (shift - 1) * share)).round().long()
+    share = levels.double() / LEVELS
+    return (LEVELS * shift * share / (1 + (shift - 1) * share)).round().long()
 
 
-def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
+def ddim_levels(steps: int, shift: float = 1.0) -> Tensor:
     """The levels a token passes in `steps` denoising steps, from K down to 0, `shifted`. -> (S + 1,) int
 
     Raises:
@@ -108,21 +106,21 @@ def ddim_levels(steps: int, shift: float = 1.0, K: int = LEVELS) -> Tensor:
     >>> ddim_levels(5, shift=3.0)  # more of the steps where there is much noise
     tensor([1000,  923,  818,  667,  429,    0])
     """
-    require_whole("denoising steps", steps, 1, K)
+    require_whole("denoising steps", steps, 1, LEVELS)
     require_number("shift", shift, over=0)
-    levels = _levels(steps, shift, K)
+    levels = _levels(steps, shift)
     if levels is None:
-        most = next(more for more in range(steps) if _levels(more + 1, shift, K) is None)
+        most = next(more for more in range(steps) if _levels(more + 1, shift) is None)
         advice = f"take {most} or fewer, or a shift nearer to 1" if most else "take a shift nearer to 1"
         raise ValueError(
-            f"denoising steps: {steps} with a shift of {shift:g} would use the same of {K} levels twice; {advice}"
+            f"denoising steps: {steps} with a shift of {shift:g} would use the same of {LEVELS} levels twice; {advice}"
         )
     return levels
 
 
-def _levels(steps: int, shift: float, K: int) -> Tensor | None:
+def _levels(steps: int, shift: float) -> Tensor | None:
     """`ddim_levels`, or None where two steps would be at one level."""
-    levels = shifted(torch.tensor([K * (steps - s) // steps for s in range(steps + 1)]), shift, K)
+    levels = shifted(torch.tensor([LEVELS * (steps - s) // steps for s in range(steps + 1)]), shift)
     return levels if bool((levels.diff() < 0).all()) else None
 
 
@@ -131,18 +129,18 @@ HIGHEST_NOISE, LOWEST_NOISE, LONGEST_STEP = -3.0, 4.67, 2.6
 (level 2), and the longest step; with fewer than four steps the last level before 0 is noisier."""
 
 
-def half_log_snr(levels: Tensor, K: int = LEVELS) -> Tensor:
+def half_log_snr(levels: Tensor) -> Tensor:
     """log(signal / noise), lambda of DPM-Solver; of level K -inf, of level 0 inf. (...) int in 0..K -> (...) float32"""
-    return _half_log_snrs(K, levels.device)[levels]
+    return _half_log_snrs(levels.device)[levels]
 
 
 @functools.cache
-def _half_log_snrs(K: int, device: torch.device) -> Tensor:
-    share = alpha_bar(torch.arange(K + 1), K).double()
+def _half_log_snrs(device: torch.device) -> Tensor:
+    share = alpha_bar(torch.arange(LEVELS + 1)).double()
     return ((share / (1 - share)).log() / 2).float().to(device)
 
 
-def log_snr_levels(steps: int, K: int = LEVELS) -> Tensor:
+def log_snr_levels(steps: int) -> Tensor:
     """Levels of S denoising steps from K down to 0, evenly spaced in `half_log_snr`, no two alike. -> (S + 1,) int
 
     Raises:
@@ -151,15 +149,15 @@ def log_snr_levels(steps: int, K: int = LEVELS) -> Tensor:
     >>> log_snr_levels(5)
     tensor([1000,  790,  255,   34,    2,    0])
     """
-    require_whole("denoising steps", steps, 1, K)
+    require_whole("denoising steps", steps, 1, LEVELS)
     length = min((LOWEST_NOISE - HIGHEST_NOISE) / max(steps - 1, 1), LONGEST_STEP)
-    return nearest_levels(HIGHEST_NOISE + length * torch.arange(1, steps, dtype=torch.float64), K)
+    return nearest_levels(HIGHEST_NOISE + length * torch.arange(1, steps, dtype=torch.float64))
 
 
-def nearest_levels(wanted: Tensor, K: int = LEVELS) -> Tensor:
+def nearest_levels(wanted: Tensor) -> Tensor:
     """K, then the levels nearest to rising values of `half_log_snr`, no two alike, and 0. (n,) -> (n + 2,) int"""
-    known = half_log_snr(torch.arange(1, K), K).double()
-    levels = [K, *(1 + (wanted[:, None] - known).abs().argmin(dim=1)).tolist(), 0]
+    known = half_log_snr(torch.arange(1, LEVELS)).double()
+    levels = [LEVELS, *(1 + (wanted[:, None] - known).abs().argmin(dim=1)).tolist(), 0]
     for i in range(len(levels) - 2, 0, -1):
         levels[i] = max(levels[i], levels[i + 1] + 1)
     for i in range(1, len(levels) - 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,15 @@ import torch
 
 from magnet.agents.agent import Agent, Player, motion_of, poses_of
 from magnet.agents.gate import Gate
-from magnet.agents.lossy import Lossy
 from magnet.agents.message import pack
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.testing import random_scene, tiny_denoiser
+from tests.scripts import module_at
+
+Lossy = module_at(Path(__file__).parents[2] / "benchmarks" / "agents.py").Lossy
 
 NAMES = ("A", "B", "C")
 REFERENCE = SamplerOptions(steps=3, precision="reference", any_floor=True)

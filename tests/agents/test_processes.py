@@ -16,7 +16,6 @@ import pytest
 import torch
 
 from magnet.agents.agent import poses_of
-from magnet.agents.lossy import Lossy
 from magnet.agents.message import unpack
 from magnet.agents.zeromq import Link, engine, make_keys
 from magnet.denoiser.module import Denoiser
@@ -26,6 +25,9 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.testing import random_scene, tiny_denoiser
 from tests.denoiser.test_module import save
+from tests.scripts import module_at
+
+Lossy = module_at(Path(__file__).parents[2] / "benchmarks" / "agents.py").Lossy
 
 DOCS = Path(__file__).parents[2] / "docs" / "agents.md"
 
