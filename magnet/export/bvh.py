@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
-from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
+from magnet.motion.scene import Scene, require_body, require_one
 
 Unit = Literal["m", "cm"]
 PER_METRE: dict[str, float] = {"m": 1.0, "cm": 100.0}
-ROTATIONS = "Zrotation Xrotation Yrotation"
+ROTATIONS = "ZXY"
 """Channels of every joint: degrees, R = Rz Rx Ry, the order most tools write."""
 
 TIPS: dict[int, tuple[float, float, float]] = {
@@ -68,8 +68,13 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)
         position = root[:, :3, 3].numpy() * PER_METRE[unit]
-        lines = [*_hierarchy(offsets, PER_METRE[unit]), *_motion(position, local.numpy(), scene.fps)]
-        each.write_text("\n".join(lines) + "\n")
+        degrees = euler_zxy(local.numpy())[:, depth_first(PARENTS)]
+        rows = [
+            f"{_numbers(place)} {' '.join(f'{angle:.6f}' for angle in angles.ravel())}"
+            for place, angles in zip(position, degrees, strict=True)
+        ]
+        tips = {joint: PER_METRE[unit] * np.array(tip) for joint, tip in TIPS.items()}
+        each.write_text(bvh_text(JOINT_NAMES, PARENTS, offsets, tips, ROTATIONS, rows, scene.fps))
         written.append(each)
     return written
 
@@ -79,43 +84,53 @@ def offsets_of(rest: Tensor) -> Tensor:
     return rest - rest[..., [0, *PARENTS[1:]], :]
 
 
-def _hierarchy(offsets: NDArray[np.float64], per_metre: float) -> Iterator[str]:
+def bvh_text(
+    names: Sequence[str],
+    parents: Sequence[int],
+    offsets: NDArray[np.float64],
+    tips: Mapping[int, NDArray[np.float64]],
+    rotations: str,
+    rows: Sequence[str],
+    fps: float,
+) -> str:
+    """A BVH file.
+
+    Args:
+        names: of K joints.
+        parents: of each joint; the root comes first, and has -1.
+        offsets: (K, 3) in the file's unit.
+        tips: (3,) offsets of End Sites, by joint.
+        rotations: axes that every joint turns about, such as ZXY.
+        rows: the numbers of each frame, the root's place and then angles of joints in the order of `depth_first`.
+        fps: frames a second.
+    """
+    channels = " ".join(f"{axis}rotation" for axis in rotations)
+
     def joint(j: int, depth: int) -> Iterator[str]:
         pad = "\t" * depth
-        yield f"{pad}{'JOINT' if j else 'ROOT'} {JOINT_NAMES[j]}"
+        yield f"{pad}{'JOINT' if depth else 'ROOT'} {names[j]}"
         yield pad + "{"
         yield f"{pad}\tOFFSET {_numbers(offsets[j])}"
-        yield f"{pad}\tCHANNELS {f'3 {ROTATIONS}' if j else f'6 Xposition Yposition Zposition {ROTATIONS}'}"
-        for child in (c for c in range(BODY_JOINTS) if PARENTS[c] == j):
+        yield f"{pad}\tCHANNELS {f'3 {channels}' if depth else f'6 Xposition Yposition Zposition {channels}'}"
+        for child in (c for c, parent in enumerate(parents) if parent == j):
             yield from joint(child, depth + 1)
-        if j in TIPS:
-            tip = per_metre * np.array(TIPS[j])
-            yield from (f"{pad}\tEnd Site", pad + "\t{", f"{pad}\t\tOFFSET {_numbers(tip)}", pad + "\t}")
+        if j in tips:
+            yield from (f"{pad}\tEnd Site", pad + "\t{", f"{pad}\t\tOFFSET {_numbers(tips[j])}", pad + "\t}")
         yield pad + "}"
 
-    yield "HIERARCHY"
-    yield from joint(0, 0)
+    motion = ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.10f}", *rows]
+    return "\n".join(["HIERARCHY", *joint(0, 0), *motion]) + "\n"
 
 
-def written_order() -> list[int]:
-    """Joints in the order of the file: depth first."""
+def depth_first(parents: Sequence[int]) -> list[int]:
+    """Joints in the order of a file."""
 
     def below(j: int) -> Iterator[int]:
         yield j
-        for child in (c for c in range(BODY_JOINTS) if PARENTS[c] == j):
+        for child in (c for c, parent in enumerate(parents) if parent == j):
             yield from below(child)
 
     return list(below(0))
-
-
-def _motion(position: NDArray[np.float64], local: NDArray[np.float64], fps: float) -> Iterator[str]:
-    """position (T, 3), local (T, 22, 3, 3)"""
-    degrees = euler_zxy(local)[:, written_order()]
-    yield "MOTION"
-    yield f"Frames: {len(position)}"
-    yield f"Frame Time: {1 / fps:.10f}"
-    for place, angles in zip(position, degrees, strict=True):
-        yield f"{_numbers(place)} {' '.join(f'{angle:.6f}' for angle in angles.ravel())}"
 
 
 def euler_zxy(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
 from magnet.datamodules.reading.recording import Axis
+from magnet.export.bvh import bvh_text, depth_first
 from magnet.motion.scene import FPS
 
 RATE = 120.0
@@ -52,34 +53,10 @@ def _file(shown: FakeMotion, person: int) -> str:
     world = world_rotations(shown.poses[:, person]) @ N.T
     local = world.copy()
     local[:, 1:] = np.swapaxes(world[:, list(PARENTS[1:])], -1, -2) @ world[:, 1:]
-    order = list(_depth_first(0))
-    degrees = roma.rotmat_to_euler("ZYX", torch.from_numpy(local[:, order]), degrees=True).numpy()
-    columns = [CENTIMETRES * shown.positions[:, person, 0], degrees.reshape(shown.frames, -1)]
-    rows = [" ".join(f"{x:.6f}" for x in row) for row in np.concatenate(columns, axis=1)]
-    head = ["HIERARCHY", *_hierarchy(0, rest, 0), "MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / shown.fps:.7f}"]
-    return "\n".join([*head, *rows]) + "\n"
-
-
-def _children(joint: int) -> Sequence[int]:
-    return [child for child, parent in enumerate(PARENTS) if parent == joint]
-
-
-def _depth_first(joint: int) -> Iterator[int]:
-    yield joint
-    for child in _children(joint):
-        yield from _depth_first(child)
-
-
-def _hierarchy(joint: int, rest: np.ndarray, depth: int) -> Iterator[str]:
-    pad = "  " * depth
-    offset = rest[joint] - rest[PARENTS[joint]] if depth else np.zeros(3)
-    place = "Xposition Yposition Zposition " if not depth else ""
-    yield f"{pad}{'JOINT' if depth else 'ROOT'} {named(JOINT_NAMES[joint])}"
-    yield f"{pad}{{"
-    yield f"{pad}  OFFSET " + " ".join(f"{x:.6f}" for x in offset)
-    yield f"{pad}  CHANNELS {3 if depth else 6} {place}Zrotation Yrotation Xrotation"
-    for child in _children(joint):
-        yield from _hierarchy(child, rest, depth + 1)
-    if not _children(joint):
-        yield from (f"{pad}  End Site", f"{pad}  {{", f"{pad}    OFFSET 0.0 0.0 5.0", f"{pad}  }}")
-    yield f"{pad}}}"
+    turns = torch.from_numpy(local[:, depth_first(PARENTS)])
+    degrees = roma.rotmat_to_euler("ZYX", turns, degrees=True).numpy().reshape(shown.frames, -1)
+    numbers = np.concatenate([CENTIMETRES * shown.positions[:, person, 0], degrees], axis=1)
+    rows = [" ".join(f"{x:.6f}" for x in row) for row in numbers]
+    tips = {joint: np.array([0.0, 0.0, 5.0]) for joint in range(len(rest)) if joint not in PARENTS}
+    names = [named(joint) for joint in JOINT_NAMES]
+    return bvh_text(names, PARENTS, rest - rest[[0, *PARENTS[1:]]], tips, "ZYX", rows, shown.fps)

@@ -19,6 +19,7 @@ from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.duobox import world_rotations
 from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
 from magnet.datamodules.reading.remocap_track import RATE
+from magnet.export.bvh import bvh_text
 from magnet.motion.scene import FPS
 
 from magnet.body.joints import (  # isort: skip
@@ -168,14 +169,11 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
     columns = [np.round(millimetres[root.name], 6)]
     columns += [turn[j.name][:, ["XYZ".index(axis) for axis in CHANNELS]] for j in declared if not j.end]
     rows = [" ".join(f"{x:.6f}" for x in row) for row in np.concatenate(columns, axis=1)]
-    header = [
-        "HIERARCHY",
-        *_hierarchy(root, offsets, 0),
-        "MOTION",
-        f"Frames: {len(rows)}",
-        f"Frame Time: {1 / RATE:.6f}",
-    ]
-    (folder / "motion.bvh").write_text("\n".join([*header, *rows]) + "\n")
+    joints = [j.name for j in declared if not j.end]
+    parents = [joints.index(above[name].name) if name in above else -1 for name in joints]
+    tips = {joints.index(above[j.name].name): offsets[j.name] for j in declared if j.end}
+    text = bvh_text(joints, parents, np.stack([offsets[name] for name in joints]), tips, CHANNELS, rows, RATE)
+    (folder / "motion.bvh").write_text(text)
 
 
 def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> None:
@@ -183,17 +181,3 @@ def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> 
     lines = [",".join(["Time", *(f"{name}.{axis}" for name in names for axis in "XYZ")])]
     lines += [",".join([f"{t / RATE:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values)]
     path.write_text("\n".join(lines) + "\n")
-
-
-def _hierarchy(joint: Joint, offsets: dict[str, np.ndarray], depth: int) -> Iterator[str]:
-    indent = "\t" * depth
-    yield indent + ("End Site" if joint.end else f"{'JOINT' if depth else 'ROOT'} {joint.name}")
-    yield indent + "{"
-    yield f"{indent}\tOFFSET " + " ".join(f"{x:.6f}" for x in offsets[joint.name])
-    if not joint.end:
-        turns = [f"{axis}rotation" for axis in CHANNELS]
-        places = [] if depth else [f"{axis}position" for axis in "XYZ"]
-        yield f"{indent}\tCHANNELS {len(places) + 3} " + " ".join([*places, *turns])
-        for child in joint.children:
-            yield from _hierarchy(child, offsets, depth + 1)
-    yield indent + "}"
