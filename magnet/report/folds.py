@@ -102,14 +102,11 @@ class FoldScoring(Scoring):
     def rows(self) -> dict[str, dict[str, Any]]:
         """By method: `value`, and `without` each unit."""
         found = {}
-        for name, folds in self.folds.items():
+        for name, folds in [*self.folds.items(), *((name + COPIED, folds) for name, folds in self.copied.items())]:
             value, without = folds.rows()
             if name == TRUTH:  # at no distance from itself
                 value, without = _of_motion(value), {unit: _of_motion(row) for unit, row in without.items()}
             found[name] = {"value": value, "without": {str(unit): row for unit, row in without.items()}}
-        for name, folds in self.copied.items():
-            value, without = folds.rows()
-            found[name + COPIED] = {"value": value, "without": {str(unit): row for unit, row in without.items()}}
         return found
 
 
