@@ -101,14 +101,15 @@ def predict_in_views(
 
 
 def step_noise(stream: NoiseStream, first: int, levels: Tensor, moves: Tensor) -> Tensor:
-    """New noise of the steps that leave these levels, of the token steps from `first` on; drawn number by number.
+    """New noise of the steps that leave these levels, of the token steps from `first` on; drawn level by level.
 
     levels (W, P, D) int, moves (W, P, D) bool, where it is needed; elsewhere 0 -> (B, W, P, D)
     """
     noise = torch.zeros(stream.shape[0], *levels.shape, dtype=stream.dtype)
-    for row, agent, number in moves.nonzero().tolist():
-        level = int(levels[row, agent, number])
-        noise[:, row, agent, number] = stream.drawn(first + row, 1, [(0, level, None)])[:, 0, agent, number]
+    for row in range(len(levels)):
+        for level in levels[row][moves[row]].unique().tolist():
+            drawn = stream.drawn(first + row, 1, [(0, level, None)])[:, 0]
+            noise[:, row] = torch.where(moves[row] & (levels[row] == level), drawn, noise[:, row])
     return noise
 
 
