@@ -49,7 +49,8 @@ def linear_of(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> Linear:
 
 def norm_of(norm: nn.LayerNorm, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
     weight, bias = norm.weight.detach().to(dtype), norm.bias.detach().to(dtype)
-    return lambda x: F.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
+    shape, eps = list(norm.normalized_shape), norm.eps
+    return lambda x: torch.layer_norm(x, shape, weight, bias, eps)
 
 
 Made = TypeVar("Made")

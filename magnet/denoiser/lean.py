@@ -65,26 +65,29 @@ class LeanBlock:
             turn: (L, D / 2) complex, or None.
             sees: (L, M + L) bool, or None.
             asked: (r,) int, which tokens are wanted; None: all.
-            before: keys and values (B, M, heads, D) of tokens in front of these.
+            before: keys and values (B, heads, M, D) of tokens in front of these.
 
         Returns:
-            (B, L or r, d), and keys and values (B, M + L, heads, D).
+            (B, L or r, d), and keys and values (B, heads, M + L, D).
         """
         if asked is None:
             made = self.qkv(x).unflatten(-1, (3, self.heads, self.each))
             both, value = made[:, :, :2], made[:, :, 2]
-            query, key = (both if turn is None else turned(both, turn[:, None, None])).unbind(2)
+            both = both if turn is None else turned(both, turn[:, None, None])
+            query, key = both.permute(2, 0, 3, 1, 4).unbind(0)
         else:
-            key, value = self.key_value(x).unflatten(-1, (2, self.heads, self.each)).unbind(2)
+            made = self.key_value(x).unflatten(-1, (2, self.heads, self.each))
+            key, value = made[:, :, 0], made[:, :, 1]
             x = x[:, asked]
             query = self.query(x).unflatten(-1, (self.heads, self.each))
             sees = None if sees is None else sees[asked]
             if turn is not None:
                 query, key = turned(query, turn[asked][:, None]), turned(key, turn[:, None])
+            query, key = query.transpose(1, 2), key.transpose(1, 2)
+        value = value.transpose(1, 2)
         if before is not None:
-            key, value = torch.cat([before[0], key], dim=1), torch.cat([before[1], value], dim=1)
-        q, k, v = (each.transpose(1, 2) for each in (query, key, value))
-        looked = F.scaled_dot_product_attention(q, k, v, attn_mask=sees).transpose(1, 2).flatten(-2)
+            key, value = torch.cat([before[0], key], dim=2), torch.cat([before[1], value], dim=2)
+        looked = F.scaled_dot_product_attention(query, key, value, attn_mask=sees).transpose(1, 2).flatten(-2)
         x = self.norm_attention(self.out(looked, plus=x))
         return self.norm_mlp(self.last(self.first(x, gelu=True), plus=x)), (key, value)
 
@@ -97,17 +100,23 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
 
 @dataclass
 class Memory:
-    """Keys and values of token steps that do not change from call to call, where attention is causal by block.
+    """What does not change from call to call while a stage denoises: made in its first call and kept.
 
-    Earlier blocks do not see later ones, so what was computed of them once holds for all calls.
+    Tokens that are shown the same go into the first block as the same. And where attention is causal by block, earlier
+    blocks do not see later ones, so what was computed of them once holds for all calls.
 
     Attributes:
-        steps: so many first token steps, whole blocks.
-        blocks: (group of scenes, transformer block) -> keys and values (B, steps * people, heads, D).
+        steps: so many first token steps, whole blocks, whose keys and values are kept.
+        changes: token steps [first, stop) that are shown otherwise in each call; None: all of them.
+        entered: of each group of scenes (B, n, p, d), token steps `span` before the first block.
+        blocks: (group of scenes, transformer block) -> keys and values (B, heads, steps * people, D).
         answers: (B, steps, P, D) what was predicted of them.
     """
 
-    steps: int
+    steps: int = 0
+    changes: tuple[int, int] | None = None
+    span: tuple[int, int] | None = None
+    entered: list[Tensor] = field(default_factory=list)
     blocks: dict[tuple[int, int], tuple[Tensor, Tensor]] = field(default_factory=dict)
     answers: Tensor | None = None
 
@@ -149,19 +158,17 @@ class LeanTransformer:
     ) -> Tensor:
         """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero.
 
-        With a `memory`, what this was last asked with it must have been the same but for the tokens behind it.
+        With a `memory`, what this was last asked with it must have been the same but for the token steps that change.
         """
         B, N, _, _ = noisy.shape
         begins, ends = self._span(N, wanted, memory)
-        entered = self._entered(noisy[:, begins:ends], levels[:, begins:ends], present)
+        groups = seats(present)
+        entered = self._entered(noisy, levels, present, groups, (begins, ends), memory)
         finished = torch.zeros_like(noisy)
         extra = self._extra(cond, B, N)
         if extra is not None and extra.shape[1] > 1:
             extra = extra[:, begins:ends]
-        for group, (scenes, slots) in enumerate(seats(present)):
-            x = entered[scenes][:, :, slots] if scenes is not None else entered[:, :, slots]
-            for layer in self.entry:
-                x = layer(x)
+        for group, ((scenes, slots), x) in enumerate(zip(groups, entered, strict=True)):
             if extra is not None:
                 x = x + (extra if len(extra) == 1 or scenes is None else extra[scenes])
             asked = None if wanted is None else wanted[begins:ends, slots].flatten().nonzero()[:, 0]
@@ -176,7 +183,7 @@ class LeanTransformer:
                 finished[:, begins:ends, slots] = answer
             else:
                 finished[scenes[:, None], begins:ends, slots] = answer.transpose(1, 2)
-        if memory is not None:
+        if memory is not None and memory.steps:
             if begins and memory.answers is not None:
                 finished[:, :begins] = memory.answers
             memory.answers = finished[:, : memory.steps].clone()
@@ -185,7 +192,7 @@ class LeanTransformer:
     def _span(self, N: int, wanted: Tensor | None, memory: Memory | None) -> tuple[int, int]:
         """Which token steps are computed: behind those that are remembered, up to the last that a wanted one sees."""
         block = self.options.causal_block
-        if memory is not None and (not block or memory.steps % block):
+        if memory is not None and memory.steps and (not block or memory.steps % block):
             raise ValueError(f"memory of {memory.steps} token steps: expected whole blocks of network.causal_block")
         begins = memory.steps if memory is not None and memory.blocks else 0
         if not block or wanted is None or not bool(wanted.any()):
@@ -200,19 +207,53 @@ class LeanTransformer:
             raise ValueError(f"cond: got {tuple(cond.shape)}, expected none: the model has network.cond_dim 0")
         return None
 
-    def _entered(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """What goes into the first layer. -> (B, N, P, ...)"""
-        B, N, P, _ = noisy.shape
+    def _entered(
+        self,
+        noisy: Tensor,
+        levels: Tensor,
+        present: Tensor,
+        groups: list[tuple[Tensor | None, slice | Tensor]],
+        span: tuple[int, int],
+        memory: Memory | None,
+    ) -> list[Tensor]:
+        """What token steps `span` are before the first block, of each group of scenes. -> [(B, n, p, d)]"""
+        begins, ends = span
+        same = memory is not None and memory.changes is not None and memory.span == span
+        if memory is not None and memory.changes is not None and same:
+            begins, ends = (min(max(edge, begins), ends) for edge in memory.changes)
+        here = slice(begins, ends)
+        made = [self._first(noisy[:, here], levels[:, here], present, *each) for each in groups]
+        if memory is None:
+            return made
+        if not same:
+            memory.span, memory.entered = span, made
+        else:
+            for kept, new in zip(memory.entered, made, strict=True):
+                kept[:, begins - span[0] : ends - span[0]] = new
+        return memory.entered
+
+    def _first(
+        self, noisy: Tensor, levels: Tensor, present: Tensor, scenes: Tensor | None, slots: slice | Tensor
+    ) -> Tensor:
+        """The layers before the first block, of some slots of some scenes. -> (B, n, p, d)"""
         own = self.layout.group_levels(levels)
         if not everybody(present):
-            there = self.layout.group_present(present)[:, None]
-            own, noisy = torch.where(there, own, LEVELS), torch.where(self.layout.spread(there), noisy, 0.0)
+            own = torch.where(self.layout.group_present(present)[:, None], own, LEVELS)
+        if scenes is not None:
+            noisy, own, present = noisy[scenes], own[scenes], present[scenes]
+        noisy, own = noisy[:, :, slots], own[:, :, slots]
+        if not everybody(present):
+            there = self.layout.group_present(present)[:, slots]
+            noisy = torch.where(self.layout.spread(there)[:, None], noisy, 0.0)
         parts = [noisy, self.levels[own[..., 0]]]
         if self.layout.slots:
             parts.append(self.slots[own[..., 1:]].flatten(-2))
         if self.agent is not None:
-            parts.append(self.agent.expand(B, N, P, -1))
-        return torch.cat(parts, dim=-1)
+            parts.append(self.agent[slots].expand(*own.shape[:-1], -1))
+        x = torch.cat(parts, dim=-1)
+        for layer in self.entry:
+            x = layer(x)
+        return x
 
     def _blocks(self, x: Tensor, begins: int, asked: Tensor | None, memory: Memory | None, group: int) -> Tensor:
         """All blocks, of token steps from `begins` on. (B, n, p, d) -> (B, n * p or as many as are asked for, d)"""
@@ -230,10 +271,10 @@ class LeanTransformer:
         for number, block in enumerate(self.blocks):
             before = None if memory is None else memory.blocks.get((group, number))
             x, pair = block(x, turn, sees, asked if number == len(self.blocks) - 1 else None, before)
-            if memory is not None and before is None:
+            if memory is not None and memory.steps and before is None:
                 keys, values = pair
                 kept = memory.steps * people
-                memory.blocks[group, number] = keys[:, :kept].clone(), values[:, :kept].clone()
+                memory.blocks[group, number] = keys[:, :, :kept].clone(), values[:, :, :kept].clone()
         return x.float()
 
 

@@ -11,7 +11,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.settling import PACE, settled_on
-from magnet.motion.frames import from_9d, posed, project_se2, to_9d
+from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
@@ -95,6 +95,7 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
     return each[:, view_of, :, agent].permute(1, 2, 0, 3)
 
 
+@torch.inference_mode()
 def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
     """Decode the bodies of the token steps up to `stop`; they are given from then on.
 
@@ -148,11 +149,12 @@ def decode_bodies(
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
     shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
-    features = decoded_frames(world, latent, deltas, shown, low, near - low)
+    keep = world.by_frame(world.known[first:stop] & options.keep_given)
+    there = world.there[~keep[:, world.there].all(dim=0)]  # of whom something is seen that is not given
+    features = decoded_frames(world, latent, deltas, shown, low, near - low, there)
     given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
     if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
         given = cat_time([world.uncorrected, given.slice(lead)])
-    keep = world.by_frame(world.known[first:stop] & options.keep_given)
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
@@ -160,17 +162,23 @@ def decode_bodies(
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
 
 
-def decoded_frames(world: World, latent: Tensor, deltas: Tensor, frames: slice, low: int, final: int) -> Tensor:
-    """Some frames of decoded tokens, of those who are there. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)
+def decoded_frames(
+    world: World, latent: Tensor, deltas: Tensor, frames: slice, low: int, final: int, there: Tensor | None = None
+) -> Tensor:
+    """Some frames of decoded tokens, of those who are `there`. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)
 
-    The first of them is row `low`; `final` of them are finished.
+    The first of them is row `low`; `final` of them are finished. `there` (p,) int, None: everybody who is.
     """
     tokenizer, betas = world.model.tokenizer, world.given.betas
     if world.options.precision == "reference":
         return tokenizer.decode(latent, betas, deltas)[:, frames]
-    there = world.there
+    there = world.there if there is None else there
     growing = Growing(world.decoder, world.released + low, final)
-    made = decoded(tokenizer, latent[:, :, there], betas[:, there], deltas[:, :, there], frames, growing)
+    made = (
+        latent.new_zeros(len(latent), frames.stop - frames.start, 0, POSE_FEATURES)
+        if not len(there)
+        else decoded(tokenizer, latent[:, :, there], betas[:, there], deltas[:, :, there], frames, growing)
+    )
     whole = made.new_zeros(*made.shape[:2], latent.shape[2], made.shape[3])
     whole[..., ::6] = whole[..., 4::6] = 1.0  # absent: any proper rotations
     whole[:, :, there] = made

@@ -150,7 +150,8 @@ def known_tokens(
     like = given.T_world_root
     latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
     deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, TOKEN_FRAMES, 9).clone()
-    T_world_can = canonical_frame(like)
+    before = max(wanted - 1, 0)  # a row more in front, for the first delta
+    T_world_can = canonical_frame(like[:, before * TOKEN_FRAMES : end * TOKEN_FRAMES])
     for start, stop, agents in segments(known):
         for low, first, last, limit, those in encodings(start, stop, agents, limits, receptive_field(model)[0]):
             first, last = max(first, wanted), min(last, end)
@@ -163,16 +164,19 @@ def known_tokens(
             if carried is not None:
                 growing = Growing(carried.setdefault(tuple(those), Carried()), first_row + low, limit - low)
             latent[:, first:last, those] = model.encode(seen, slice(first - low, last - low), packed, growing)
-        low, stop = max(start, wanted - 1), min(stop, end)  # a row more in front, for the first delta
+        low, stop = max(start, before), min(stop, end)
         if low >= stop:
             continue
-        own = by_token(to_9d(canonical_deltas(T_world_can[:, low * TOKEN_FRAMES : stop * TOKEN_FRAMES, agents])))
+        part = slice((low - before) * TOKEN_FRAMES, (stop - before) * TOKEN_FRAMES)
+        own = by_token(to_9d(canonical_deltas(T_world_can[:, part, agents])))
         if low == start > 0:
             own[:, 0, :, 0] = own[:, 0, :, 1]
         deltas[:, low:stop, agents] = own
-    frames = slice(wanted * TOKEN_FRAMES, end * TOKEN_FRAMES)
-    T_world_can = T_world_can if related is None else canonical_frame(related.T_world_root)
-    pairs = pairwise_by_token(to_9d(pairwise(T_world_can[:, frames], model.layout.partners(like.device))))
+    if related is None:
+        T_world_can = T_world_can[:, (wanted - before) * TOKEN_FRAMES :]
+    else:
+        T_world_can = canonical_frame(related.T_world_root[:, wanted * TOKEN_FRAMES : end * TOKEN_FRAMES])
+    pairs = pairwise_by_token(to_9d(pairwise(T_world_can, model.layout.partners(like.device))))
     return model.normalizer.normalize(model.layout.pack(latent[:, rows], deltas[:, rows], pairs))
 
 

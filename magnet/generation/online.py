@@ -51,6 +51,7 @@ class OnlineRollout(Rollout):
         self.base = 0  # the row that the recording, as far as it is held, begins with
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
         self.there = past.frames // TOKEN_FRAMES
+        self.scene = mask_unknown(self.scene, self._known(0, self.there))
         self._advance()
 
     @property
@@ -71,8 +72,10 @@ class OnlineRollout(Rollout):
         fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
         fed = fed.pad_agents(self.model.layout.agents)
         # The floor was checked in the past; later frames may leave it, because somebody jumps or is carried.
-        check_given(fed, self._known(begins, ends), any_floor=True)
-        self.scene, self.there = cat_time([self.scene.replace(valid=None, names=()), fed]), ends
+        known = self._known(begins, ends)
+        check_given(fed, known, any_floor=True)
+        self.scene = cat_time([self.scene.replace(valid=None, names=()), mask_unknown(fed, known)])
+        self.there = ends
         return self._advance(begins)
 
     def _advance(self, begins: int = 0) -> Scene:
@@ -86,13 +89,12 @@ class OnlineRollout(Rollout):
         made = self._decoded(begins, self.made, None, needed)
         old = max(self.stop - receptive_field(self.model)[0] - 1, 0) - self.base
         if old > 0:
-            kept = self.scene.slice(old * TOKEN_FRAMES)
-            self.scene = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
+            self.scene = self.scene.slice(old * TOKEN_FRAMES)  # a view, until the next frames are added
             self.base += old
         return made
 
     def _given(self, low: int, high: int) -> Scene:
-        return mask_unknown(self.scene, self._known(self.base, high), low - self.base, high - self.base)
+        return self.scene.slice((low - self.base) * TOKEN_FRAMES, (high - self.base) * TOKEN_FRAMES)
 
     def _known(self, first: int, stop: int) -> Tensor:
         """What is given after the context is given throughout."""

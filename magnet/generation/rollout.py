@@ -193,7 +193,7 @@ class Rollout:
         self.there: float = self.length
         self.expected = Expected(receptive_field(model)[1])
         self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
-        self.world = WorldState(model, self._given(0, 0), schedule, o, samples, self.stats)
+        self.world = WorldState(model, self._given(0, 0), schedule, o, samples, stats)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         self.body_guidance = None if o.body_guidance == "off" else BodyGuidance.of(self.world, grid)
@@ -279,9 +279,8 @@ class Rollout:
         changes = (begins != ends).any(dim=-1)
         self._asked = torch.nn.functional.pad(changes, (0, 0, 0, stage.ahead))
         # Where attention is causal, what lies before the first change is the same in all steps of a stage.
-        block = self.model.network.causal_block
-        still = int(changes.any(dim=1).int().argmax()) // block * block if block else 0
-        self._memory = Memory(still) if still else None
+        block, rows = self.model.network.causal_block, changes.any(dim=1).nonzero()[:, 0].tolist() or [0]
+        self._memory: Memory | None = Memory(rows[0] // block * block if block else 0, (rows[0], rows[-1] + 1))
 
     def _network(self) -> Callable[..., Tensor]:
         """What predicts: the transformer as it was trained, or its lean form."""
@@ -341,7 +340,7 @@ class Rollout:
         surplus = min(stop - behind, needed - 1) - self.first
         if surplus > 0:
             self.world.release(surplus)
-            self.tokens, self.mask_noise = self.tokens[:, surplus:].clone(), self.mask_noise[:, surplus:].clone()
+            self.tokens, self.mask_noise = self.tokens[:, surplus:], self.mask_noise[:, surplus:]
             self.history = None if self.history is None else self.history.release(surplus)
             self.first += surplus
         given = self._known(start, stop).repeat_interleave(TOKEN_FRAMES, dim=0).to(made.device)

@@ -125,7 +125,7 @@ def preview(
     """
     shown = copy.copy(world)
     shown.T_world_can, shown.placed = world.T_world_can.clone(), world.placed.clone()
-    shown.stats = type(world.stats)()
+    shown.stats = None
     stop = first + estimate.shape[1]
     finished = torch.zeros_like(shown.placed)
     finished[first:stop] = ~shown.placed[first:stop] & wanted

@@ -46,7 +46,7 @@ class WorldState:
         schedule: the plan of the whole scene; only what it knows is read.
         options: how to sample.
         samples: scenes drawn for each of B.
-        stats: filled.
+        stats: filled, where given.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class WorldState:
     ) -> None:
         self.model = model
         self.options = options
-        self.stats = stats or SamplingStats()
+        self.stats = stats
         self.samples = samples
         self.known = schedule.known[: given.frames // TOKEN_FRAMES]
         self.given = given.repeat(samples)
@@ -84,15 +84,17 @@ class WorldState:
         self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
 
     def release(self, rows: int) -> None:
-        """Release the first rows, on which nothing that may still change depends: one row before it must stay."""
+        """Release the first rows, on which nothing that may still change depends: one row before it must stay.
+
+        What is left is a view of what was, which goes when rows are added.
+        """
         frames = rows * TOKEN_FRAMES
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
-        self.known, self.placed = self.known[rows:].clone(), self.placed[rows:].clone()
-        self.T_world_can = self.T_world_can[:, frames:].clone()
-        kept = self.given.slice(frames)
-        self.given = kept.replace(body_rot=kept.body_rot.clone(), T_world_root=kept.T_world_root.clone())
+        self.known, self.placed = self.known[rows:], self.placed[rows:]
+        self.T_world_can, self.given = self.T_world_can[:, frames:], self.given.slice(frames)
 
+    @torch.inference_mode()
     def make_consistent(self, tokens: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:
         """Make the tokens that a stage finished self-consistent, in place. tokens (B, N, P, D), finished (N, P) bool
 
@@ -109,7 +111,8 @@ class WorldState:
         if self.model.quantized if self.options.requantize is None else self.options.requantize:
             new = finished[first:stop].to(tokens.device)
             code = self.model.tokenizer.requantize(latent)
-            self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
+            if self.stats is not None:
+                self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
@@ -126,7 +129,7 @@ class WorldState:
         implied = pairwise_by_token(to_9d(pairwise(here, partner)))
         settled = layout.pack(latent, true_deltas, implied)
         changed_groups = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
-        if layout.slots:
+        if layout.slots and self.stats is not None:
             together = (layout.group_present(self.given.present)[:, None] & changed_groups)[:, first - begin :, :, 1:]
             if decentralized:
                 new = finished[first:stop].to(tokens.device)

@@ -112,6 +112,8 @@ class Guidance:
         Clean tokens are history. A branch that must not see someone's history has it at level K, as noise.
         tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
         """
+        if self.kind == "none" and not self.stabilization_level:
+            return denoise(tokens, levels, present)
         B, _, P, _ = tokens.shape
         there = present.any(dim=0)
         sees = self.branches(there)  # (K, P)

@@ -70,6 +70,7 @@ class StagePlan:
     last: Tensor
 
 
+@torch.inference_mode()
 def run_planned_stage(
     denoise: DenoiseFn,
     stage: Stage,

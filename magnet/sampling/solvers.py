@@ -40,8 +40,8 @@ class History:
         return History(torch.cat([self.clean, more.clean], dim=1), torch.cat([self.levels, more.levels]))
 
     def release(self, rows: int) -> History:
-        """Without the first token steps."""
-        return History(self.clean[:, rows:].clone(), self.levels[rows:].clone())
+        """Without the first token steps, as a view: `extend` lets them go."""
+        return History(self.clean[:, rows:], self.levels[rows:])
 
     def window(self, rows: slice) -> History:
         """Some token steps, as a view: writing to it writes to this history."""

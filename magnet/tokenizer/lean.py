@@ -180,7 +180,7 @@ class Growing:
     final: int
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def decoded(
     tokenizer: PoseTokenizer,
     latent: Tensor,
@@ -210,7 +210,7 @@ def encoded_plainly(tokenizer: PoseTokenizer, scene: Scene, quantize: bool, toke
     return tokenizer.encode_scene(scene, quantize).float()[:, tokens]
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def encoded(
     tokenizer: PoseTokenizer, scene: Scene, quantize: bool, tokens: slice, growing: Growing | None = None
 ) -> Tensor:

@@ -152,6 +152,26 @@ def test_a_memory_spares_what_it_holds_and_needs_causal_attention(monkeypatch: p
         LeanTransformer(network())(noisy, levels, present, None, wanted, Memory(4))
 
 
+@pytest.mark.parametrize("options", KINDS, ids=str)
+@pytest.mark.parametrize("present", PRESENT.values(), ids=PRESENT.keys())
+@torch.no_grad()
+def test_what_a_stage_does_not_change_enters_once(options: dict[str, Any], present: Tensor) -> None:
+    """Bit for bit: a row of the first layers does not depend on how many there are."""
+    made = LeanTransformer(network(**options))
+    noisy, levels, _ = question(made, 4, 6)  # type: ignore[arg-type]
+    memory, entered, first = Memory(changes=(2, 4)), [], made.entry[0]
+    made.entry[0] = lambda x: (entered.append(x.shape[1]), first(x))[1]
+    for _ in range(3):
+        noisy, levels = noisy.clone(), levels.clone()
+        noisy[:, 2:4] += 1.0
+        levels[:, 2:4] //= 2
+        entered.clear()
+        cached = made(noisy, levels, present, None, None, memory)
+        rows = set(entered)
+        assert torch.equal(cached, made(noisy, levels, present))
+    assert rows == {2}
+
+
 @pytest.mark.parametrize("task", ["joint_future", "motion_control", "agentic_async"])
 @pytest.mark.parametrize("solver", ["ddim", "dpmpp_2m"])
 @torch.no_grad()

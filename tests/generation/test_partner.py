@@ -195,3 +195,16 @@ def test_an_answer_takes_the_same_work_however_long_the_past():
     assert max(late) <= max(early), (early, late)
     held = partner.stream
     assert held.tokens.shape[1] <= 2 * (8 + sum(model.tokenizer.receptive_field)) + 4
+
+
+@pytest.mark.parametrize(("precision", "most"), [("float32", 2500), ("bf16", 2500)])
+def test_an_answer_is_few_operators(precision: str, most: int) -> None:
+    """Each is so small that its call is its time; a sixth more were work done again."""
+    model = tiny_denoiser(max_agents=2, window=8)
+    scene = random_scene(1, 80, 2, torch.Generator().manual_seed(0))
+    options = SamplerOptions(steps=4, precision=precision, any_floor=True)  # type: ignore[arg-type]
+    partner = Partner(model, scene.slice(0, 32), (0,), options, torch.Generator().manual_seed(0))
+    partner.answer(scene.slice(32, 76))
+    with Counting() as mode:
+        partner.answer(scene.slice(76, 80))
+    assert mode.operators <= most
