@@ -72,11 +72,13 @@ def private(name: str) -> bool:
 
 def defined(tree: ast.Module) -> set[str]:
     """Names that a file gives to functions, classes, variables and attributes."""
-    made = {node.name for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
-    made |= {
-        node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
-    }
-    return made | {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    made = set()
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            made.add(node.name)
+        elif isinstance(node, (ast.Attribute, ast.Name)) and isinstance(node.ctx, ast.Store):
+            made.add(node.attr if isinstance(node, ast.Attribute) else node.id)
+    return made
 
 
 def reached_for(tree: ast.Module) -> Iterator[tuple[int, str]]:

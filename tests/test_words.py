@@ -28,11 +28,15 @@ def test_no_class_name_exists_twice():
     assert not twice, f"one word for one thing: {twice}"
 
 
+@functools.cache
+def tokens(path: Path) -> list[tuple[int, str]]:
+    """Kind and text of each word of a source file."""
+    return [(token.type, token.string) for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline)]
+
+
 def texts(path: Path) -> Iterator[str]:
     """Comments and strings of a source file, docstrings among them."""
-    for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
-        if token.type in (tokenize.COMMENT, tokenize.STRING):
-            yield token.string
+    return (text for kind, text in tokens(path) if kind in (tokenize.COMMENT, tokenize.STRING))
 
 
 def test_every_page_that_the_code_names_is_in_the_repository():
@@ -68,8 +72,7 @@ def names() -> set[str]:
     """Every name that the package's code uses, and its modules."""
     found = {path.stem for path in SOURCES}
     for path in SOURCES:
-        tokens = tokenize.generate_tokens(io.StringIO(path.read_text()).readline)
-        found |= {token.string for token in tokens if token.type == tokenize.NAME}
+        found |= {text for kind, text in tokens(path) if kind == tokenize.NAME}
     return found
 
 

@@ -288,10 +288,10 @@ def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name,
     options = SamplerOptions(steps=1 + 3 * bool(pyramid_offset), stride=4, pyramid_offset=pyramid_offset)
     short = recording.slice(0, context).select([0])
     ended, begun = (
-        cat_time(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 5)))
-        for frames in (300, None)
+        cat_time(list(itertools.islice(streamed(model, short, TASKS[name], context, frames, 8, options), 3)))
+        for frames in (200, None)
     )
-    assert begun.frames == 5 * 32
+    assert begun.frames == 3 * 32
     assert same(ended, begun)
 
 
