@@ -98,25 +98,28 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
     raise ValueError(f"no checkpoint {name_or_path}: not a file, nor a model that comes with the package ({there})")
 
 
-def read(path: str | Path) -> dict[str, Any]:
+def read(path: str | Path, halves: bool = False) -> dict[str, Any]:
     """A checkpoint as Lightning wants it, from a released folder or a file of Lightning's own, of any version.
+
+    `halves`: weights that were released in float16 stay so, for a caller who copies them into a model at once; else
+    as much memory as the model takes would be held beside it, and not all of it comes back.
 
     Raises:
         ValueError: not a checkpoint, damaged, or of a later format.
     """
     path = Path(path)
     verify(path)
-    return load(path)
+    return load(path, halves=halves)
 
 
-def load(path: Path, mmap: bool = False) -> dict[str, Any]:
+def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]:
     """As `read`, of a file that is known to be whole; with `mmap` only what is looked at is read from the disk.
 
     Raises:
         ValueError: not a checkpoint, or of a later format.
     """
     if path.is_dir():
-        return renamed_checkpoint(_read_folder(path))
+        return renamed_checkpoint(_read_folder(path, halves))
     try:
         mapped = mmap and zipfile.is_zipfile(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
@@ -183,7 +186,7 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
     write_whole(path.parent, beside.name, line, advice=advice)
 
 
-def _read_folder(folder: Path) -> dict[str, Any]:
+def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder}: a folder without config.json is no released model")
     try:
@@ -204,7 +207,7 @@ def _read_folder(folder: Path) -> dict[str, Any]:
         if file_hash(file) != digest:
             raise ValueError(f"{file} is damaged: its hash is not the one in config.json: fetch the release again")
         for name, value in load_file(file).items():
-            state[name] = value.float() if value.dtype == torch.float16 else value
+            state[name] = value if halves or value.dtype != torch.float16 else value.float()
     return {
         "state_dict": state,
         "pytorch-lightning_version": "2.6.4",

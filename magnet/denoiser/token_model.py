@@ -118,7 +118,7 @@ class TokenModel(L.LightningModule):
             ValueError: no such checkpoint, or not a denoiser's.
         """
         path = checkpoints.resolve(name_or_path)
-        checkpoint = checkpoints.read(path)
+        checkpoint = checkpoints.read(path, halves=True)
         if "tokenizer_hyper_parameters" not in checkpoint:
             raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
         fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these

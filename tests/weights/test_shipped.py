@@ -29,6 +29,13 @@ def test_it_is_complete_and_small():
     assert checkpoints.read(folder)["state_dict"]
 
 
+def test_a_loaded_model_holds_all_that_training_and_saving_need(model):
+    read, held = checkpoints.read(checkpoints.resolve())["state_dict"], model.state_dict()
+    assert read.keys() == held.keys()
+    assert all(torch.equal(value, held[name]) and value.dtype == held[name].dtype for name, value in read.items())
+    assert all(weight.requires_grad for weight in model.transformer.parameters())
+
+
 def test_it_says_what_it_was_trained_on_and_names_no_machine():
     text = (checkpoints.resolve() / "config.json").read_text()
     config = json.loads(text)

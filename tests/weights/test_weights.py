@@ -35,6 +35,14 @@ def test_a_released_model_comes_back(checkpoint, tmp_path):
     assert all(back[key] == checkpoint[key] for key in (*checkpoints.KEPT, "global_step"))
 
 
+def test_weights_released_in_half_are_widened_where_they_are_wanted(checkpoint, tmp_path):
+    folder = checkpoints.write(checkpoint, tmp_path)
+    kept, wide = (checkpoints.read(folder, halves=halves)["state_dict"] for halves in (True, False))
+    assert (kept["big"].dtype, kept["bias"].dtype) == (torch.float16, torch.float32)
+    assert wide["big"].dtype == torch.float32
+    assert all(torch.equal(kept[name].to(wide[name].dtype), wide[name]) for name in wide)
+
+
 def test_no_part_is_larger_than_the_limit(checkpoint, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "PART_BYTES", 10_000)
     folder = checkpoints.write({**checkpoint, "state_dict": {str(i): torch.randn(50, 40) for i in range(9)}}, tmp_path)
