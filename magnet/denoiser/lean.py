@@ -227,9 +227,11 @@ class LeanTransformer:
             return made
         if not same:
             memory.span, memory.entered = span, made
-        else:
-            for kept, new in zip(memory.entered, made, strict=True):
-                kept[:, begins - span[0] : ends - span[0]] = new
+        else:  # not in place: a stage's steps are made in inference mode, and may be asked again outside
+            low, high, kept = begins - span[0], ends - span[0], memory.entered
+            memory.entered = [
+                torch.cat([x[:, :low], new, x[:, high:]], dim=1) for x, new in zip(kept, made, strict=True)
+            ]
         return memory.entered
 
     def _first(
