@@ -63,7 +63,8 @@ def contact_sheet(
     for i, moment in enumerate(moments):
         ink = PINK if moment < context else GENERATED
         place = (left + (i + 0.5) * cell[0], top - 13 * unit)
-        draw.text(place, _time(moment, context, first.fps), fill=ink, font=font(15 * unit), anchor="mm")
+        seconds = f"{(moment - context + 1) / first.fps:+.2f} s" if context else f"{moment / first.fps:.2f} s"
+        draw.text(place, seconds, fill=ink, font=font(15 * unit), anchor="mm")
         for row, group in enumerate(people):
             page.paste(paint(group, views[row][moment], moment), (left + i * cell[0], top + row * cell[1]))
     for row, (label, _) in enumerate(rows):
@@ -77,10 +78,6 @@ def contact_sheet(
     path.parent.mkdir(parents=True, exist_ok=True)
     page.save(path)
     return path
-
-
-def _time(frame: int, context_frames: int, fps: float) -> str:
-    return f"{(frame - context_frames + 1) / fps:+.2f} s" if context_frames else f"{frame / fps:.2f} s"
 
 
 def _broken(label: str, wide: int = 16) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,10 +15,7 @@ from magnet.sampling.noise import LEVELS
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.sampling.solvers import History
-
-if TYPE_CHECKING:
-    from magnet.tasks.base import Task
-
+from magnet.tasks.base import Task
 
 TASK_GRIDS = (
     Grid(30, 2, 8, steps=4),

@@ -7,11 +7,11 @@ import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.module import Denoiser
 from magnet.generation.conditioning import task_lookahead_limit
 from magnet.generation.rollout import Rollout
 from magnet.motion.scene import Scene, cat_time
@@ -19,11 +19,8 @@ from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
+from magnet.tasks.base import Task
 from magnet.testing.models import random_scene, tiny_denoiser
-
-if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
-    from magnet.tasks.base import Task
 
 AFTER = 4
 """Token steps sampled beyond those that are compared: time enough for what came later to reach back."""
