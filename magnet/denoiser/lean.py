@@ -238,15 +238,12 @@ class LeanTransformer:
         self, noisy: Tensor, levels: Tensor, present: Tensor, scenes: Tensor | None, slots: slice | Tensor
     ) -> Tensor:
         """The layers before the first block, of some slots of some scenes. -> (B, n, p, d)"""
-        own = self.layout.group_levels(levels)
-        if not everybody(present):
-            own = torch.where(self.layout.group_present(present)[:, None], own, LEVELS)
         if scenes is not None:
-            noisy, own, present = noisy[scenes], own[scenes], present[scenes]
-        noisy, own = noisy[:, :, slots], own[:, :, slots]
+            noisy, levels, present = noisy[scenes], levels[scenes], present[scenes]
+        noisy, own = noisy[:, :, slots], self.layout.group_levels(levels)[:, :, slots]
         if not everybody(present):
-            there = self.layout.group_present(present)[:, slots]
-            noisy = torch.where(self.layout.spread(there)[:, None], noisy, 0.0)
+            there = self.layout.group_present(present)[:, None, slots]
+            own, noisy = torch.where(there, own, LEVELS), torch.where(self.layout.spread(there), noisy, 0.0)
         parts = [noisy, self.levels[own[..., 0]]]
         if self.layout.slots:
             parts.append(self.slots[own[..., 1:]].flatten(-2))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from magnet.denoiser.lean import Memory, lean
+from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
@@ -280,6 +280,7 @@ class Rollout:
         self._asked = torch.nn.functional.pad(changes, (0, 0, 0, stage.ahead))
         # Where attention is causal, what lies before the first change is the same in all steps of a stage.
         block, rows = self.model.network.causal_block, changes.any(dim=1).nonzero()[:, 0].tolist() or [0]
+        self._packed: LeanTransformer | None = None
         self._memory: Memory | None = Memory(rows[0] // block * block if block else 0, (rows[0], rows[-1] + 1))
 
     def _network(self) -> Callable[..., Tensor]:
@@ -293,7 +294,8 @@ class Rollout:
         if self._left == 0 and self.expected.most:
             self._asked[len(self._asked) - self._ahead :] = True
         asked = None if whole else self._asked
-        return functools.partial(lean(network, precision), wanted=asked, memory=self._memory)
+        packed = self._packed = self._packed or lean(network, precision)  # a stage looks once whether weights changed
+        return functools.partial(packed, wanted=asked, memory=self._memory)
 
     def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""
@@ -308,9 +310,9 @@ class Rollout:
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
         width = noisy.shape[1]
-        # What lies ahead is nobody's: it is shown as the mean of pure noise, which tells nothing of anybody.
-        noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
-        levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
+        if self._ahead:  # nobody's: shown as the mean of pure noise, which tells nothing of anybody
+            noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
+            levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
             cond = self._condition(*noisy.shape[:2])
             clean = self.model.denoise(noisy, levels, present, cond, self._network()).float()

@@ -10,6 +10,8 @@ import torch.utils._python_dispatch
 import magnet
 from magnet.api import Model
 from magnet.datamodules.synthetic import Synthetic
+from magnet.denoiser.lean import lean
+from magnet.generation import rollout
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
@@ -208,3 +210,11 @@ def test_an_answer_is_few_operators(precision: str, most: int) -> None:
     with Counting() as mode:
         partner.answer(scene.slice(76, 80))
     assert mode.operators <= most
+
+
+def test_weights_are_looked_at_once_a_stage(model, duet, monkeypatch):
+    """Whether they have changed takes a look at each: no step of an answer needs it again."""
+    partner, looked = Partner(model, duet.slice(0, 16), (0,), FAST), []
+    monkeypatch.setattr(rollout, "lean", lambda *asked: (looked.append(asked), lean(*asked))[1])
+    partner.answer(duet.slice(16, 20))
+    assert len(looked) == 1 < FAST.steps
