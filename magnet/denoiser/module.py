@@ -43,7 +43,7 @@ class Denoiser(TokenModel):
             `duet`. `raw` uses plain poses instead (ablation, paper Table 5). A checkpoint of this module brings its
             own, and this is then not read.
         max_agents: agent slots P; smaller scenes leave slots empty. Linked to the data's.
-        window: token steps that the model sees at once; 16 tokens are 64 frames. Linked to the data's.
+        window: token steps that the model sees at once; 16 are 64 frames. Linked to the data's.
         target: what of the pose is generated: `quantized`, the tokenizer's codes, as in the paper, or `continuous`,
             its encoder's latents before they are rounded to codes (ours); sampling follows.
         start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
@@ -53,7 +53,7 @@ class Denoiser(TokenModel):
         loss: weights of the terms.
         self_forcing: training on a past that the model has made itself.
         optimizer: AdamW, or Muon for matrices.
-        compile: compile the transformer's blocks for training; worth it on a GPU, not on a CPU.
+        compile: compile the blocks for training; worth it on a GPU, not on a CPU.
         seed: all training noise follows from it.
     """
 

@@ -104,16 +104,15 @@ class DenoiserLoss:
         pairwise: lambda_2 of paper Eq. 10.
         consistency: lambda_3 of paper Eq. 10, for rotation and translation alike.
         consistency_warmup: training steps over which lambda_3 grows from 0.
-        near: error of pairwise transforms in which centimetres near a partner count (ours); see
-            `magnet.denoiser.losses.near_loss`.
-        shake: error of how deltas change from frame to frame (ours); see `magnet.denoiser.losses.shake_loss`.
+        near: error of pairwise transforms in which centimetres near a partner count (ours).
+        shake: error of how deltas change from frame to frame (ours).
         unfused: weight of the same three terms on the network's own deltas and pairwise transforms, where
             `network.pairwise_posterior` replaces them (ours).
         joint: distance of the decoded joints, in metres (ours); see `magnet.denoiser.body_losses`.
         velocity: error of the decoded joints' velocities, in m/s (ours).
         partner: distance of the partners' decoded joints, as each sees them, in metres (ours).
         hands: error of the vectors between people's wrists within reach, in metres (ours).
-        decoded_share: share of a batch's scenes, the least noisy ones, that are decoded for these four.
+        decoded_share: share of a batch's scenes, the least noisy, that are decoded for these four.
         weighting: how much a token's error counts by its noise: `uniform`, as in the paper, or `min_snr`; see
             `magnet.denoiser.losses.snr_weights`.
         snr_gamma: gamma of `min_snr`, the most that an error counts.
@@ -150,7 +149,7 @@ class SelfForcing:
     changes no training.
 
     Args:
-        share: of the training scenes with a past, how many show it as the model would have made it.
+        share: of training scenes with a past, how many show it as the model would make it.
         placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.placement.place`.
         pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
         displaced: share of the training scenes in which people stand a little off at first and come back, as those must

@@ -67,7 +67,7 @@ class Tokenizer(L.LightningModule):
         start_from: checkpoint of a tokenizer, or of a denoiser with one, or the name of a shipped model such as `duet`,
             whose encoder and decoder training starts from; codes start anew where there is another number of them.
         decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
-            trained on them takes the new decoder as it is.
+            trained on them can take it.
         compile: compile encoder and decoder for training; worth it on a GPU, not on a CPU.
         seed: the start and the revival of codes follow from it.
     """

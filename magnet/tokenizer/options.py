@@ -112,7 +112,7 @@ class AugmentOptions:
 
     Args:
         limb_swap_prob: share of limbs that move as somebody else's of the batch do.
-        joint_noise: standard deviation in radians of a random rotation of each joint, the same in all frames.
+        joint_noise: each joint is turned at random, alike in all frames; standard deviation, radians.
         root_noise: the deltas that the decoder is given are off by up to so many m/s, as sampled ones are; with the
             loss `foot_contact` the decoder learns to keep feet where they stand.
     """

@@ -21,7 +21,7 @@ class OptimizerOptions:
         learning_rate: the highest, paper A.3.
         weight_decay: paper A.3.
         warmup_steps: training steps until the rate is at its highest; the paper does not say.
-        muon: matrices step by Muon, this many times as far as by AdamW; 0: by AdamW, as in the paper.
+        muon: over 0: matrices step by Muon, so many times as far (ours).
     """
 
     learning_rate: float = 2e-4
