@@ -10,6 +10,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # The default before: it loses a quarter of the variance, and with it much of what the shipped model gets wrong.
     "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even"},
+    # Without rolling: for models with `network.skip`, such as `duet3`, which calm down where the levels are a ramp.
+    "strides": {"stride": 12, "pyramid_offset": 0},
     "paper": {
         "steps": 30,  # A.3
         "stride": 4,  # 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
@@ -40,8 +42,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "settle_blocks": False,
     },
 }
-"""Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four; `paper`
-gives every field, so that it stays the paper's whatever the defaults become."""
+"""Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four, `strides`
+for `duet3`; `paper` gives every field, so that it stays the paper's whatever the defaults become."""
 
 
 def preset_fields(name: str) -> dict[str, Any]:

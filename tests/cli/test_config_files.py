@@ -95,10 +95,10 @@ def test_a_wrong_preset_in_a_file_suggests_the_closest(toy: Path, capsys: pytest
 
 def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["test", "--help", "sampler"]) == 0
-    assert "--sampler PRESET      default or steady or paper, or a file" in capsys.readouterr().out
+    assert "--sampler PRESET      default or steady or strides or paper, or a file" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         view.arguments_of(["--help"])
-    assert "default or steady or paper" in capsys.readouterr().out
+    assert "default or steady or strides or paper" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
