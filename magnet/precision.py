@@ -56,3 +56,16 @@ def device_of(device: str | torch.device) -> torch.device:
     if not there.get(place.type, True):
         raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
     return place
+
+
+def quick_bf16(device: torch.device) -> bool:
+    """Whether a device multiplies matrices in bfloat16; a CPU without AVX-512 emulates it, some eighty times slower."""
+    return device.type != "cpu" or torch.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
+
+
+def quick_precision(precision: Any, accelerator: Any) -> Any:
+    """A Trainer's precision, float32 in place of `bf16-mixed` where only a CPU that emulates bfloat16 would train."""
+    elsewhere = accelerator == "auto" and (torch.cuda.is_available() or torch.backends.mps.is_available())
+    on_cpu = accelerator in ("auto", "cpu") and not elsewhere
+    slow = precision == "bf16-mixed" and on_cpu and not quick_bf16(torch.device("cpu"))
+    return "32-true" if slow else precision

@@ -13,7 +13,7 @@ from magnet.body import load_body
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
-from magnet.precision import Float32
+from magnet.precision import Float32, quick_precision
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
@@ -87,3 +87,19 @@ def test_a_trainer_that_would_convert_scenes_is_refused(part, precision, tmp_pat
     loader = DataLoader([random_scene(1, 64, 2, torch.Generator().manual_seed(0))], batch_size=None)
     with pytest.raises(ValueError, match=f"^trainer.precision {precision} would convert scenes too"):
         trainer.validate(model if part == "denoiser" else model.tokenizer, loader, verbose=False)
+
+
+@pytest.mark.parametrize("capability, taken", [("AVX2", "32-true"), ("DEFAULT", "32-true"), ("AVX512", "bf16-mixed")])
+def test_a_processor_that_emulates_bfloat16_trains_in_float32(
+    capability: str, taken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert quick_precision("bf16-mixed", "cpu") == taken
+
+
+@pytest.mark.parametrize("precision, accelerator", [("16-mixed", "cpu"), ("bf16-mixed", "gpu"), (None, "auto")])
+def test_what_else_was_asked_for_stays(
+    precision: str | None, accelerator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
+    assert quick_precision(precision, accelerator) == precision

@@ -30,6 +30,7 @@ from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
 from magnet.motion.scene import Scene
 from magnet.old_names import OPTIONS
+from magnet.precision import quick_precision
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
@@ -261,9 +262,19 @@ class MagnetCLI(LightningCLI):
             "callbacks": callbacks,
             "logger": logger or False,
             "plugins": plugins,
+            "precision": self._precision(config),
             "default_root_dir": config.get("default_root_dir") or str(self.folder),
         }
         return self.trainer_class(**{**config, **changes, **kwargs})
+
+    def _precision(self, config: Any) -> Any:
+        asked = config.get("precision")
+        taken = quick_precision(asked, config.get("accelerator") or "auto")
+        if taken != asked:
+            print(
+                f"{asked}: this processor only emulates bfloat16, which takes many times as long; it is float32 instead"
+            )
+        return taken
 
     def _refuse_overwriting(self) -> None:
         own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents

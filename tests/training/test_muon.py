@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from magnet.training.muon import MuonAdamW
+from magnet.training.muon import MuonAdamW, orthogonal
 
 
 def small_net() -> nn.Module:
@@ -33,7 +33,8 @@ def steps(net: nn.Module, optimizer: torch.optim.Optimizer, count: int) -> list[
 
 
 @pytest.mark.parametrize("faster", [1.0, 3.0])
-def test_a_step_is_the_one_of_torchs_two_optimizers(faster: float) -> None:
+def test_a_step_is_the_one_of_torchs_two_optimizers(faster: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("magnet.training.muon.quick_bf16", lambda device: True)
     ours, theirs = small_net(), small_net()
     optimizer = MuonAdamW(ours.parameters(), lr=1e-2, weight_decay=0.1, faster=faster)
     matrices = [p for p in theirs.parameters() if p.ndim == 2]
@@ -49,6 +50,34 @@ def test_a_step_is_the_one_of_torchs_two_optimizers(faster: float) -> None:
         adamw.step()
     for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(5, 9), (9, 5), (6, 6)])
+def test_a_matrix_becomes_nearly_orthogonal(shape: tuple[int, int]) -> None:
+    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    made = orthogonal(matrix)
+    left, _, right = torch.linalg.svd(matrix, full_matrices=False)
+    assert torch.linalg.svdvals(made).sub(1).abs().max() < 0.35
+    assert (left.T @ made @ right.T - torch.diag(torch.linalg.svdvals(made).new_ones(min(shape)))).abs().max() < 0.35
+
+
+@pytest.mark.parametrize("shape", [(5, 9), (9, 5)])
+def test_where_bf16_is_emulated_a_step_is_torchs_to_its_rounding(
+    shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.training.muon.quick_bf16", lambda device: False)
+    torch.manual_seed(0)
+    ours = nn.Parameter(torch.randn(shape))
+    theirs = nn.Parameter(ours.detach().clone())
+    optimizer = MuonAdamW([ours, nn.Parameter(torch.zeros(2))], lr=1e-2, weight_decay=0.1)
+    muon = torch.optim.Muon([theirs], lr=1e-2, weight_decay=0.1, adjust_lr_fn="match_rms_adamw")
+    for _ in range(3):
+        ours.grad = torch.randn(shape)
+        theirs.grad = ours.grad.clone()
+        optimizer.step()
+        muon.step()
+    moved = 3 * 1e-2 * 0.2 * max(shape) ** 0.5
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=0.02 * moved)
 
 
 def test_it_learns() -> None:
