@@ -8,8 +8,9 @@ from torch.nn import functional as F
 
 from magnet.body.apart import lifted
 from magnet.body.base import Body
+from magnet.body.holding import holds
 from magnet.body.joints import TOES
-from magnet.body.settle_wishes import SLIDES, Wishes, holds
+from magnet.body.settle_wishes import SLIDES, Wishes
 from magnet.motion.frames import from_planar
 from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene

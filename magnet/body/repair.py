@@ -13,7 +13,7 @@ from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
 from magnet.body.drift import moved_over_ground, undrifted
 from magnet.body.settle import Settle, corrected, correction
-from magnet.body.settle_wishes import SLIDES, Wishes
+from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
 from magnet.motion.scene import FPS, Scene
 
 DEEP: dict[str, Apart] = {
@@ -56,7 +56,8 @@ def repaired(
     Args:
         scene: (B, T, P); above 45 fps corrections are computed for about 30 frames a second.
         body: the body of its shape numbers.
-        how: `light` or `firm`, see `CONTACT`.
+        how: `light` or `firm`, see `CONTACT`; or `hold`: as `firm`, and hands that met go on holding
+            (`magnet.body.holding.lasting_holds`).
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; they come back bit-identical.
         settle: how poses are corrected.
         begun: the motion continues a past that stays, so corrections grow from 0.
@@ -86,14 +87,15 @@ def settling(
     begun: bool = False,
     past: Tensor | None = None,
     slides: float = SLIDES,
+    holding: Tensor | None = None,
 ) -> Tensor:
     """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
-    Arguments as for `repaired` and `correction`.
+    Arguments as for `repaired`, `Wishes.of` and `correction`.
     """
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
-    toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[how], begun, scene.fps)
-    wishes = Wishes.of(scene, body, how, slides, begun=begun)
+    toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
+    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding)
     first, second = torch.triu_indices(scene.agents, scene.agents, 1)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.

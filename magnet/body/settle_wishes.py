@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.body.base import Body
-from magnet.body.energy import CONTACT, GRAVITY, Contact, hand_points
+from magnet.body.energy import CONTACT, GRAVITY, Contact
 from magnet.body.fit import clearance
+from magnet.body.holding import holds, lasting_holds
 from magnet.body.joints import FEET, TOES
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
 
-HELD = 0.20
-"""Metres between the middles of two hands that hold each other, as in the metric."""
+FIRM = {"hold": "firm"}
+"""How deep people may be in each other by `hold`: as by `firm`."""
 LOW = 0.05
 """Height in metres below which a toe can stand, as in the metric FS."""
 SLIDES = 0.6
@@ -42,7 +42,7 @@ class Wishes:
         highest: (B, T, P) metres over the floor that the lower foot shall be at most: 0 for who floats, as it is for
             who stands or steps, infinite for who jumps.
         held: (B, T, Q, 2, 2) bool, hands that hold, of each pair of people in the order of `combinations`.
-        between: (B, T, Q, 2, 2, 3) metres from the second's hands to the first's.
+        between: (B, T, Q, 2, 2, 3) metres from the second's hands to the first's, as it shall be.
         still: m/s at which a toe still stands.
         fps: frames a second.
     """
@@ -67,14 +67,17 @@ class Wishes:
         slides: float = SLIDES,
         still: float = 0.04,
         begun: bool = False,
+        holding: Tensor | None = None,
     ) -> Wishes:
         """The wishes that a motion (B, T, P) itself shows.
 
         Args:
-            how: a name in `CONTACT`.
+            how: a name in `CONTACT`; with `hold` hands that met go on holding (`lasting_holds`), else they keep what is
+                between them in each frame.
             slides: m/s below which a low toe is meant to stand.
             still: m/s that a standing toe is allowed.
             begun: the first frames continue others; who is in the air then may have jumped.
+            holding: (B, Q, 2, 2) bool, hands that held in the frame before the first.
         """
         joints = body.joints(scene)
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
@@ -83,13 +86,18 @@ class Wishes:
         height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)
         joints = joints.clone()
         joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
-        held, between = holds(joints, scene.present)
+        if how == "hold":
+            held, between = lasting_holds(joints, scene.present, scene.fps, holding)
+        else:
+            held, between = holds(joints, scene.present)
         stands = standing(joints, above, scene.fps, slides) & there[..., None]
         on = low_toes(joints, above) & there[..., None]
         toes = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
         heights = torch.where(on, toes, torch.nan)
         highest = torch.where(floats, 0.0, torch.where(height > FLOATS, torch.inf, height.clamp_min(LIFTED)))
-        return cls(CONTACT[how], scene.present, above, stands, heights, highest, held, between, still, scene.fps)
+        return cls(
+            CONTACT[FIRM.get(how, how)], scene.present, above, stands, heights, highest, held, between, still, scene.fps
+        )
 
     def there(self, one: int, other: int) -> Tensor:
         """Whether both of two people are there. -> (B, 1) bool"""
@@ -110,26 +118,6 @@ class Wishes:
             held=self.held[:, frames],
             between=self.between[:, frames],
         )
-
-
-def holds(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Which hands hold, and vectors between hands. (B, T, P, 22, 3), (B, P) -> (B, T, Q, 2, 2), (B, T, Q, 2, 2, 3)
-
-    Of two people the nearest pair of hands counts, and the pair of the other two hands.
-    """
-    P = joints.shape[2]
-    pairs = list(combinations(range(P), 2))
-    if not pairs:
-        empty = joints.new_zeros(*joints.shape[:2], 0, 2, 2, 3)
-        return empty[..., 0].bool(), empty
-    first, second = [i for i, _ in pairs], [j for _, j in pairs]
-    hands = hand_points(joints)
-    between = hands[:, :, first, :, None] - hands[:, :, second, None]
-    apart = between.norm(dim=-1)
-    own = apart == apart.amin(dim=-1, keepdim=True)
-    held = (apart < HELD) & own & (apart == apart.amin(dim=-2, keepdim=True))
-    both = present[:, first] & present[:, second]
-    return held & both[:, None, :, None, None], between
 
 
 def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) -> Tensor:

@@ -23,6 +23,7 @@ the air without falling comes down, and soles are not under the floor. The table
 for example:
   magnet refine demo/quartet.npz apart.npz
   magnet refine leader.bvh follower.bvh couple.glb --keep 0
+  magnet refine dance.bvh held.bvh --hands hold
   magnet refine duet.npz better.npz --plot over_time.svg
   magnet refine smplx.npz apart.npz --poses keep   # people are moved over the ground as a whole, and that is all
 """
@@ -35,6 +36,8 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument
     apart = "light lets people lean on each other, firm lets them touch (default: %(default)s)"
     add("--apart", choices=("light", "firm"), default="firm", help=apart)
+    hands = "hold: hands that met hold until they are half a metre apart; firm alone (default: %(default)s)"
+    add("--hands", choices=("keep", "hold"), default="keep", help=hands)
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
     add("--poses", choices=("correct", "keep"), default="correct", help=poses)
@@ -69,11 +72,14 @@ def main(arguments: Sequence[str] = ()) -> int:
     wrong = [agent for agent in options.keep if not 0 <= agent < got.scene.agents]
     if wrong:
         raise CommandError(f"--keep {wrong[0]}: the scene has people 0 to {got.scene.agents - 1}")
+    if options.hands == "hold" and (options.apart, options.poses) != ("firm", "correct"):
+        raise CommandError("--hands hold: goes with --apart firm and --poses correct, the defaults")
+    how = "hold" if options.hands == "hold" else options.apart
     fixed = fixed_agents(got.scene, options.keep)
     if options.poses == "keep":
         refined = moved_apart(got.scene, got.body, APART[options.apart], fixed)
     else:
-        refined = repaired(got.scene, got.body, options.apart, fixed, slides=options.slides)
+        refined = repaired(got.scene, got.body, how, fixed, slides=options.slides)
     for title, scene in (("before", got.scene), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))

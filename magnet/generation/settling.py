@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from magnet.body import Body
+from magnet.body.holding import holds
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
 from magnet.generation.separation import Decode, open_body_on
@@ -57,7 +61,7 @@ def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead
         scene: (B, T, P) bodies.
         new: (T, P) bool, who may be moved.
         unseen: (P,) bool, whom the new ones may know no further than the first frames: they are carried on from there.
-        how: `light` or `firm`.
+        how: `light`, `firm` or `hold`.
         lead: first frames that are a past; 0: none, and whoever is unseen is not there.
         decentralized: the new ones do not see each other either.
     """
@@ -106,24 +110,38 @@ def settled_block(
     return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
+class Corrected(NamedTuple):
+    """How the last frames of a chunk were corrected, for the next one."""
+
+    offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
+    holding: Tensor  # (B, Q, 2, 2) bool, hands that hold in the last
+
+
 @torch.no_grad()
-def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Tensor | None) -> tuple[Scene, Tensor]:
+def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None) -> tuple[Scene, Corrected]:
     """Bodies of a finished chunk corrected, going on from the correction of the chunk before.
 
     Args:
         scene: (B, T, P) bodies.
         fixed: (T, P) bool, who stays.
-        how: `light` or `firm`.
+        how: `light`, `firm` or `hold`.
         past: what the last call returned; None: the chunk is the first.
 
     Returns:
-        The scene, and the corrections of its last two frames.
+        The scene, and how its last frames were corrected.
     """
     body = open_body_on(scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
-    offset = settling(shaped, body, how, fixed, begun=past is not None, past=past)
+    offset, holding = (None, None) if past is None else past
+    offset = settling(shaped, body, how, fixed, begun=past is not None, past=offset, holding=holding)
     made = corrected(shaped, offset)
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]
+    held = hands_held(made, body)
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(offset[:, -2:], held)
+
+
+def hands_held(scene: Scene, body: Body) -> Tensor:
+    """Which hands hold in a scene's last frame. -> (B, Q, 2, 2) bool"""
+    return holds(body.joints(scene.slice(scene.frames - 1)), scene.present)[0][:, -1]
 
 
 def settled_on(
@@ -136,7 +154,7 @@ def settled_on(
         before: the last frames before, as shown; None: there are none, and nobody else is there yet.
         new: (T, P) bool, who may be moved.
         unseen: (P,) bool, of whom nobody knows more than `before`.
-        how: `light` or `firm`.
+        how: `light`, `firm` or `hold`.
         past: what the last call returned.
 
     Returns:
@@ -145,14 +163,16 @@ def settled_on(
     body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
     offset, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
+    holding = None
     for who in [agents == agent for agent in agents[moving]]:
         hidden = unseen | (moving & ~who)
         if before is None:
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             known = before.replace(body=body.id, valid=None, given=None)
+            holding = hands_held(known, body)
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, slides=0.0)
+        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, 0.0, holding)
         offset[:, :, who] = one[:, :, who]
     made = corrected(shaped, offset)
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]

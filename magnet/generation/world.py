@@ -13,7 +13,7 @@ from magnet.generation.blending import crossfade_given, delta_between, freeze_af
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
 from magnet.generation.conditioning import lookahead_limit, receptive_field
 from magnet.generation.separation import Decode, separated
-from magnet.generation.settling import LEAD, settled_block, settled_chunk
+from magnet.generation.settling import LEAD, Corrected, settled_block, settled_chunk
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
     align_planar,
@@ -70,7 +70,8 @@ class WorldState:
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
-        self.correction: Tensor | None = None  # of the last two frames shown, see `settled_chunk`
+        self.correction: Tensor | None = None  # of the last two frames shown, in causal plans
+        self.chunk: Corrected | None = None  # and in others
         self.uncorrected: Scene | None = None  # those frames of a causal plan without it
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
@@ -375,7 +376,7 @@ class WorldState:
         decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
         if self.options.settle != "off":
             fixed = self.by_frame(self.known[first:stop])
-            decoded, self.correction = settled_chunk(decoded, fixed, self.options.settle, self.correction)
+            decoded, self.chunk = settled_chunk(decoded, fixed, self.options.settle, self.chunk)
         return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
     def by_frame(self, rows: Tensor) -> Tensor:

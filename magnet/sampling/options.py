@@ -13,6 +13,7 @@ from magnet.sampling.presets import preset_fields
 from magnet.sampling.solvers import Solver
 
 Separation = Literal["off", "light", "firm"]
+Settling = Literal["off", "light", "firm", "hold"]
 
 
 NoiseSampling = Literal["joint", "independent"]
@@ -53,7 +54,7 @@ class SamplerOptions:
             (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
         settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
             themselves, hands held, feet still and on the floor. `light` lets people lean on each other, `firm` leaves
-            them touch.
+            them touch; with `hold`, firm too, hands that met hold until they are half a metre apart.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
@@ -82,7 +83,7 @@ class SamplerOptions:
     pairwise_weight: float = 0.02
     apart: Separation = "off"
     body_guidance: Separation = "off"
-    settle: Separation = "off"
+    settle: Settling = "off"
     settle_blocks: bool = False
     requantize: bool | None = None
     keep_given: bool = True
@@ -100,7 +101,7 @@ class SamplerOptions:
         if not isinstance(self.guidance, Guidance):
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         choices = {"placement": Placement, "solver": Solver, "precision": Precision}
-        choices |= dict.fromkeys(("apart", "body_guidance", "settle"), Separation)
+        choices |= {"apart": Separation, "body_guidance": Separation, "settle": Settling}
         for name, known in choices.items():
             require_choice(name, getattr(self, name), known)
         require_whole("steps", self.steps, 1, LEVELS)

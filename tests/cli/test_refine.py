@@ -79,7 +79,11 @@ def test_skeleton_files_of_several_people_are_refined_as_well(crowded: Scene, tm
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [(("--keep", "7"), "people 0 to 1"), (("--apart", "very"), "invalid choice")],
+    [
+        (("--keep", "7"), "people 0 to 1"),
+        (("--apart", "very"), "invalid choice"),
+        (("--hands", "hold", "--apart", "light"), "firm"),
+    ],
 )
 def test_wrong_wishes_are_told_what_was_expected(crowded: Scene, tmp_path: Path, words, said, capsys) -> None:
     scene = crowded.save(tmp_path / "crowded.npz")

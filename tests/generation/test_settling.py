@@ -11,20 +11,23 @@ import torch
 import magnet
 from magnet.body import load_body
 from magnet.body.energy import CONTACT
+from magnet.body.settle_wishes import FIRM
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
-from magnet.generation.settling import GLIDE, PACE, carried_on
+from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk
+from magnet.metrics import hand_distance
 from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.options import SamplerOptions, Separation
+from magnet.sampling.options import SamplerOptions, Separation, Settling
 from magnet.sampling.schedule import Grid
+from magnet.synthesis import synthesize
 from magnet.tasks import registry
 from magnet.testing import random_scene
 from magnet.testing.poses import pose_law
 from tests.cases import some_slow
 
-BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="firm", settle_blocks=True)
+BOTH = SamplerOptions(steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="hold", settle_blocks=True)
 GRID = Grid(12, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
 
 
@@ -36,13 +39,15 @@ def run(model, scene: Scene, name: str, options: SamplerOptions, **more) -> Scen
 
 def test_every_choice_but_off_has_its_sizes() -> None:
     assert set(get_args(Separation)) - {"off"} == set(CONTACT) == set(FARTHEST) == set(STEP)
+    assert set(get_args(Settling)) - {"off"} == {*CONTACT, *FIRM}
     assert SamplerOptions().settle == SamplerOptions().body_guidance == "off"
 
 
 @pytest.mark.parametrize("name", some_slow(registry.names(), "agentic_async", "agentic_sync", "motion_control"))
 def test_whoever_is_given_stays_bit_identical_in_every_task(model, name) -> None:
     scene = random_scene(1, 40, 3, torch.Generator().manual_seed(2))
-    plain, made = (run(model, scene, name, replace(BOTH, body_guidance=how, settle=how)) for how in ("off", "firm"))
+    plain = run(model, scene, name, replace(BOTH, body_guidance="off", settle="off"))
+    made = run(model, scene, name, BOTH)
     assert torch.equal(plain.given, made.given)
     for before, after in ((scene.body_rot, made.body_rot), (scene.T_world_root, made.T_world_root)):
         assert torch.equal(before[made.given], after[made.given]) and after.isfinite().all()
@@ -52,10 +57,10 @@ def test_whoever_is_given_stays_bit_identical_in_every_task(model, name) -> None
 CAUSAL = [name for name in registry.names() if registry.get(name)().schedule(GRID).causal]
 
 
-@pytest.mark.parametrize("what", ["body_guidance", "settle"])
+@pytest.mark.parametrize("what", [{"body_guidance": "firm"}, {"settle": "firm"}, {"settle": "hold"}], ids=str)
 @pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
 def test_no_pose_depends_on_what_is_not_known_when_it_is_shown(name, what) -> None:
-    assert pose_law(registry.get(name)(), GRID, SamplerOptions(**{what: "firm"}, settle_blocks=True))
+    assert pose_law(registry.get(name)(), GRID, SamplerOptions(**what, settle_blocks=True))
 
 
 @pytest.mark.parametrize("name", some_slow(["partner_inpainting", "joint_future"], "partner_inpainting"))
@@ -106,6 +111,25 @@ def test_people_of_the_shipped_model_are_out_of_each_other() -> None:
     plain, guided, settled = depth(), depth(body_guidance="firm"), depth(settle="firm")
     assert plain > 0.5, "two steps from nothing: people do run through each other"
     assert guided < 0.9 * plain and settled < 0.1 * plain
+
+
+def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
+    body = load_body()
+    shake = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(56, 88)
+    assert bool(hands_held(shake, body).any())
+    root = shake.T_world_root.clone()
+    away = (root[:, :, 1, :3, 3] - root[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
+    root[:, :, 1, :3, 3] += 0.25 * away / away.norm(dim=-1, keepdim=True)
+    apart, nobody = shake.replace(T_world_root=root), torch.zeros(32, 2, dtype=torch.bool)
+
+    def together(scene: Scene) -> int:
+        joints = body.joints(scene)
+        return int((hand_distance(joints[:, :, 0], joints[:, :, 1]) < 0.2).sum())
+
+    _, past = settled_chunk(shake, nobody, "hold", None)
+    assert together(settled_chunk(apart, nobody, "hold", None)[0]) < 3  # they have not met
+    assert together(settled_chunk(apart, nobody, "hold", past)[0]) > 20
+    assert together(settled_chunk(apart, nobody, "firm", past)[0]) < 3
 
 
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:

@@ -1,0 +1,123 @@
+"""Which hands hold each other, frame by frame, and over time."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magnet.body.energy import hand_points
+from magnet.motion.resample import smoothstep
+from magnet.motion.runs import true_runs
+
+HELD = 0.20
+"""Metres between the middles of two hands that hold each other, as in the metric."""
+LET_GO = 0.50
+"""Metres between two hands that held each other and do no longer; chosen on CMU's salsa (docs/tasks.md)."""
+GRIP = 0.10
+"""Metres between the middles of hands that hold: half of those held in CMU's salsa are nearer."""
+BREAK = 0.27
+"""Seconds for which hands may be further apart than `LET_GO` and still hold."""
+EASE = 0.2
+"""Seconds in which hands come together and part."""
+
+
+def between_hands(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors between the hands of each two people, and whether both are there.
+
+    joints (B, T, P, 22, 3), present (B, P) -> (B, T, Q, 2, 2, 3) metres from the second's hands to the first's, (B, Q)
+    bool; the Q pairs are in the order of `combinations`.
+    """
+    pairs = list(combinations(range(joints.shape[2]), 2))
+    first, second = [i for i, _ in pairs], [j for _, j in pairs]
+    hands = hand_points(joints)
+    return hands[:, :, first, :, None] - hands[:, :, second, None], present[:, first] & present[:, second]
+
+
+def holds(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Which hands hold in each frame, and vectors between hands. -> (B, T, Q, 2, 2) bool, (B, T, Q, 2, 2, 3)
+
+    Of two people the nearest pair of hands counts, and the pair of the other two hands. Arguments as for
+    `between_hands`.
+    """
+    between, both = between_hands(joints, present)
+    apart = between.norm(dim=-1)
+    own = apart == apart.amin(dim=-1, keepdim=True)
+    held = (apart < HELD) & own & (apart == apart.amin(dim=-2, keepdim=True))
+    return held & both[:, None, :, None, None], between
+
+
+class Hold(NamedTuple):
+    """Two hands that hold in the frames [start, stop); `worth` grows with how long and how near they are."""
+
+    worth: float
+    start: int
+    stop: int
+    pair: int
+    one: int
+    other: int
+
+
+def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Which hands hold, and the vectors that they shall have between them. -> as for `holds`
+
+    Hands that come within `HELD` hold for as long as they are within `LET_GO`, short breaks apart, before and after;
+    each hand one other. Where they are further apart than `GRIP` they are to come so near, eased at both ends.
+
+    Args:
+        joints: (B, T, P, 22, 3).
+        present: (B, P) bool.
+        fps: frames a second.
+        before: (B, Q, 2, 2) bool, hands that held in the frame before the first; None: there is none.
+    """
+    between, both = between_hands(joints, present)
+    apart = between.norm(dim=-1)
+    near = (apart < LET_GO) & both[:, None, :, None, None]
+    held, share = torch.zeros_like(near), torch.zeros_like(apart)
+    people = list(combinations(range(joints.shape[2]), 2))
+    for b in range(len(apart)):
+        busy = torch.zeros(joints.shape[2], 2, apart.shape[1], dtype=torch.bool, device=apart.device)
+        for hold in sorted(_found(apart[b], near[b], None if before is None else before[b], fps), reverse=True):
+            frames, (p, q) = slice(hold.start, hold.stop), people[hold.pair]
+            free = ~busy[p, hold.one, frames] & ~busy[q, hold.other, frames]
+            busy[p, hold.one, frames] |= free
+            busy[q, hold.other, frames] |= free
+            held[b, frames, hold.pair, hold.one, hold.other] = free
+            share[b, frames, hold.pair, hold.one, hold.other] = _eased(hold, apart.shape[1], fps).to(share)
+    shorter = GRIP / apart.clamp_min(GRIP)  # 1 where they are near enough
+    return held, between * torch.lerp(torch.ones_like(shorter), shorter, share)[..., None]
+
+
+def _found(apart: Tensor, near: Tensor, before: Tensor | None, fps: float) -> list[Hold]:
+    """The holds of each two hands by themselves. apart, near (T, Q, 2, 2), before (Q, 2, 2)"""
+    found = []
+    for pair, one, other in near.any(dim=0).nonzero().tolist():
+        metres = apart[:, pair, one, other]
+        for start, stop in _bridged(true_runs(near[:, pair, one, other].tolist()), round(BREAK * fps)):
+            held_on = start == 0 and before is not None and bool(before[pair, one, other])
+            if held_on or bool((metres[start:stop] < HELD).any()):
+                worth = float((LET_GO - metres[start:stop]).clamp_min(0).sum())
+                found.append(Hold(worth, start, stop, pair, one, other))
+    return found
+
+
+def _bridged(runs: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
+    """Runs with those joined between which at most `gap` frames lie."""
+    joined: list[tuple[int, int]] = []
+    for start, stop in runs:
+        if joined and start - joined[-1][1] <= gap:
+            joined[-1] = (joined[-1][0], stop)
+        else:
+            joined.append((start, stop))
+    return joined
+
+
+def _eased(hold: Hold, frames: int, fps: float) -> Tensor:
+    """How far hands follow a hold, 0 to 1, in each of its frames; the first and last of a motion need no easing."""
+    count, length = hold.stop - hold.start, max(EASE * fps, 1.0)
+    into = torch.arange(1, count + 1) / length
+    rise = torch.ones(count) if hold.start == 0 else into
+    fall = torch.ones(count) if hold.stop == frames else into.flip(0)
+    return smoothstep(torch.minimum(rise, fall).clamp(0, 1))
