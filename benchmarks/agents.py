@@ -3,7 +3,9 @@
     MAGNET_CMU=... python benchmarks/agents.py --out runs/results/agents
 
 Two agents in step go on from recorded test takes, each in its own view (`magnet.agents`), through a link that loses or
-delays their tokens. Beside the table a picture is written; delay 0 is a token that comes before the next is made.
+delays their tokens. Every start is gone on from several times, with other noise. Beside the table a picture is written;
+delay 0 is a token that comes before the next is made. After each value is what it varies by: the standard error over
+the repetitions, which says nothing of other starts.
 """
 
 from __future__ import annotations
@@ -94,20 +96,38 @@ def run(model: Denoiser, scene: Scene, options: SamplerOptions, link: Lossy, see
     return cat_time([scene.slice(0, CONTEXT).replace(given=None), new.replace(given=None)]), members[0].gaps
 
 
-def measured(model: Denoiser, scenes: Scene, options: SamplerOptions, loss: float, delay: int) -> dict[str, Any]:
-    """Metrics of the generated second half of all scenes."""
-    made, gaps, begun = [], 0, time.perf_counter()
-    for number in range(scenes.scenes):
-        link = Lossy(loss, 1 + delay, generator=torch.Generator().manual_seed(number))
-        scene, missing = run(model, scenes.select([number]), options, link, number)
-        made.append(scene)
-        gaps += missing
+def scored(made: list[Scene], scenes: Scene) -> dict[str, float]:
+    """Metrics of the generated second half. made: of each repetition all scenes."""
     body = load_body("open")
-    joints, truth = (body.joints(x.slice(CONTEXT)) for x in (concatenate(made), scenes))
-    found: dict[str, Any] = {"loss": loss, "delay": delay, "gaps": gaps / scenes.scenes}
+    truth = body.joints(scenes.slice(CONTEXT))
+    found: dict[str, float] = {}
     for metric in (FrechetDistance("pair"), Interpenetration(), HandContact()):
-        metric.update(joints[None], truth, scenes.present)
+        metric.update(torch.stack([body.joints(each.slice(CONTEXT)) for each in made]), truth, scenes.present)
         found |= {name: float(value) for name, value in metric.compute().items()}
+    return found
+
+
+def measured(
+    model: Denoiser, scenes: Scene, options: SamplerOptions, loss: float, delay: int, samples: int
+) -> dict[str, Any]:
+    """Metrics over all scenes and repetitions, and their standard errors over the repetitions (`..._error`)."""
+    made, gaps, begun = [], 0, time.perf_counter()
+    for sample in range(samples):
+        each = []
+        for number in range(scenes.scenes):
+            seed = 1000 * sample + number
+            link = Lossy(loss, 1 + delay, generator=torch.Generator().manual_seed(seed))
+            scene, missing = run(model, scenes.select([number]), options, link, seed)
+            each.append(scene)
+            gaps += missing
+        made.append(concatenate(each))
+    found: dict[str, Any] = {"loss": loss, "delay": delay, "gaps": gaps / scenes.scenes / samples}
+    found |= scored(made, scenes)
+    if samples > 1:
+        single = [scored([each], scenes) for each in made]
+        for name in COLUMNS:
+            values = torch.tensor([one[name] for one in single])
+            found[f"{name}_error"] = float(values.std() / samples**0.5)
     return found | {"seconds": time.perf_counter() - begun}
 
 
@@ -121,9 +141,12 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(9, 2.6), constrained_layout=True)
     for axis, name in zip(axes, COLUMNS, strict=False):
         for key, other, mark, scale in (("loss", "delay", "o-", 10), ("delay", "loss", "s--", 1)):
-            line = sorted((row[key] * scale, row[name]) for row in rows if not row[other])
+            line = sorted(
+                (row[key] * scale, row[name], row.get(f"{name}_error", 0.0)) for row in rows if not row[other]
+            )
             label = "loss, in 10 %" if key == "loss" else "delay, tokens"
-            axis.plot(*zip(*line, strict=True), mark, label=label)
+            x, y, error = zip(*line, strict=True)
+            axis.errorbar(x, y, error, fmt=mark, capsize=2, label=label)
         axis.set_title(name)
         axis.set_ylim(bottom=0)
     axes[0].legend()
@@ -136,20 +159,31 @@ def main() -> None:
     given.add_argument("--model", default="duet")
     given.add_argument("--steps", type=int, default=4)
     given.add_argument("--scenes", type=int, default=10)
+    given.add_argument("--samples", type=int, default=8, help="how often each start is gone on from")
     given.add_argument("--frames", type=int, default=60)
     given.add_argument("--out", type=Path, default=Path("runs/results/agents"))
     asked = given.parse_args()
     model, options = Denoiser.load(asked.model), SamplerOptions(steps=asked.steps, any_floor=True)
     scenes, rows = starts(asked.frames, asked.scenes), []
     asked.out.mkdir(parents=True, exist_ok=True)
-    print(f"{scenes.scenes} scenes of {asked.frames} frames\n| loss | delay | gaps | " + " | ".join(COLUMNS) + " |")
+    print(
+        f"{scenes.scenes} scenes of {asked.frames} frames, {asked.samples} times\n| loss | delay | gaps | "
+        + " | ".join(COLUMNS)
+        + " |"
+    )
     print("|" + "---:|" * (3 + len(COLUMNS)))
     for loss, delay in [*((loss, 0) for loss in LOSSES), *((0.0, delay) for delay in DELAYS if delay)]:
-        row = measured(model, scenes, options, loss, delay)
+        row = measured(model, scenes, options, loss, delay, asked.samples)
         rows.append(row)
-        values = " | ".join(f"{row.get(name, float('nan')):.3f}" for name in COLUMNS)
+        values = " | ".join(f"{row[name]:.3f} ± {row.get(f'{name}_error', float('nan')):.3f}" for name in COLUMNS)
         print(f"| {100 * loss:.0f} % | {delay} | {row['gaps']:.1f} | {values} |", flush=True)
-        about = {"rows": rows, "scenes": scenes.scenes, "steps": asked.steps, "machine": machine()}
+        about = {
+            "rows": rows,
+            "scenes": scenes.scenes,
+            "samples": asked.samples,
+            "steps": asked.steps,
+            "machine": machine(),
+        }
         (asked.out / "results.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     draw(rows, asked.out / "agents.png")
 

@@ -155,6 +155,8 @@ def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, 
     if people > max(model.most_people, scene.agents):
         options.context = options.context or CONTEXT
         groups = [scene.slice(0, options.context)] if options.inputs else []
+        if options.task == "generation" and not groups:
+            options.task = None  # a crowd from nothing: couples that the model makes, from which it goes on
         return model.start_crowd(people, groups, options.spacing, seed=options.seed), body, ()
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
+from magnet.generation.crowd_start import START, start_from_nothing
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
@@ -26,6 +27,7 @@ from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage, initial_levels
 from magnet.tasks.base import Task
+from magnet.tasks.joint import Generation, JointFuture
 
 BATCH = 32
 """Views that run through the network at a time, to bound memory."""
@@ -62,7 +64,8 @@ def generate_crowd(
 
     Scenes and samples are made one after the other, and people are always kept apart (`firm`, unless `options` say
     `light`). Of as many people as the model has slots for, or fewer, a single
-    scene is what `generate` makes, bit for bit.
+    scene is what `generate` makes, bit for bit. `Generation` from nothing begins with couples on a floor plan
+    (`start_crowd`), from which everybody goes on.
 
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
@@ -71,7 +74,15 @@ def generate_crowd(
     for number in range(scene.scenes * samples):
         which = [number // samples]
         more = (options, generator, progress, stats, CHUNK, None if cond is None else cond[which])
-        rollout = CrowdRollout(model, scene.select(which), task, context, frames, *more)
+        one = scene.select(which)
+        if scene.agents > model.layout.agents and context == 0 and isinstance(task, Generation):
+            _refuse(model, one, TOKEN_FRAMES, options or SamplerOptions())
+            start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
+            whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *more).chunks()))
+            nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
+            made.append(whole.replace(given=nobody).slice(0, frames))
+            continue
+        rollout = CrowdRollout(model, one, task, context, frames, *more)
         made.append(cat_time(list(rollout.chunks())))
     return concatenate(made)
 
@@ -112,9 +123,8 @@ class CrowdRollout(Rollout):
             self.world.decode_rows = self._decode_rows
         if self.crowd and not bool((self.known[context // TOKEN_FRAMES - 1] | ~self.scene.present[0].cpu()).all()):
             raise ValueError(
-                "in a crowd everybody's start must be known, because partners are chosen by place: instead of "
-                "generation, joint_future goes on from what start_crowd makes, as `magnet predict --people` does where "
-                "no --task is given; partner_inpainting knows it with own_past"
+                "in a crowd everybody's start must be known, because partners are chosen by place: generation needs "
+                "context 0, partner_inpainting own_past; joint_future goes on from what start_crowd makes"
             )
 
     def _look_around(self, scene: Scene, context: int) -> None:

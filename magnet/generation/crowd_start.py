@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from magnet.checks import require_number, require_whole
 from magnet.denoiser.module import Denoiser
@@ -33,6 +34,7 @@ def start_crowd(
     generator: torch.Generator | None = None,
     groups: Sequence[Scene] = (),
     spacing: float = SPACING,
+    betas: Tensor | None = None,
 ) -> Scene:
     """How a crowd begins: given groups again and again, or couples of different shapes that the model makes.
 
@@ -42,6 +44,7 @@ def start_crowd(
         options: how couples are sampled.
         generator: source of randomness, on the model's device.
         groups, spacing: as for `compose`.
+        betas: (people, 10) shapes of people whom the model makes; None: by chance.
 
     Returns:
         One scene of `people`; of `START` frames where the model makes it.
@@ -52,11 +55,27 @@ def start_crowd(
     if not groups:
         couples = -(-people // 2)
         empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros(()))
-        betas = SHAPES * torch.randn(couples, 2, 10, generator=turns)
-        scene = empty.replace(present=torch.ones(couples, 2, dtype=torch.bool), betas=betas.clamp(-2, 2))
+        shapes = (SHAPES * torch.randn(couples, 2, 10, generator=turns)).clamp(-2, 2)
+        if betas is not None:
+            shapes.view(-1, 10)[:people] = betas.cpu()
+        scene = empty.replace(present=torch.ones(couples, 2, dtype=torch.bool), betas=shapes)
         made = generate(model, scene, Generation(), 0, START, 1, options, generator).to("cpu")
         groups = [made.select([number]) for number in range(couples)]
     return compose(groups, people, turns, spacing)
+
+
+def start_from_nothing(
+    model: Denoiser, scene: Scene, options: SamplerOptions | None, generator: torch.Generator | None
+) -> Scene:
+    """How a crowd begins of which nothing is known: couples of those who are there, in their slots and of their shapes.
+
+    scene (1, T, P) -> (1, START, P)
+    """
+    there = scene.present[0].cpu()
+    count = int(there.sum())
+    made = start_crowd(model, count, options, generator, betas=scene.betas[0, there.to(scene.device)])
+    slots = torch.where(there, there.cumsum(0) - 1, count + (~there).cumsum(0) - 1)
+    return made.pad_agents(scene.agents).permute_agents(slots).replace(body=scene.body).to(scene.device).replace(betas=scene.betas)
 
 
 def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, spacing: float = SPACING) -> Scene:

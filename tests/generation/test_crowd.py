@@ -189,15 +189,32 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
     assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
 
 
+@pytest.mark.parametrize("frames", [16, 40])
+def test_a_crowd_is_made_from_nothing_in_its_slots_and_of_its_shapes(model: Denoiser, frames: int) -> None:
+    scene = crowd(7, 4)
+    betas = torch.randn(1, 7, 10, generator=torch.Generator().manual_seed(0))
+    scene = scene.replace(present=torch.arange(7)[None] != 2, betas=betas)
+    generation = registry.get("generation")()
+    made = generate_crowd(model, scene, generation, 0, frames, 2, QUICK, seeded())
+    assert (made.scenes, made.frames, made.agents) == (2, frames, 7)
+    assert torch.equal(made.present, scene.present.expand(2, -1)) and torch.equal(made.betas[1], betas[0])
+    assert not bool(made.given.any()), "nothing was given"
+    ground = made.T_world_root[0, 0, scene.present[0]][:, [0, 2], 3]
+    assert (torch.cdist(ground, ground) + 99 * torch.eye(6)).min() > 0.01
+    assert not torch.equal(made.T_world_root[0], made.T_world_root[1])
+    again = generate_crowd(model, scene, generation, 0, frames, 2, QUICK, seeded())
+    assert torch.equal(made.T_world_root, again.T_world_root)
+
+
 def test_what_is_not_made_for_crowds_is_refused(model: Denoiser) -> None:
     def refused(task: str, match: str, people: int = 6, context: int = 8, fields: Any = None, **options: Any) -> None:
         kind, how = registry.get(task)(**(fields or {})), SamplerOptions(steps=2, **options)
         with pytest.raises(ValueError, match=match):
             generate_crowd(model, crowd(people), kind, context, 8, 1, how, seeded())
 
-    refused("generation", "context", context=0)
+    refused("generation", "placement", context=0, placement="anchor")
     refused("partner_inpainting", "own_past", fields={"target": (1,)})
-    refused("generation", "instead of generation, joint_future goes on")
+    refused("generation", "context 0")
     refused("agentic_sync", "square", people=18)
     refused("joint_future", "placement", placement="anchor")
     refused("joint_future", "settle", settle="light")
