@@ -75,7 +75,8 @@ def start_from_nothing(
     count = int(there.sum())
     made = start_crowd(model, count, options, generator, betas=scene.betas[0, there.to(scene.device)])
     slots = torch.where(there, there.cumsum(0) - 1, count + (~there).cumsum(0) - 1)
-    return made.pad_agents(scene.agents).permute_agents(slots).replace(body=scene.body).to(scene.device).replace(betas=scene.betas)
+    made = made.pad_agents(scene.agents).permute_agents(slots).to(scene.device)
+    return made.replace(body=scene.body, betas=scene.betas)
 
 
 def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, spacing: float = SPACING) -> Scene:
