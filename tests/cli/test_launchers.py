@@ -100,16 +100,11 @@ def test_the_slurm_script_of_the_docs_trains_on_two_nodes(tmp_path: Path) -> Non
         command, count = re.subn(rf"--{flag} \S+", f"--{flag} {value}", command)
         assert count == 1, flag
     (tmp_path / "job.sh").write_text(
-        script.replace(script[script.index("srun") :], "")
-        + command.rstrip()
-        + " "
-        + " ".join(FIT[3:] + QUIET)
+        script.replace(script[script.index("srun") :], "") + command.rstrip() + " " + " ".join(FIT[3:] + QUIET)
     )
     subprocess.run(["bash", "-n", "job.sh"], cwd=tmp_path, check=True)
     (tmp_path / "srun").write_text(SRUN)
-    (tmp_path / "magnet").write_text(
-        f'#!/bin/bash\nexec {sys.executable} -m magnet "$@"\n'
-    )
+    (tmp_path / "magnet").write_text(f'#!/bin/bash\nexec {sys.executable} -m magnet "$@"\n')
     for name in ("srun", "magnet"):
         (tmp_path / name).chmod(0o755)
     path = f"{tmp_path}:{os.environ['PATH']}"
