@@ -21,6 +21,9 @@ DEEP: dict[str, Apart] = {
 }
 """Depths beyond which whole people are first moved apart; poses do the rest."""
 
+UPRIGHT = 15.0
+"""`Settle.tilt` where hands are drawn together: arms shall reach and people come nearer, not lean over."""
+
 LET_GO = 0.10
 """Metres that people may be moved apart before their held hands are let go."""
 
@@ -100,6 +103,8 @@ def settling(
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
+    if how == "hold":
+        settle = replace(settle or Settle(), tilt=UPRIGHT)
     return correction(scene, body, wishes, fixed, settle, begun, past, toward)
 
 
