@@ -18,7 +18,8 @@ from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
 from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
-from magnet.packing import Kept, linear_of, norm_of
+from magnet.packing import Kept, Linear, linear_of, norm_of
+from magnet.precision import quick_bf16
 from magnet.sampling.noise import LEVELS
 
 Precision = Literal["float32", "bf16"]
@@ -28,9 +29,16 @@ class LeanBlock:
     """`TransformerBlock` with packed weights, for tokens whose times are turned by given complex numbers.
 
     Only of the last one some tokens may be asked for: it keeps weights of queries beside those of keys and values.
+
+    Args:
+        held: the type that weights are rounded to.
+        dtype: the type that it computes in.
     """
 
-    def __init__(self, block: TransformerBlock, dtype: torch.dtype, asked: bool) -> None:
+    def __init__(self, block: TransformerBlock, held: torch.dtype, dtype: torch.dtype, asked: bool) -> None:
+        def layer(weight: Tensor, bias: Tensor) -> Linear:
+            return linear_of(weight.to(held), bias.to(held), dtype)
+
         width = block.out.in_features
         self.heads, self.each = block.heads, width // block.heads
         weight, bias = block.qkv.weight.detach(), block.qkv.bias.detach()
@@ -41,13 +49,12 @@ class LeanBlock:
         keep = torch.arange(width) if order is None else order
         channels = torch.cat([keep, width + keep, 2 * width + torch.arange(width)]).to(weight.device)
         weight, bias = weight[channels], bias[channels]
-        self.qkv = linear_of(weight, bias, dtype)
+        self.qkv = layer(weight, bias)
         if asked:
-            self.query = linear_of(weight[:width], bias[:width], dtype)
-            self.key_value = linear_of(weight[width:], bias[width:], dtype)
-        self.out = linear_of(block.out.weight, block.out.bias, dtype)
-        first, last = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
-        self.first, self.last = (linear_of(layer.weight, layer.bias, dtype) for layer in (first, last))
+            self.query = layer(weight[:width], bias[:width])
+            self.key_value = layer(weight[width:], bias[width:])
+        self.out = layer(block.out.weight, block.out.bias)
+        self.first, self.last = (layer(x.weight, x.bias) for x in block.mlp if isinstance(x, nn.Linear))
         self.norm_attention, self.norm_mlp = (norm_of(n, dtype) for n in (block.norm_attention, block.norm_mlp))
 
     def __call__(
@@ -126,7 +133,8 @@ class LeanTransformer:
 
     Args:
         network: what it computes; changes of its weights afterwards are not seen.
-        precision: `bf16` holds the weights of the blocks in bfloat16; what goes in and out stays float32.
+        precision: `bf16` rounds the weights of the blocks to bfloat16 and computes them in it, where the processor
+            does so; what goes in and out stays float32.
     """
 
     def __init__(self, network: Transformer, precision: Precision = "float32") -> None:
@@ -134,7 +142,8 @@ class LeanTransformer:
         o, device = network.options, network.out_proj.weight.device
         if network.out_proj.weight.dtype != torch.float32:
             raise ValueError(f"weights are {network.out_proj.weight.dtype}, expected float32; bf16 is made here")
-        self.dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+        held = torch.bfloat16 if precision == "bf16" else torch.float32
+        self.dtype = held if quick_bf16(device) else torch.float32
         steps = torch.arange(LEVELS + 1, device=device)
         self.levels, self.slots = sinusoids(steps, o.level_width), sinusoids(steps, o.slot_width)
         self.agent = None if network.agent is None else network.agent.detach().clone()
@@ -143,7 +152,7 @@ class LeanTransformer:
             linear_of(x.weight, x.bias, torch.float32) if isinstance(x, nn.Linear) else plain_layer(x) for x in layers
         ]
         blocks = list(network.blocks)
-        self.blocks = [LeanBlock(block, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
+        self.blocks = [LeanBlock(block, held, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
         self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
         self.condition = network.condition if o.cond_dim else None
 
