@@ -123,7 +123,7 @@ class BadLine(threading.Thread):
             while True:
                 found.append(os.read(end, 65536))
         except BlockingIOError:
-            pass
+            pass  # nothing more has come
         except OSError:  # the process is gone, and its namespace with it
             if self._ends.get(address) == end:
                 del self._ends[address]

@@ -14,12 +14,12 @@ from magnet.motion.runs import true_runs
 
 HELD = 0.20
 """Metres between the middles of two hands that hold each other, as in the metric."""
-LET_GO = 0.50
+PARTED = 0.50
 """Metres between two hands that held each other and do no longer; chosen on CMU's salsa (docs/tasks.md)."""
 GRIP = 0.10
 """Metres between the middles of hands that hold: half of those held in CMU's salsa are nearer."""
 BREAK = 0.27
-"""Seconds for which hands may be further apart than `LET_GO` and still hold."""
+"""Seconds for which hands may be further apart than `PARTED` and still hold."""
 EASE = 0.2
 """Seconds in which hands come together and part."""
 
@@ -63,7 +63,7 @@ class Hold(NamedTuple):
 def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Which hands hold, and the vectors that they shall have between them. -> as for `holds`
 
-    Hands that come within `HELD` hold for as long as they are within `LET_GO`, short breaks apart, before and after;
+    Hands that come within `HELD` hold for as long as they are within `PARTED`, short breaks apart, before and after;
     each hand one other. Where they are further apart than `GRIP` they are to come so near, eased at both ends.
 
     Args:
@@ -74,7 +74,7 @@ def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | 
     """
     between, both = between_hands(joints, present)
     apart = between.norm(dim=-1)
-    near = (apart < LET_GO) & both[:, None, :, None, None]
+    near = (apart < PARTED) & both[:, None, :, None, None]
     held, share = torch.zeros_like(near), torch.zeros_like(apart)
     people = list(combinations(range(joints.shape[2]), 2))
     for b in range(len(apart)):
@@ -98,7 +98,7 @@ def _found(apart: Tensor, near: Tensor, before: Tensor | None, fps: float) -> li
         for start, stop in _bridged(true_runs(near[:, pair, one, other].tolist()), round(BREAK * fps)):
             held_on = start == 0 and before is not None and bool(before[pair, one, other])
             if held_on or bool((metres[start:stop] < HELD).any()):
-                worth = float((LET_GO - metres[start:stop]).clamp_min(0).sum())
+                worth = float((PARTED - metres[start:stop]).clamp_min(0).sum())
                 found.append(Hold(worth, start, stop, pair, one, other))
     return found
 

@@ -270,9 +270,9 @@ class MagnetCLI(LightningCLI):
     def _precision(self, config: Any) -> Any:
         asked = config.get("precision")
         taken = quick_precision(asked, config.get("accelerator") or "auto")
-        if taken != asked:
+        if taken != asked and "LOCAL_RANK" not in os.environ:
             print(
-                f"{asked}: this processor only emulates bfloat16, which takes many times as long; it is float32 instead"
+                f"{asked}: this processor only emulates bfloat16, many times slower: it is float32 instead"
             )
         return taken
 

@@ -114,7 +114,7 @@ class Corrected(NamedTuple):
     """How the last frames of a chunk were corrected, for the next one."""
 
     offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
-    holding: Tensor  # (B, Q, 2, 2) bool, hands that hold in the last
+    holding: Tensor | None  # (B, Q, 2, 2) bool, hands that hold in the last; None: nobody asks
 
 
 @torch.no_grad()
@@ -135,7 +135,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     offset, holding = (None, None) if past is None else past
     offset = settling(shaped, body, how, fixed, begun=past is not None, past=offset, holding=holding)
     made = corrected(shaped, offset)
-    held = hands_held(made, body)
+    held = hands_held(made, body) if how == "hold" else None
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(offset[:, -2:], held)
 
 
@@ -170,7 +170,7 @@ def settled_on(
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             known = before.replace(body=body.id, valid=None, given=None)
-            holding = hands_held(known, body)
+            holding = hands_held(known, body) if how == "hold" else None
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
         one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, 0.0, holding)
         offset[:, :, who] = one[:, :, who]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from magnet.body import load_body
 from magnet.body.energy import hand_points
-from magnet.body.holding import GRIP, HELD, LET_GO, holds, lasting_holds
+from magnet.body.holding import GRIP, HELD, PARTED, holds, lasting_holds
 from magnet.body.repair import repaired
 from magnet.metrics import hand_distance
 from magnet.motion.scene import Scene
@@ -44,7 +44,7 @@ def held_by(joints: Tensor, before: Tensor | None = None) -> Tensor:
 
 
 def test_hands_that_met_hold_until_they_are_half_a_metre_apart() -> None:
-    joints = two_people(near((20, 0.15), (20, 0.35), (20, LET_GO + 0.1)))
+    joints = two_people(near((20, 0.15), (20, 0.35), (20, PARTED + 0.1)))
     held = held_by(joints)
     assert held[:40].all() and not held[40:].any()
     assert int(holds(joints, THERE)[0].any(dim=(2, 3, 4)).sum()) == 20
