@@ -271,9 +271,7 @@ class MagnetCLI(LightningCLI):
         asked = config.get("precision")
         taken = quick_precision(asked, config.get("accelerator") or "auto")
         if taken != asked and "LOCAL_RANK" not in os.environ:
-            print(
-                f"{asked}: this processor only emulates bfloat16, many times slower: it is float32 instead"
-            )
+            print(f"{asked}: this processor only emulates bfloat16, many times slower: it is float32 instead")
         return taken
 
     def _refuse_overwriting(self) -> None:
