@@ -26,7 +26,7 @@ ELSEWHERE = {
     "CHANGELOG.md": "changes.md",
     "CONTRIBUTING.md": "contributing.md",
     "magnet/weights/duet/README.md": "card.md",
-    "magnet/weights/duet3/README.md": "card2.md",
+    "magnet/weights/duet1/README.md": "card1.md",
     "magnet/body/OPEN_BODY.md": "open_body.md",
     "examples/magnet-duel/README.md": "plugin.md",
     "examples/tour.ipynb": "tour.md",

@@ -35,10 +35,10 @@ trainer:
 
 
 def test_the_shipped_weights_load_whole_although_they_have_the_old_names():
-    stored = json.loads((checkpoints.FOLDER / "duet" / "config.json").read_text())
+    stored = json.loads((checkpoints.FOLDER / "duet1" / "config.json").read_text())
     assert "relation_noise" in stored["hyper_parameters"], "written before names changed"
-    checkpoint = checkpoints.read(checkpoints.resolve("duet"))
-    model = Denoiser.load("duet")
+    checkpoint = checkpoints.read(checkpoints.resolve("duet1"))
+    model = Denoiser.load("duet1")
     assert checkpoint["state_dict"].keys() == model.state_dict().keys()
     assert bool(model.normalizer.ready) and bool(model.tokenizer.quantizer.initialized)
 

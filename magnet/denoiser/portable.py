@@ -15,7 +15,6 @@ of a token's D numbers share a noise level; fps, the version and the model's nam
 from __future__ import annotations
 
 import copy
-import functools
 import io
 import json
 import logging
@@ -28,12 +27,12 @@ import torch
 from torch import Tensor, nn
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.transformer import Transformer, block_causal, rotate
 from magnet.files import write_whole
 from magnet.motion.scene import FPS
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.module import Tokenizer
+from magnet.tokenizer.quantizer import ResidualVQ
 from magnet.version import __version__
 
 OPSET = 18
@@ -41,26 +40,6 @@ OPSET = 18
 NEEDS = 'ONNX files need onnx, onnxruntime and onnxscript: pip install "magnet-motion[onnx]"'
 MOST_OFF = 1e-4
 """Largest difference between a file's numbers, by onnxruntime, and the model's that is let pass."""
-
-
-def all_at_once(transformer: Transformer, x: Tensor, present: Tensor) -> Tensor:
-    """`Transformer`'s blocks on all slots together, of which nobody looks at absent ones: no loop over the data.
-
-    x (B, N, P, d), present (B, P) bool -> (B, N, P, d), meaningless where somebody is absent
-    """
-    B, N, P, _ = x.shape
-    time = torch.arange(N, device=x.device).repeat_interleave(P)
-    there = present[:, None].expand(B, N, P).reshape(B, 1, 1, N * P)
-    # Who is absent sees itself at least: a softmax over nothing is not a number.
-    sees = there | torch.eye(N * P, dtype=torch.bool, device=x.device)
-    if transformer.options.causal_block:
-        sees = sees & block_causal(time, transformer.options.causal_block)
-    y = x.flatten(1, 2)
-    if transformer.options.rope == "hidden":
-        y = y + rotate(y, time)
-    for block in transformer.blocks:
-        y = block(y, time, sees)
-    return y.unflatten(1, (N, P))
 
 
 class PortableDenoiser(nn.Module):
@@ -80,7 +59,7 @@ class PortableDenoiser(nn.Module):
             )
         self.denoiser = [denoiser]  # in a list: only the transformer's weights belong to the file
         self.transformer = copy.copy(denoiser.transformer)
-        self.transformer._blocks = functools.partial(all_at_once, denoiser.transformer)  # type: ignore[method-assign]
+        self.transformer.in_groups = False  # which would be a loop over the data
 
     def forward(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         return self.denoiser[0].predict_tokens(noisy, levels, present, network=self.alone)
@@ -111,6 +90,9 @@ class PortableEncoder(nn.Module):
             raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
         self.layout, self.normalizer = denoiser.layout, denoiser.normalizer
         self.tokenizer = copy.deepcopy(denoiser.tokenizer)
+        quantizer = self.tokenizer.quantizer
+        if isinstance(quantizer, ResidualVQ):
+            quantizer.waits = quantizer.waiting  # asked once: a trace cannot ask a tensor
         self.quantized = denoiser.quantized
 
     def train(self, mode: bool = True) -> PortableEncoder:

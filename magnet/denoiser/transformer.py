@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
@@ -74,6 +75,12 @@ def quick_to_train(like: Tensor) -> AbstractContextManager[None]:
     return sdpa_kernel(SDPBackend.MATH) if like.device.type == "cpu" else nullcontext()
 
 
+def is_sharded(module: nn.Module) -> bool:
+    """Whether a module's weights lie in shards on several processes (FSDP), which must all run it equally often."""
+    fsdp = sys.modules.get("torch.distributed.fsdp")
+    return fsdp is not None and isinstance(module, (fsdp.FSDPModule, fsdp.FullyShardedDataParallel))
+
+
 class TransformerBlock(nn.Module):
     """Post-norm transformer encoder block: self-attention over all tokens of a scene, then a GELU MLP."""
 
@@ -94,7 +101,7 @@ class TransformerBlock(nn.Module):
         self.drop = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, time: Tensor, sees: Tensor | None = None) -> Tensor:
-        """x (B, L, d), time (L,), sees (L, L) bool, whom each one sees; None: everybody -> (B, L, d)"""
+        """x (B, L, d), time (L,), sees (L, L) or (B, 1, L, L) bool, whom each one sees; None: everybody -> (B, L, d)"""
         query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         if self.rope_heads:
             query, key = rotate(query, time), rotate(key, time)
@@ -137,6 +144,7 @@ class Transformer(nn.Module):
             nn.init.zeros_(self.cond_proj.bias)
             self.no_cond = nn.Parameter(torch.zeros(o.width))
         self.register_buffer("groups", layout.groups(), persistent=False)
+        self.in_groups = True  # scenes with equally many people run together; else all slots of all scenes at once
 
     groups: Tensor
 
@@ -188,6 +196,8 @@ class Transformer(nn.Module):
 
     def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
         """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)"""
+        if is_sharded(self.blocks[0]) or not self.in_groups:
+            return self._blocks_once(x, present)
         people = present.sum(dim=1)
         slots_in_use = (~present).int().argsort(dim=1, stable=True)
         finished = torch.zeros_like(x)
@@ -205,3 +215,19 @@ class Transformer(nn.Module):
                 y = block(y, time, sees)
             finished[scenes, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
         return finished
+
+    def _blocks_once(self, x: Tensor, present: Tensor) -> Tensor:
+        """As `_blocks`, each block once whatever scenes hold: processes ask for shards equally often. (B, N, P, d)"""
+        B, N, P, _ = x.shape
+        time = torch.arange(N, device=x.device).repeat_interleave(P)
+        there = present[:, None].expand(B, N, P).reshape(B, 1, 1, N * P)
+        # Who is absent sees itself at least: a softmax over nothing is not a number.
+        sees = there | torch.eye(N * P, dtype=torch.bool, device=x.device)
+        if self.options.causal_block:
+            sees = sees & block_causal(time, self.options.causal_block)
+        y = x.flatten(1, 2)
+        if self.options.rope == "hidden":
+            y = y + rotate(y, time)
+        for block in self.blocks:
+            y = block(y, time, sees)
+        return y.unflatten(1, (N, P))

@@ -31,13 +31,31 @@ FIT = ("fit", "--config", str(ROOT / "configs" / "debug.yaml"), "--trainer.log_e
 QUIET = ("--trainer.enable_progress_bar", "false", "--data.epoch_size", "96")
 
 
+DENOISER = ("fit", "--config", str(ROOT / "configs" / "fsdp_denoiser.yaml"), "--model.tokenizer", "raw")
+SMALL = ("--model.network", "{width: 32, layers: 2, heads: 2, dropout: 0}", "--model.self_forcing.share", "0.5")
+SWIFT = ("--model.optimizer", "{learning_rate: 0.003, warmup_steps: 1}")
+FEW = ("--data.train_clips", "4", "--data.val_clips", "2", "--data.max_agents", "4", "--trainer.log_every_n_steps", "1")
+
+
 def started(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
     """The processes of one training, a global batch of 16."""
+    several = ("--trainer.devices", str(world), "--trainer.strategy", "ddp" if world > 1 else "auto")
+    return begun(world, out, *FIT, *QUIET, *several, "--data.batch_size", str(16 // world), *words)
+
+
+def cut(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
+    """The processes of one training of a denoiser of two to four people, in shards where they are several."""
+    alone = ("--trainer.devices", "1", "--trainer.strategy", "auto") if world == 1 else ()
+    cpu = ("--trainer.accelerator", "cpu", "--trainer.precision", "32-true", "--data.batch_size", str(16 // world))
+    return begun(world, out, *DENOISER, *SMALL, *SWIFT, *FEW, *QUIET, *cpu, *alone, *words)
+
+
+def begun(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
+    """Processes that run one command together, each with the variables that torchrun would give it."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    several = ("--trainer.devices", str(world), "--trainer.strategy", "ddp" if world > 1 else "auto")
-    every = [*FIT, *QUIET, *several, "--data.batch_size", str(16 // world), "--out", str(out), *words]
+    every = [*words, "--out", str(out)]
     context = multiprocessing.get_context("fork")
     each = [context.Process(target=process, args=(r, world, port, every, f"{out}.{r}.log")) for r in range(world)]
     for one in each:
@@ -124,6 +142,10 @@ def main(folder: Path) -> None:
                 one.start()
             codes[f"sharded_{world}"] = ended(both)  # type: ignore[arg-type]
             shutil.copy(Path(meet, f"sharded{world}.0.json"), folder)
+    for world in (1, 2):
+        codes[f"cut_{world}"] = ended(cut(world, folder / f"cut_{world}", "--trainer.max_steps", "12"))
+    shutil.copytree(folder / "cut_2", folder / "cut_on")
+    codes["cut_on"] = ended(cut(1, folder / "cut_on", "--trainer.max_steps", "18", "--ckpt_path", "last"))
     (folder / "codes.json").write_text(json.dumps(codes))
 
 

@@ -70,6 +70,15 @@ def test_sharded_over_two_processes_the_network_learns_the_same(runs: Path) -> N
     assert one["held"] == 1.0 and two["held"] < 0.51
 
 
+@pytest.mark.slow
+def test_a_denoiser_in_shards_learns_as_one_and_goes_on_alone(runs: Path) -> None:
+    """Scenes of two, three and four people and self-forcing, which processes without shards run unequally often."""
+    assert codes(runs)["cut_1"] == [0] and codes(runs)["cut_2"] == [0, 0] and codes(runs)["cut_on"] == [0]
+    one, two = (curve(runs / f"cut_{world}", "val/loss") for world in (1, 2))
+    assert two == pytest.approx(one, rel=0.05)
+    assert curve(runs / "cut_on", "val/loss")[-1] < two[0]
+
+
 def test_what_torch_says_of_a_lost_process_becomes_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     lost = RuntimeError("[gloo/transport/tcp/pair.cc:537] Read error [127.0.0.1]:8091: Connection reset by peer")
     assert explain(lost) is None, "of a single process it is ours"

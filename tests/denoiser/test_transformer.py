@@ -25,6 +25,24 @@ def batch(generator: torch.Generator, layout: TokenLayout = LAYOUT):
     return noisy, levels
 
 
+@pytest.mark.parametrize("options", [{}, {"causal_block": 2}, {"rope": "hidden"}], ids=["plain", "causal", "hidden"])
+def test_all_slots_at_once_are_the_groups_of_equally_many_people(options, generator):
+    """As processes with weights in shards run it, each block once; somebody may be alone, or nobody there."""
+    model = build(**options)
+    noisy, levels = (each.repeat(2, 1, 1, *[1] * (each.ndim - 3)) for each in batch(generator))
+    present = torch.tensor([[1, 1, 1, 1], [0, 1, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0]], dtype=torch.bool)
+    there = present[:, None].expand(levels.shape)
+
+    def run(in_groups: bool) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        model.in_groups = in_groups
+        made = model(noisy, levels, present)
+        return made, list(torch.autograd.grad(made[there].square().mean(), list(model.parameters())))
+
+    (groups, slopes), (once, same) = run(True), run(False)
+    assert once.isfinite().all() and torch.allclose(groups[there], once[there], atol=1e-5)
+    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(slopes, same, strict=True))
+
+
 def test_the_paper_size_has_about_19_million_weights():
     model = Transformer(TokenLayout(512, 2))
     assert 19e6 < sum(p.numel() for p in model.parameters()) < 21e6
