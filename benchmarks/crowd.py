@@ -19,6 +19,7 @@ import torch
 
 import magnet
 from magnet.generation.crowd import CrowdRollout
+from magnet.generation.crowd_settling import settled_moments
 from magnet.generation.crowd_start import START
 from magnet.generation.stats import SamplingStats
 from magnet.metrics.body_depth import DEEP, deepest
@@ -51,10 +52,12 @@ def sampled(model: magnet.Model, people: int, frames: int, spacing: float) -> tu
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         done = sum(each.frames for each in pieces)
         print(f"  {people} people, {done} frames after {time.perf_counter() - began:.0f} s, {peak:.2f} GB", flush=True)
+    scene = cat_time(pieces)
+    scene = settled_moments(scene, ~scene.given[0]) if people > model.denoiser.layout.agents else scene
     took, cpu = time.perf_counter() - began, time.process_time() - used
     views = stats.windows / stats.calls
     cost = Cost(people, stats.calls, views, 1000 * cpu / stats.calls, frames / took, frames / cpu, peak)
-    return cat_time(pieces), cost
+    return scene, cost
 
 
 def depths(scene: Scene) -> str:
@@ -97,12 +100,13 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--people", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64, 128, 200])
     options.add_argument("--frames", type=int, default=16, help="after the first second")
-    options.add_argument("--steps", type=int, default=8)
+    options.add_argument("--sampler", default="default", help="a preset")
+    options.add_argument("--steps", type=int, default=16)
     options.add_argument("--spacing", type=float, default=3.0)
     options.add_argument("--plot", type=Path)
     options.add_argument("--out", type=Path, help="where the last crowd goes")
     chosen = options.parse_args()
-    model = magnet.Model(magnet.load().denoiser, SamplerOptions.preset("steady", steps=chosen.steps))
+    model = magnet.Model(magnet.load().denoiser, SamplerOptions.preset(chosen.sampler, steps=chosen.steps))
     costs = []
     for people in chosen.people:
         scene, cost = sampled(model, people, chosen.frames, chosen.spacing)

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import Sampling
+from magnet.generation.crowd_settling import settled_moments
 from magnet.generation.crowd_start import START, start_from_nothing
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
@@ -62,10 +64,10 @@ def generate_crowd(
 ) -> Scene:
     """Sample a task for any number of people; arguments and result as of `magnet.generation.rollout.generate`.
 
-    Scenes and samples are made one after the other, and people are always kept apart (`firm`, unless `options` say
-    `light`). Of as many people as the model has slots for, or fewer, a single
-    scene is what `generate` makes, bit for bit. `Generation` from nothing begins with couples on a floor plan
-    (`start_crowd`), from which everybody goes on.
+    Scenes and samples are made one after the other. People are kept apart (`firm`, unless `options` say `light`),
+    and in the end moments in which two still pass through each other are settled (`settled_moments`). Of as many
+    people as the model has slots for, or fewer, a single scene is what `generate` makes, bit for bit. `Generation`
+    from nothing begins with couples on a floor plan (`start_crowd`), from which everybody goes on.
 
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
@@ -79,11 +81,15 @@ def generate_crowd(
             _refuse(model, one, TOKEN_FRAMES, options or SamplerOptions())
             start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
             whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *more).chunks()))
+            whole = settled_moments(whole, torch.ones_like(whole.present).expand(whole.frames, -1))
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
             made.append(whole.replace(given=nobody).slice(0, frames))
             continue
         rollout = CrowdRollout(model, one, task, context, frames, *more)
-        made.append(cat_time(list(rollout.chunks())))
+        whole = cat_time(list(rollout.chunks()))
+        if rollout.crowd and whole.given is not None:
+            whole = settled_moments(whole, ~whole.given[0])
+        made.append(whole)
     return concatenate(made)
 
 
@@ -110,7 +116,7 @@ class CrowdRollout(Rollout):
     ) -> None:
         self.crowd = scene.agents > model.layout.agents
         if self.crowd:
-            options = options or SamplerOptions()
+            options = (options or SamplerOptions()).filled(Sampling(settle="off"))
             _refuse(model, scene, context, options)
             options = replace(options, apart="firm") if options.apart == "off" else options
         self.viewer, self.model = model, copy.copy(model)  # the same weights with tokens of another layout
@@ -373,9 +379,8 @@ def _refuse(model: Denoiser, scene: Scene, context: int, options: SamplerOptions
             f"context: got {context} of {scene.frames} frames; a crowd goes on from where everybody stands: give at "
             f"least {TOKEN_FRAMES} frames of everybody, for example by magnet.generation.crowd_start.compose"
         )
-    wrong = {"body_guidance": "off", "settle": "off"}
-    for name, right in wrong.items():
-        if getattr(options, name) != right:
-            raise ValueError(f"{name}: got {getattr(options, name)}, expected {right} in a crowd; apart works there")
+    for name in ("body_guidance", "settle"):
+        if getattr(options, name) not in (None, "off"):
+            raise ValueError(f"{name}: got {getattr(options, name)}, expected off in a crowd; apart works there")
     if options.placement == "anchor":
         raise ValueError("placement: got anchor, expected fuse or integrate in a crowd: nobody knows everybody")

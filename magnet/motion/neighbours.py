@@ -11,8 +11,9 @@ from torch import Tensor
 from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 
-ENTER, LEAVE = 2.5, 3.5
-"""Metres over the ground within which somebody becomes a partner, and beyond which a partner is one no longer."""
+ENTER, LEAVE = 1.5, 2.2
+"""Metres over the ground within which somebody becomes a partner, and beyond which a partner is one no longer; with 2.5
+and 3.5 strangers crowd together, for the model learned from couples (docs/tasks.md, "Crowds")."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,10 @@ def nearest_partners(
     Returns:
         (P, K) int.
 
-    >>> ground = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
+    >>> ground = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.4, 0.0], [9.0, 0.0]])
     >>> nobody = torch.arange(4)[:, None].repeat(1, 2)
     >>> everybody, strangers = torch.ones(4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
-    >>> nearest_partners(ground, everybody, nobody, strangers)  # 0 and 2 are 3 m apart, and nobody is near 3
+    >>> nearest_partners(ground, everybody, nobody, strangers)  # 0 and 2 are 2.4 m apart, and nobody is near 3
     tensor([[1, 0],
             [0, 2],
             [1, 2],

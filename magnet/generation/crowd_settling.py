@@ -1,0 +1,92 @@
+"""Moments of a finished crowd in which two people are still in each other's bodies are settled, one by one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magnet.body.apart import APART, REACH, excess_depth, near_pairs
+from magnet.body.repair import repaired
+from magnet.generation.separation import open_body_on
+from magnet.generation.settling import CHUNK, LEAD
+from magnet.motion.runs import true_runs
+from magnet.motion.scene import Scene
+
+ROUNDS = 3
+"""How often all moments are settled: whoever makes way for one may step into another."""
+
+AROUND = 20
+"""Frames before and after a moment in which people make way; two moments less than that apart are one."""
+
+BESIDE = 6
+"""Others who stand by at most, as they are, so that nobody makes way into them."""
+
+
+class Encounter(NamedTuple):
+    """Two people who are in each other in the frames [start, stop), or nearly all of them."""
+
+    one: int
+    other: int
+    start: int
+    stop: int
+
+
+@torch.no_grad()
+def settled_moments(scene: Scene, free: Tensor) -> Scene:
+    """A crowd out of each other's bodies: `apart` moves whole people over longer stretches and sees no quick passes.
+
+    Args:
+        scene: (1, T, P) of any body.
+        free: (T, P) bool, who may be moved.
+    """
+    body = open_body_on(scene.device)
+    for _ in range(ROUNDS):
+        joints = body.joints(scene.replace(body=body.id, valid=None, given=None))[0]
+        moments = deep_moments(joints, scene.present[0])
+        if not moments:
+            break
+        for moment in moments:
+            scene = _settled(scene, free, moment, joints[:, :, 0, [0, 2]])
+    return scene
+
+
+def deep_moments(joints: Tensor, present: Tensor) -> list[Encounter]:
+    """When who is deeper in whom than `light` allows. joints (T, P, 22, 3), present (P,) bool"""
+    people, found = joints.transpose(0, 1), []
+    for one, other in zip(*(each.tolist() for each in near_pairs(people, present)), strict=True):
+        ground = (people[one, :, 0] - people[other, :, 0])[:, [0, 2]]
+        near = (ground.norm(dim=-1) < REACH / 2).nonzero()[:, 0]
+        deep = near[excess_depth(people[one, near], people[other, near], APART["light"]) > 0]
+        inside = torch.zeros(len(joints), dtype=torch.bool)
+        for frame in deep.tolist():
+            inside[max(frame - AROUND // 2, 0) : frame + AROUND // 2 + 1] = True
+        found += [Encounter(one, other, *run) for run in true_runs(inside.tolist())]
+    return found
+
+
+def _settled(scene: Scene, free: Tensor, moment: Encounter, ground: Tensor) -> Scene:
+    """A scene with one moment settled. ground (T, P, 2): where people are"""
+    start, stop = max(moment.start - AROUND // 2, 0), min(moment.stop + AROUND // 2, scene.frames)
+    two = torch.tensor([moment.one, moment.other], device=scene.device)
+    away = torch.cdist(ground[start:stop, two], ground[start:stop]).amin(dim=(0, 1))
+    away[two] = torch.inf
+    beside = away.argsort()[:BESIDE]
+    who = torch.cat([two, beside[away[beside] < REACH]])
+    fixed = ~free[start:stop, who.to(free.device)]
+    fixed[:, 2:] = True
+    fixed[: LEAD * (start > 0)] = True
+    fixed[len(fixed) - LEAD * (stop < scene.frames) :] = True
+    part = scene.slice(start, stop).replace(valid=None, given=None, names=()).permute_agents(who)
+    made = repaired(
+        part.replace(body=open_body_on(scene.device).id),
+        open_body_on(scene.device),
+        "firm",
+        fixed,
+        CHUNK,
+        drifting=False,
+    )
+    body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
+    body_rot[:, start:stop, two], root[:, start:stop, two] = made.body_rot[:, :, :2], made.T_world_root[:, :, :2]
+    return scene.replace(body_rot=body_rot, T_world_root=root)

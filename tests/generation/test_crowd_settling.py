@@ -1,0 +1,60 @@
+"""Moments in which two people of a crowd are in each other."""
+
+import torch
+
+from magnet.bench.speed import standing
+from magnet.generation.crowd_settling import deep_moments, settled_moments
+from magnet.metrics.body_depth import deepest
+from magnet.motion.scene import Scene
+
+FRAMES = 90
+
+
+def passing() -> Scene:
+    """Five people; the second walks through the first at 2 m/s, the others stand by."""
+    scene = standing(1, FRAMES, 5, torch.device("cpu"))
+    root = scene.T_world_root.clone()
+    places = torch.tensor([[0.0, 0.0], [0.0, 0.12], [0.0, 1.5], [4.0, 0.0], [0.0, -4.0]])
+    root[..., :3, 3] = torch.stack([places[:, 0], torch.full((5,), 0.95), places[:, 1]], dim=-1)
+    root[:, :, 1, 0, 3] = torch.linspace(-3.0, 3.0, FRAMES)
+    return scene.replace(T_world_root=root)
+
+
+def depth(scene: Scene) -> float:
+    from magnet.body import load_body
+
+    joints = load_body().joints(scene)[0]
+    return float(deepest(joints[:, 0], joints[:, 1])[:, 0].max())
+
+
+def test_who_walks_through_somebody_goes_around_them_and_nobody_else_moves() -> None:
+    scene = passing()
+    made = settled_moments(scene, torch.ones(FRAMES, 5, dtype=torch.bool))
+    assert depth(scene) > 0.10 and depth(made) < 0.05
+    assert torch.equal(made.T_world_root[:, :, 2:], scene.T_world_root[:, :, 2:])
+    assert torch.equal(made.T_world_root[:, [0, -1]], scene.T_world_root[:, [0, -1]]), (
+        "before and after they go as they went"
+    )
+    step = (made.T_world_root - scene.T_world_root)[..., :3, 3].diff(dim=1).norm(dim=-1)
+    assert step.max() < 0.02, "metres a frame"
+
+
+def test_who_is_given_does_not_make_way() -> None:
+    free = torch.ones(FRAMES, 5, dtype=torch.bool)
+    free[:, 0] = False
+    scene = passing()
+    made = settled_moments(scene, free)
+    assert torch.equal(made.body_rot[:, :, 0], scene.body_rot[:, :, 0]) and depth(made) < depth(scene)
+
+
+def test_a_crowd_that_keeps_apart_is_left_as_it_is() -> None:
+    scene = passing().permute_agents(torch.tensor([0, 2, 3, 4]))
+    assert settled_moments(scene, torch.ones(FRAMES, 4, dtype=torch.bool)) is scene
+
+
+def test_a_moment_is_found_with_its_frames() -> None:
+    from magnet.body import load_body
+
+    scene = passing()
+    (moment,) = deep_moments(load_body().joints(scene)[0], scene.present[0])
+    assert (moment.one, moment.other) == (0, 1) and moment.start < FRAMES / 2 < moment.stop < FRAMES - 10
