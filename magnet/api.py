@@ -44,7 +44,8 @@ def load(
     Args:
         device: where it runs.
         steps: denoising steps; fewer are faster and coarser. None: the sampler's.
-        sampler: how it samples: `default`, or `paper` for the paper's way; see `SamplerOptions.preset`.
+        sampler: how it samples: `default`, as the model is best sampled, `plain`, or another of
+            `magnet.sampling.presets`, such as `paper` for the paper's way.
 
     Raises:
         ValueError: no such model or sampler, which names those there are; or no such device here.

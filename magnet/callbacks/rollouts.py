@@ -67,7 +67,8 @@ class RollOuts(Callback):
         if frames[1] < frames[0]:
             raise ValueError(f"frames: got {frames}, expected the fewest first")
         self.share, self.every, self.scenes, self.frames, self.stretches = share, every, scenes, frames, stretches
-        self.sampler, self.return_frames = SamplerOptions(steps=steps), return_frames
+        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False)  # what it makes by itself
+        self.return_frames = return_frames
         self.task = registry.get("joint_future")()
         self.kept: list[Scene] = []
         self.filled, self.start = -1, start

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, ClassVar, NoReturn
 
-from jsonargparse import ActionConfigFile, Namespace
+from jsonargparse import ActionConfigFile, DefaultHelpFormatter, Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
@@ -118,16 +118,16 @@ class Parser(LightningArgumentParser):
         return "\n".join(["more help:", *lines, f"  magnet {self.command} --help NAME, such as {names}", ""])
 
     def _classes_help(self, key: str, whole: bool) -> list[str]:
-        """The fields of each class under a key. Of many data sets, in short: those of the first, and what each is."""
+        """The fields of each class under a key. Of models and data sets, in short: of the first, and what each is."""
         parts: list[str] = []
         shared: set[str] = set()
         for name, kind in self.classes[key].items():
-            if key == "data" and parts and not whole:
+            if key in SHARING and parts and not whole:
                 first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
                 parts.append(f"--{key} {name}: {first}")
             else:
                 parts.append(_fields_help(key, name, kind, shared if key in SHARING else set()))
-        if key == "data" and not whole:
+        if key in SHARING and not whole:
             parts.append(f"\nThe fields of one of these: magnet {self.command} --help NAME\n")
         return parts
 
@@ -223,8 +223,9 @@ class Parser(LightningArgumentParser):
         return chosen_flags(self.own_flags(), self.options(self.chosen), self.chosen)
 
     def own_flags(self) -> list[str]:
-        """The command's own options."""
-        return [flag for action in self._actions for flag in action.option_strings]
+        """The command's own options; of predict also the one that, without files, asks for people from nothing."""
+        more = ["--people"] if self.command == "predict" else []
+        return [flag for action in self._actions for flag in action.option_strings] + more
 
     def options(self, chosen: Mapping[str, str] | None = None) -> dict[str, dict[str, list[str]]]:
         """Options of each class, or of those that are chosen where one is, by key and short name."""
@@ -266,9 +267,17 @@ def _expected(action: argparse.Action) -> str:
     return " or ".join(KINDS[each.__name__] for each in kinds) if plain else ""
 
 
+class ChoicesOnce(DefaultHelpFormatter):
+    """Help that names the choices of an option beside its flag, and not as its type again."""
+
+    def _get_type_str(self, action: argparse.Action) -> str | None:
+        said: str | None = super()._get_type_str(action)
+        return None if said is not None and said.startswith("Literal[") else said
+
+
 def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:
     """Fields of one class as `--key.field`, less those that a class before it has told the same of."""
-    parser = LightningArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+    parser = LightningArgumentParser(add_help=False, usage=argparse.SUPPRESS, formatter_class=ChoicesOnce)
     parser.add_class_arguments(kind, key, fail_untyped=False)
     told: set[str] = set()
     for action in parser._actions:

@@ -71,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument_group("how").add_argument
     add("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
     add("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
-    add("--sampler", metavar="PRESET", help="default, steady (that of crowds) or paper")
+    add("--sampler", metavar="PRESET", help="default, plain, steady or paper")
     add("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
     scene_files.add_look(options.add_argument_group("films"))
     files = options.add_argument_group("files")
@@ -104,8 +104,6 @@ def main(arguments: Sequence[str]) -> int:
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
     model = Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
-    if options.sampler is None and (options.people or 0) > model.most_people:
-        model = dataclasses.replace(model, sampler=sampler_of("steady", groups["sampler"]))
     scene, body, added = read_people(options, model)
     task = task_of(options, groups["task"], added)
     context, frames = lengths(options, task, scene, added, model)

@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument
     apart = "light lets people lean on each other, firm lets them touch (default: %(default)s)"
     add("--apart", choices=("light", "firm"), default="firm", help=apart)
-    hands = "hold: hands that met hold until they are half a metre apart; firm alone (default: %(default)s)"
+    hands = "hold: hands that met hold until they are 60 cm apart; firm alone (default: %(default)s)"
     add("--hands", choices=("keep", "hold"), default="keep", help=hands)
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"

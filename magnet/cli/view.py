@@ -16,8 +16,6 @@ STEPS = 10
 """Denoising steps where nothing is said: quick enough to watch."""
 EXAMPLE = "duet"
 """Scene that a live model goes on from where nothing is said: its couple stays together (docs/viewer.md)."""
-LIVE_PRESET = "steady"
-"""How a live model samples where nothing is said: over minutes, feet stay on the floor and bodies out of each other."""
 
 EXAMPLES = """\
 examples:
@@ -207,8 +205,8 @@ def sampler_options(options: argparse.Namespace) -> Any:
 
     steps = STEPS if options.sampler is None and options.steps is None else options.steps
     said: dict[str, Any] = {} if steps is None else {"steps": steps}
-    if options.live and options.sampler is None:
-        return SamplerOptions.preset(LIVE_PRESET, apart="light", **said)
+    if options.live and options.sampler is None:  # live partners are not settled, and keep apart at least
+        said["apart"] = "light"
     return SamplerOptions.preset(options.sampler or "default", **said)
 
 

@@ -13,14 +13,14 @@ from magnet import checkpoints
 from magnet.checks import require_choice
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
-from magnet.denoiser.levels import draw_levels
+from magnet.denoiser.levels import draw_levels, missing_bursts
 from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
-from magnet.denoiser.options import DenoiserLoss, NoiseOptions, SelfForcing, TransformerOptions
+from magnet.denoiser.options import DenoiserLoss, NoiseOptions, Sampling, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.token_model import TokenModel
-from magnet.denoiser.transformer import Transformer, skipped
+from magnet.denoiser.transformer import Transformer, is_sharded, skipped
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout
 from magnet.precision import dtype_of
@@ -53,6 +53,7 @@ class Denoiser(TokenModel):
         loss: weights of the terms.
         self_forcing: training on a past that the model has made itself.
         optimizer: AdamW, or Muon for matrices.
+        sampling: how the trained model is best sampled, where a sampler leaves it open.
         compile: compile the blocks for training; worth it on a GPU, not on a CPU.
         seed: all training noise follows from it.
     """
@@ -69,6 +70,7 @@ class Denoiser(TokenModel):
         loss: DenoiserLoss = DenoiserLoss(),
         self_forcing: SelfForcing = SelfForcing(),
         optimizer: OptimizerOptions = OptimizerOptions(warmup_steps=1000),
+        sampling: Sampling = Sampling(),
         compile: bool = False,
         seed: int = 1111,
     ) -> None:
@@ -76,11 +78,12 @@ class Denoiser(TokenModel):
         require_choice("target", target, Target)
         self.network, self.noise = group_of(TransformerOptions, network), group_of(NoiseOptions, noise)
         self.loss, self.self_forcing = group_of(DenoiserLoss, loss), group_of(SelfForcing, self_forcing)
-        self.optimizer = group_of(OptimizerOptions, optimizer)
+        self.optimizer, self.sampling = group_of(OptimizerOptions, optimizer), group_of(Sampling, sampling)
         groups = {"network": self.network, "noise": self.noise, "loss": self.loss, "self_forcing": self.self_forcing}
         sizes = {"tokenizer": tokenizer, "max_agents": max_agents, "window": window, "target": target}
         rest = {"start_from": start_from, "compile": compile, "seed": seed}
-        self.save_hyperparameters(plain({**sizes, **groups, "optimizer": self.optimizer, **rest}))
+        groups |= {"optimizer": self.optimizer, "sampling": self.sampling}
+        self.save_hyperparameters(plain({**sizes, **groups, **rest}))
         self.window = window
         self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
         self.build_named(tokenizer)
@@ -166,6 +169,16 @@ class Denoiser(TokenModel):
 
     # -- training ------------------------------------------------------------------------------
 
+    def configure_model(self) -> None:
+        """Shards the network block by block where the strategy has a mesh of devices (`ModelParallelStrategy`)."""
+        if self.device_mesh is None or not self.built or is_sharded(self.transformer):
+            return
+        from torch.distributed.fsdp import fully_shard
+
+        parts: list[nn.Module] = [*self.transformer.blocks, self.transformer]
+        for part in parts if self.posterior is None else [*parts, self.posterior]:
+            fully_shard(part, mesh=self.device_mesh["data_parallel"])
+
     def on_fit_start(self) -> None:
         if not self.normalizer.ready:
             if self.hparams["start_from"]:
@@ -217,6 +230,7 @@ class Denoiser(TokenModel):
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
+            levels = missing_bursts(levels, self.noise.bursts, generator)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
@@ -275,7 +289,10 @@ class Denoiser(TokenModel):
             return truth
         requantize = self.tokenizer.requantize if self.quantized else None
         parts = (self.denoise, requantize, self.normalizer, self.layout)
-        return with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift, cond)
+        shown = with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift, cond)
+        if shown is truth and is_sharded(self.transformer):  # nobody ran it; processes must run shards equally often
+            self.denoise(truth[:1], levels[:1], scene.present[:1], None if cond is None else cond[:1])
+        return shown
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()

@@ -7,6 +7,7 @@ from typing import Literal
 
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.placement import Placement
+from magnet.sampling.options import Settling
 
 Rope = Literal["hidden", "heads", "none"]
 Distribution = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -80,18 +81,22 @@ class NoiseOptions:
             token as the paper reads literally, which leaks where unknown agents are.
         pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
             smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
+        bursts: share of scenes in which all but one of the people miss tokens in bursts of three on average, as agents
+            do whose messages get lost (ours).
     """
 
     distribution: Distribution = "per_token"
     shift: float = 1.0
     pairwise: PairwiseNoise = "noisier_end"
     pairwise_metres: float = 0.0
+    bursts: float = 0.0
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
+        require_number("bursts", self.bursts, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -166,3 +171,20 @@ class SelfForcing:
             require_number(name, getattr(self, name), 0, 1)
         require_choice("placement", self.placement, Placement)
         require_number("pairwise_weight", self.pairwise_weight, least=0)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a trained model is best sampled: what a `SamplerOptions` leaves open (ours). None: as other models are.
+
+    Args:
+        stride: token steps finished before the window moves on.
+        pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
+        settle: how poses are corrected.
+        smooth_path: whether paths over the floor are smoothed.
+    """
+
+    stride: int | None = None
+    pyramid_offset: int | None = None
+    settle: Settling | None = None
+    smooth_path: bool | None = None

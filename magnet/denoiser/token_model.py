@@ -14,6 +14,7 @@ from torch import Tensor
 
 from magnet import checkpoints
 from magnet.body import Body, load_body
+from magnet.denoiser.options import Sampling
 from magnet.denoiser.statistics import token_statistics
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
@@ -36,6 +37,7 @@ class TokenModel(L.LightningModule):
     layout: TokenLayout
     normalizer: Normalizer
     window: int  # token steps that the network sees at once
+    sampling: Sampling = Sampling()  # how it is best sampled
 
     def __init__(self) -> None:
         super().__init__()

@@ -145,8 +145,9 @@ class Evaluator(L.LightningModule):
 
     def schedule(self, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
         """The task's plan for scenes of so many frames, of people in the first `slots` slots; by default in all."""
-        agents = self.denoiser.layout.agents if slots is None else slots
-        return planned(self.task, context, horizon, agents, self.denoiser.window, self.sampler)
+        model = self.denoiser
+        agents = model.layout.agents if slots is None else slots
+        return planned(self.task, context, horizon, agents, model.window, self.sampler.filled(model.sampling))
 
     def sees(self, slots: int) -> Sight:
         """What the task gives and what it generates, of people in the first `slots` slots."""

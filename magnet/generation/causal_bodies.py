@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.blending import freeze_after, spring_from_given
+from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.settling import PACE, settled_on
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
@@ -38,6 +38,9 @@ class World(Protocol):
     there: Tensor
     released: int
     decoder: Carried
+
+    @property
+    def settle(self) -> str | None: ...
 
     def by_frame(self, rows: Tensor) -> Tensor: ...
 
@@ -108,14 +111,14 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
-    if world.options.settle != "off":
-        made = _settled(world, made, stop)
+    if world.settle is not None:
+        made = _settled(world, made, stop, world.settle)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
     world.finalized = stop
 
 
-def _settled(world: World, made: Scene, stop: int) -> Scene:
+def _settled(world: World, made: Scene, stop: int, how: str) -> Scene:
     """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before."""
     first = world.finalized * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
@@ -123,7 +126,7 @@ def _settled(world: World, made: Scene, stop: int) -> Scene:
     before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
     world.uncorrected = made.slice(made.frames - LEAD)
     unseen = world.known[rows].any(dim=0).to(new.device)
-    made, world.correction = settled_on(made, before, new, unseen, world.options.settle, world.correction)
+    made, world.correction = settled_on(made, before, new, unseen, how, world.correction)
     return made
 
 
@@ -144,6 +147,7 @@ def decode_bodies(
     lead = LEAD if first else 0
     low = max(first - bool(first) - receptive_field(model)[0], 0)
     latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
+    ways = None
     if expected is not None:
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
@@ -152,7 +156,7 @@ def decode_bodies(
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     there = world.there[~keep[:, world.there].all(dim=0)]  # of whom something is seen that is not given
     features = decoded_frames(world, latent, deltas, shown, low, near - low, there)
-    given, T_world_can = world.given.slice(frames.start, frames.stop), world.T_world_can[:, frames]
+    given, T_world_can = world.given.slice(frames.start, frames.stop), shown_path(world, near, ways)[:, frames]
     if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
         given = cat_time([world.uncorrected, given.slice(lead)])
     if first:  # whoever was not there before does not go on from anywhere
@@ -160,6 +164,22 @@ def decode_bodies(
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
+
+
+def shown_path(world: World, near: int, ways: Tensor | None) -> Tensor:
+    """Canonical frames before row `near` as they are shown. -> (B, 4 near, P, 4, 4)
+
+    The last of them is averaged with where the first of `ways` (B, n, P, 4, 9) leads: what is expected next.
+    """
+    T_world_can = world.T_world_can[:, : near * TOKEN_FRAMES]
+    if not world.options.smooth_path:
+        return T_world_can
+    placed, known = (world.by_frame(each[:near]) for each in (world.placed, world.known))
+    if ways is None:
+        return smoothed_path(T_world_can, placed, known)
+    ahead = T_world_can[:, -1:] @ from_9d(ways[:, :1, :, 0])
+    placed, known = (torch.cat([each, each[-1:]]) for each in (placed, known))
+    return smoothed_path(torch.cat([T_world_can, ahead], dim=1), placed, known)[:, :-1]
 
 
 def decoded_frames(

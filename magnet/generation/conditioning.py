@@ -208,3 +208,16 @@ def segments(known: Tensor) -> list[tuple[int, int, list[int]]]:
         for run in true_runs(known[:, agent].tolist()):
             found.setdefault(run, []).append(agent)
     return [(start, stop, agents) for (start, stop), agents in sorted(found.items())]
+
+
+def first_of(mask: Tensor) -> Tensor:
+    """The first agent of each scene for whom a mask holds; 0 where there is none. (B, P) bool -> (B,) int"""
+    return mask.int().argmax(dim=1)
+
+
+def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:
+    """Runs of token steps in which the same agents are new and the same are placed. finished, placed (N, P) bool"""
+    pattern = torch.cat([finished, placed], dim=1)[first:stop]
+    change = (pattern[1:] != pattern[:-1]).any(dim=1).nonzero()[:, 0] + first + 1
+    edges = [first, *change.tolist(), stop]
+    return [(start, end) for start, end in itertools.pairwise(edges) if bool(finished[start].any())]

@@ -1,4 +1,4 @@
-"""Checks of what a model is to continue: refused before anything is sampled, with what to do."""
+"""What a model is to continue: checked before anything is sampled, with what to do, and filled up to whole tokens."""
 
 from __future__ import annotations
 
@@ -106,3 +106,13 @@ def _refuse(bad: Tensor, frames: Tensor, scene: Scene, what: str) -> None:
         count = int(bad[b].any(dim=-1).sum())
         also = f" (and {count - 1} more frames of that scene)" if count > 1 else ""
         raise ValueError(f"{label(scene, b)}, agent {agent}: frame {int(frames[frame])}{also} {what}")
+
+
+def whole_tokens(scene: Scene, frames: int) -> Scene:
+    """The first frames of a scene, filled up to a whole token; its last pose is repeated if it has no more frames."""
+    wanted = -(-frames // TOKEN_FRAMES) * TOKEN_FRAMES
+    if scene.frames >= wanted:
+        return scene
+    frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)
+    valid = None if scene.valid is None else scene.valid[:, frame]
+    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=valid)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import Sampling
 from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
 from magnet.generation.rollout import CHUNK, Generators, Rollout
@@ -49,6 +50,8 @@ class OnlineRollout(Rollout):
                 "live; train with pairwise_noise='noisier_end'"
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
+        # A correction takes longer than half of a token: it has to be asked for.
+        options = (options or SamplerOptions()).filled(Sampling(settle="off"))
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
         self.there = past.frames // TOKEN_FRAMES
         self.scene = mask_unknown(self.scene, self._known(0, self.there))

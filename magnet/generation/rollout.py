@@ -23,7 +23,7 @@ from magnet.generation.conditioning import (
     require_people,
     task_lookahead_limit,
 )
-from magnet.generation.inputs import check_given, check_request
+from magnet.generation.inputs import check_given, check_request, whole_tokens
 from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
@@ -67,7 +67,7 @@ def generate(
         context: frames recorded of everybody, a multiple of 4.
         frames: frames after the context.
         samples: scenes drawn for each recording; sample s of scene b is at b * samples + s.
-        options: how to sample.
+        options: how to sample; what they leave open is as the model is best sampled.
         generator: source of randomness, on the model's device; or one for each of the B * samples scenes, which
             are then the same whatever else is in the batch.
         progress: told 1 after each denoising step.
@@ -108,12 +108,16 @@ def stream(
     Args:
         frames: None: endless, for tasks that are given nothing after the context.
         chunk: token steps decoded and handed out at a time. Smaller chunks come sooner. With the precision `reference`
-            they cost more, and poses differ by rounding. None: all that are final, or 64 where poses are settled.
+            they cost more, and poses differ by rounding. None: all that are final, or 64 where `options` say `settle`,
+            which is off here unless they do.
 
     Raises:
         ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
     """
-    chunk = CHUNK if chunk is None and options is not None and options.settle != "off" else chunk
+    options = options or SamplerOptions()
+    if chunk is None and options.settle is None:
+        options = dataclasses.replace(options, settle="off")
+    chunk = CHUNK if chunk is None and options.settle != "off" else chunk
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
     more = (options, generator, progress, stats, chunk, cond)
@@ -146,7 +150,7 @@ class Rollout:
     ) -> None:
         check_request(model, scene, context, frames, samples)
         layout = model.layout
-        self.model, self.options, self.chunk = model, options or SamplerOptions(), chunk
+        self.model, self.options, self.chunk = model, (options or SamplerOptions()).filled(model.sampling), chunk
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
         self.samples, self.progress, self.stats = samples, progress, stats or SamplingStats()
         self.frames = None if frames is None else context + frames
@@ -242,7 +246,8 @@ class Rollout:
         if self.world.causal:
             return before + 2, 0
         seam = -(-self.options.blend // TOKEN_FRAMES) if self.options.keep_given else 0
-        return before + seam + 1, after + seam * (self.limits is not None or self.options.precision == "reference")
+        after = after + seam * (self.limits is not None or self.options.precision == "reference")
+        return before + seam + 1, max(after, int(bool(self.options.smooth_path)))
 
     # Each call enters its contexts itself: held across a yield they would apply to the caller too.
 
@@ -386,13 +391,3 @@ class Rollout:
         """Which tokens of the rows [first, stop) are known; none beyond the plan of an endless scene."""
         rows = self.known[first:stop]
         return torch.nn.functional.pad(rows, (0, 0, 0, stop - first - len(rows)))
-
-
-def whole_tokens(scene: Scene, frames: int) -> Scene:
-    """The first frames of a scene, filled up to a whole token; its last pose is repeated if it has no more frames."""
-    wanted = -(-frames // TOKEN_FRAMES) * TOKEN_FRAMES
-    if scene.frames >= wanted:
-        return scene
-    frame = torch.arange(wanted, device=scene.device).clamp(max=scene.frames - 1)
-    valid = None if scene.valid is None else scene.valid[:, frame]
-    return scene.replace(body_rot=scene.body_rot[:, frame], T_world_root=scene.T_world_root[:, frame], valid=valid)

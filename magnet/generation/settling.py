@@ -22,6 +22,9 @@ LEAD = 2
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 """How a block is corrected before the model goes on from it: stiffly, since it is short; the end sees to the rest."""
 
+CHUNK = Settle(iterations=8, inner=24, bend=100.0)
+"""How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too (docs/tasks.md)."""
+
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
 """How a causal plan's next frames are corrected: what is held over fades soon where nothing asks for it."""
 
@@ -115,6 +118,7 @@ class Corrected(NamedTuple):
 
     offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
     holding: Tensor | None  # (B, Q, 2, 2) bool, hands that hold in the last; None: nobody asks
+    who: tuple[int, ...]  # the P slots
 
 
 @torch.no_grad()
@@ -122,7 +126,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     """Bodies of a finished chunk corrected, going on from the correction of the chunk before.
 
     Args:
-        scene: (B, T, P) bodies.
+        scene: (B, T, P) bodies; whoever is not present is not seen.
         fixed: (T, P) bool, who stays.
         how: `light`, `firm` or `hold`.
         past: what the last call returned; None: the chunk is the first.
@@ -131,12 +135,18 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
         The scene, and how its last frames were corrected.
     """
     body = open_body_on(scene.device)
-    shaped = scene.replace(body=body.id, valid=None, given=None)
-    offset, holding = (None, None) if past is None else past
-    offset = settling(shaped, body, how, fixed, begun=past is not None, past=offset, holding=holding)
+    there = scene.present.any(dim=0).nonzero()[:, 0]
+    who, begun = tuple(there.tolist()), past is not None
+    past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
+    shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
+    offset, holding = (None, None) if past is None else past[:2]
+    still = fixed[:, there.to(fixed.device)]
+    offset = settling(shaped, body, how, still, CHUNK, begun, offset, holding=holding)
     made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(offset[:, -2:], held)
+    body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
+    body_rot[:, :, there], root[:, :, there] = made.body_rot, made.T_world_root
+    return scene.replace(body_rot=body_rot, T_world_root=root), Corrected(offset[:, -2:], held, who)
 
 
 def hands_held(scene: Scene, body: Body) -> Tensor:

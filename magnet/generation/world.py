@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.blending import crossfade_given, delta_between, freeze_after, warp_to_keyframe
+from magnet.generation.blending import crossfade_given, delta_between, freeze_after, smoothed_path, warp_to_keyframe
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
-from magnet.generation.conditioning import lookahead_limit, receptive_field
+from magnet.generation.conditioning import first_of, lookahead_limit, receptive_field, spans
 from magnet.generation.separation import Decode, separated
 from magnet.generation.settling import LEAD, Corrected, settled_block, settled_chunk
 from magnet.generation.stats import SamplingStats
@@ -60,6 +59,7 @@ class WorldState:
     ) -> None:
         self.model = model
         self.options = options
+        self.settle = None if options.settle == "off" else options.settle
         self.stats = stats
         self.samples = samples
         self.known = schedule.known[: given.frames // TOKEN_FRAMES]
@@ -119,7 +119,7 @@ class WorldState:
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
-        if self.options.settle_blocks and self.options.settle != "off":
+        if self.options.settle_blocks and self.settle is not None:
             latent = self._settle(tokens, latent, finished, first, stop, decentralized)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
@@ -168,6 +168,7 @@ class WorldState:
         self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
     ) -> Tensor:
         """Correct the poses of the newly placed, and make them what the model goes on from. -> latents (B, n, P, C)"""
+        assert self.settle is not None
         lead = min(LEAD, first)
         if lead:
             before = self.model.normalizer.denormalize(tokens[:, first - lead : first])
@@ -176,7 +177,7 @@ class WorldState:
         new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
         new, known = new.to(latent.device), self.known[low:stop].to(latent.device)
         T_world_can, unseen = self.T_world_can[:, frames], (self.known[first] & self.causal).to(latent.device)
-        rest = self.given.slice(frames.start, frames.stop), new, known, unseen, self.options.settle, lead, decentralized
+        rest = self.given.slice(frames.start, frames.stop), new, known, unseen, self.settle, lead, decentralized
         deltas = self.placed_deltas(low, stop)
         plain, made = settled_block(self.model.tokenizer.decode, latent, deltas, T_world_can, *rest)
         moved = (made.T_world_root != plain.T_world_root).flatten(3).any(-1)
@@ -368,30 +369,28 @@ class WorldState:
         frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
         features = decoded_frames(self, latent, deltas, frames, near.start, latent.shape[1])
         given = self.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
-        T_world_can = self.T_world_can[:, low * TOKEN_FRAMES : high * TOKEN_FRAMES]
+        T_world_can = self._shown_path(low, high)
         decoded = posed(features, T_world_can, given)
         if self.options.keep_given:
             keep = self.by_frame(self.known[low:high])
             decoded = crossfade_given(decoded, given, T_world_can, keep, self.options.blend)
         decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
-        if self.options.settle != "off":
-            fixed = self.by_frame(self.known[first:stop])
-            decoded, self.chunk = settled_chunk(decoded, fixed, self.options.settle, self.chunk)
+        if self.settle is not None:
+            fixed, goes_on = self.by_frame(self.known[first:stop]), self.placed[first:stop].all(dim=0).to(tokens.device)
+            seen = decoded.replace(present=decoded.present & goes_on)  # nobody makes way for whom nothing is known of
+            made, self.chunk = settled_chunk(seen, fixed, self.settle, self.chunk)
+            decoded = made.replace(present=decoded.present)
         return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
+
+    def _shown_path(self, first: int, stop: int) -> Tensor:
+        """Canonical frames of rows [first, stop) as they are shown. -> (B, 4 n, P, 4, 4)"""
+        until = stop * TOKEN_FRAMES + 1
+        T_world_can = self.T_world_can[:, :until]
+        if self.options.smooth_path:
+            placed, known = (self.by_frame(each)[:until] for each in (self.placed, self.known))
+            T_world_can = smoothed_path(T_world_can, placed, known)
+        return T_world_can[:, first * TOKEN_FRAMES : stop * TOKEN_FRAMES]
 
     def by_frame(self, rows: Tensor) -> Tensor:
         """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""
         return rows.repeat_interleave(TOKEN_FRAMES, dim=0).to(self.given.device)
-
-
-def first_of(mask: Tensor) -> Tensor:
-    """The first agent of each scene for whom a mask holds; 0 where there is none. (B, P) bool -> (B,) int"""
-    return mask.int().argmax(dim=1)
-
-
-def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple[int, int]]:
-    """Runs of token steps in which the same agents are new and the same are placed. finished, placed (N, P) bool"""
-    pattern = torch.cat([finished, placed], dim=1)[first:stop]
-    change = (pattern[1:] != pattern[:-1]).any(dim=1).nonzero()[:, 0] + first + 1
-    edges = [first, *change.tolist(), stop]
-    return [(start, end) for start, end in itertools.pairwise(edges) if bool(finished[start].any())]

@@ -14,7 +14,7 @@ from magnet.body import Body
 from magnet.denoiser.losses import token_losses
 from magnet.denoiser.token_model import TokenModel
 from magnet.generation.conditioning import mask_unknown
-from magnet.generation.rollout import whole_tokens
+from magnet.generation.inputs import whole_tokens
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.peers.network import PeerNetwork

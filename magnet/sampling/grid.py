@@ -10,6 +10,9 @@ from torch import Tensor
 from magnet.checks import require_choice, require_whole
 from magnet.sampling.options import NoiseSampling, SamplerOptions, Spacing, require_spacing
 
+STRIDE = 4
+"""Token steps that are finished before the window moves on, where nothing is said."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -20,7 +23,7 @@ class Grid:
     context: int  # recorded token steps at the start, 0 for generation from nothing
     steps: int = SamplerOptions.steps  # denoising steps S
     window: int = 16  # token steps W that the model sees at once
-    stride: int = SamplerOptions.stride  # token steps finished before the window moves on
+    stride: int = STRIDE  # token steps finished before the window moves on
     pyramid_offset: int | None = SamplerOptions.pyramid_offset  # steps between a token and the next, see `token_offset`
     shift: float = SamplerOptions.shift  # see `magnet.sampling.noise.shifted`
     noise_sampling: NoiseSampling = SamplerOptions.noise_sampling  # see `magnet.sampling.plans.token_levels`
@@ -80,5 +83,5 @@ class Grid:
 
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
-    o = options
-    return Grid(tokens, agents, past, o.steps, window, o.stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)
+    o, stride = options, options.stride or min(STRIDE, window)
+    return Grid(tokens, agents, past, o.steps, window, stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)

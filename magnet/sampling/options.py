@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from magnet.checks import require_choice, require_number, require_whole
@@ -40,10 +40,12 @@ class SamplerOptions:
     Args:
         steps: denoising steps S; the paper takes 30 (A.3). At most as many as there are different levels, which depends
             on `spacing` and `shift`.
-        stride: token steps finished before the window moves on; the reference keeps 12 of 16.
+        stride: token steps finished before the window moves on; the reference keeps 12 of 16. None: as the model is
+            best sampled (`Denoiser.sampling`), or 4.
         pyramid_offset: denoising steps from a token to the next, which makes the plan lower-triangular: 4 of 30 steps
-            keep 8 tokens in flight. 0: the tokens of a stride are denoised together, as in the paper. None: half of
-            the window is in flight; tasks whose agents take turns or that look ahead to keyframes go in strides.
+            keep 8 tokens in flight. 0: the tokens of a stride are denoised together, as in the paper. None: as the
+            model is best sampled, or half of the window is in flight; tasks whose agents take turns or that look ahead
+            to keyframes go in strides.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
@@ -54,7 +56,11 @@ class SamplerOptions:
             (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
         settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
             themselves, hands held, feet still and on the floor. `light` lets people lean on each other, `firm` leaves
-            them touch; with `hold`, firm too, hands that met hold until they are half a metre apart.
+            them touch; with `hold`, firm too, hands that met hold until they are 60 cm apart. None: as the model
+            is best sampled, or `off`, as in crowds, live runs and streams.
+        smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
+            the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
+            the one after the last is as it is expected. None: as the model is best sampled, or not.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
@@ -77,14 +83,15 @@ class SamplerOptions:
     """
 
     steps: int = 16
-    stride: int = 4
+    stride: int | None = None
     pyramid_offset: int | None = None
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
     apart: Separation = "off"
     body_guidance: Separation = "off"
-    settle: Settling = "off"
+    settle: Settling | None = None
     settle_blocks: bool = False
+    smooth_path: bool | None = None
     requantize: bool | None = None
     keep_given: bool = True
     blend: int = 10
@@ -101,11 +108,13 @@ class SamplerOptions:
         if not isinstance(self.guidance, Guidance):
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         choices = {"placement": Placement, "solver": Solver, "precision": Precision}
-        choices |= {"apart": Separation, "body_guidance": Separation, "settle": Settling}
+        choices |= {"apart": Separation, "body_guidance": Separation}
+        choices |= {} if self.settle is None else {"settle": Settling}
         for name, known in choices.items():
             require_choice(name, getattr(self, name), known)
         require_whole("steps", self.steps, 1, LEVELS)
-        require_whole("stride", self.stride, 1)
+        if self.stride is not None:
+            require_whole("stride", self.stride, 1)
         if self.pyramid_offset is not None:
             require_whole("pyramid_offset", self.pyramid_offset, 0)
         require_number("pairwise_weight", self.pairwise_weight, least=0)
@@ -113,14 +122,19 @@ class SamplerOptions:
         require_number("eta", self.eta, 0, 1)
         require_spacing(self.spacing, self.shift)
 
+    def filled(self, best: Any) -> SamplerOptions:
+        """These options where they say something; what they leave open from another object's fields of that name."""
+        left_open = [each.name for each in fields(self) if getattr(self, each.name) is None]
+        return replace(self, **{name: getattr(best, name) for name in left_open if hasattr(best, name)})
+
     @classmethod
-    def preset(cls, name: str, **fields: Any) -> SamplerOptions:
+    def preset(cls, name: str, **said: Any) -> SamplerOptions:
         """The options of a preset (`magnet.sampling.presets`), some fields replaced: `preset("paper", steps=50)`.
 
         Raises:
             ValueError: no such preset; suggests the closest.
         """
-        said = preset_fields(name)
-        if "guidance" in said:
-            said = {**said, "guidance": Guidance(**said["guidance"])}
-        return cls(**{**said, **fields})
+        named = preset_fields(name)
+        if "guidance" in named:
+            named = {**named, "guidance": Guidance(**named["guidance"])}
+        return cls(**{**named, **said})

@@ -10,7 +10,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # The default before: it loses a quarter of the variance, and with it much of what the shipped model gets wrong.
     "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even"},
-    # Without rolling: for models with `network.skip`, such as `duet3`, which calm down where the levels are a ramp.
+    # What the model makes, and nothing corrected after it.
+    "plain": {"settle": "off", "smooth_path": False},
+    # Without rolling, for any model.
     "strides": {"stride": 12, "pyramid_offset": 0},
     "paper": {
         "steps": 30,  # A.3
@@ -40,10 +42,12 @@ PRESETS: dict[str, dict[str, Any]] = {
         "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose
         "settle_blocks": False,
+        "smooth_path": False,
     },
 }
 """Fields of `SamplerOptions` by name. `default` is the class's own; `steady` is for groups of three and four, `strides`
-for `duet3`; `paper` gives every field, so that it stays the paper's whatever the defaults become."""
+makes any model go in strides, `plain` corrects nothing; `paper` gives every field, so that it stays the paper's
+whatever the defaults become."""
 
 
 def preset_fields(name: str) -> dict[str, Any]:

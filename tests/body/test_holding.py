@@ -78,11 +78,11 @@ def test_hands_are_drawn_together_and_nearer_ones_are_left_as_they_are() -> None
 
 
 def test_a_hold_begins_and_ends_smoothly() -> None:
-    closer = torch.linspace(0.7, 0.15, 20)
+    closer = torch.linspace(PARTED + 0.2, 0.15, 20)
     joints = two_people(torch.cat([closer, torch.full((30,), 0.15), closer.flip(0)]))
     wished = lasting_holds(joints, THERE, FPS)[1].norm(dim=-1)[0, :, 0, 0, 1]
     assert wished[30] == pytest.approx(GRIP, abs=1e-4)
-    assert float(wished.diff().abs().max()) < 0.12  # metres a frame; without easing 0.4 at either end
+    assert float(wished.diff().abs().max()) < 0.15  # metres a frame; without easing 0.5 at either end
 
 
 def test_a_hand_holds_one_hand() -> None:

@@ -5,14 +5,16 @@ import torch
 
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.options import SelfForcing
+from magnet.denoiser.options import Sampling, SelfForcing
 from magnet.denoiser.self_forcing import with_self_forcing
-from magnet.generation.rollout import generate
+from magnet.generation.online import OnlineRollout
+from magnet.generation.rollout import generate, stream
 from magnet.generation.stats import SamplingStats
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
+from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 
 FAST = SamplerOptions(steps=2, stride=2)
@@ -136,3 +138,45 @@ def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, mon
         for name in ("latent", "delta", "pairwise"):
             assert torch.allclose(b[name], weight * a[name], rtol=1e-5)
         assert torch.equal(a["consistency"], b["consistency"])
+
+
+# -- how a model is best sampled ---------------------------------------------------------------
+
+BEST = {"stride": 6, "pyramid_offset": 0, "settle": "hold", "smooth_path": True}
+
+
+@pytest.mark.parametrize("name", ["joint_future", "motion_control"])
+def test_what_a_sampler_leaves_open_is_as_the_model_is_best_sampled(scene: Scene, name: str):
+    plain, best = tiny_denoiser(), tiny_denoiser(sampling=BEST)
+    asked = sampled(plain, scene, registry.get(name)(), SamplerOptions(steps=2, **BEST))
+    assert torch.equal(sampled(best, scene, registry.get(name)(), SamplerOptions(steps=2)).body_rot, asked.body_rot)
+    assert not torch.equal(
+        sampled(plain, scene, registry.get(name)(), SamplerOptions(steps=2)).body_rot, asked.body_rot
+    )
+    other = {"stride": 2, "pyramid_offset": 0, "settle": "off", "smooth_path": False}
+    said = [sampled(each, scene, registry.get(name)(), SamplerOptions(steps=2, **other)) for each in (plain, best)]
+    assert torch.equal(said[0].T_world_root, said[1].T_world_root)
+
+
+def test_a_live_run_corrects_nothing_unless_it_is_asked_to(scene: Scene):
+    models = [tiny_denoiser(sampling={"settle": how}) for how in ("off", "firm")]
+    runs = [OnlineRollout(model, scene.slice(0, 16), MotionControl(), SamplerOptions(steps=2)) for model in models]
+    asked = OnlineRollout(models[0], scene.slice(0, 16), MotionControl(), SamplerOptions(steps=2, settle="firm"))
+    assert [each.world.settle for each in (*runs, asked)] == [None, None, "firm"]
+
+
+def test_how_it_is_best_sampled_comes_back_with_a_checkpoint(tmp_path):
+    from tests.denoiser.test_module import save
+
+    assert Denoiser.load(save(tiny_denoiser(sampling=BEST), tmp_path / "model.ckpt")).sampling == Sampling(**BEST)
+    assert tiny_denoiser().sampling == Sampling() and Denoiser.load("duet").sampling.settle == "hold"
+
+
+def test_a_stream_hands_out_what_is_final_at_once_unless_it_is_to_be_corrected(scene: Scene):
+    model = tiny_denoiser(sampling={"settle": "firm"})
+
+    def first(options: SamplerOptions) -> Scene:
+        return next(stream(model, scene, JointFuture(), 16, 64, 1, options, torch.Generator().manual_seed(0)))
+
+    assert first(FAST).frames < 80 and first(SamplerOptions(steps=2, stride=2, settle="firm")).frames == 80
+    assert torch.equal(first(FAST).body_rot, first(SamplerOptions(steps=2, stride=2, settle="off")).body_rot)

@@ -4,7 +4,7 @@ import pytest
 import roma
 import torch
 
-from magnet.generation.blending import SPRING, spring_from_given, spring_weights
+from magnet.generation.blending import SPRING, smoothed_path, spring_from_given, spring_weights
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -76,3 +76,26 @@ def test_without_blending_only_given_frames_are_put_back(pair):
     made = spring_from_given(decoded, given, T_world_can, keep, 0)
     assert torch.allclose(made.body_rot[:, 10:], decoded.body_rot[:, 10:], atol=1e-5)
     assert torch.equal(made.body_rot[:, :10], given.body_rot[:, :10])
+
+
+def path(*places: float) -> torch.Tensor:
+    """Canonical frames of two people who go the same way. -> (1, T, 2, 4, 4)"""
+    T_world_can = torch.eye(4).repeat(1, len(places), 2, 1, 1)
+    T_world_can[..., 0, 3] = torch.tensor(places)[None, :, None]
+    return T_world_can
+
+
+def test_a_smoothed_path_keeps_a_steady_walk_and_stops_a_tremble():
+    placed, nobody = torch.ones(6, 2, dtype=torch.bool), torch.zeros(6, 2, dtype=torch.bool)
+    walk, tremble = path(0, 1, 2, 3, 4, 5), path(0, 1, 0, 1, 0, 1)
+    assert torch.equal(smoothed_path(walk, placed, nobody), walk)
+    made = smoothed_path(tremble, placed, nobody)[0, :, :, 0, 3]
+    assert torch.equal(made[1:-1], torch.full((4, 2), 0.5)) and torch.equal(made[[0, -1]], path(0, 1)[0, :, :, 0, 3])
+
+
+def test_whoever_is_given_or_beside_a_gap_stays_where_they_are():
+    placed, given = torch.ones(6, 2, dtype=torch.bool), torch.zeros(6, 2, dtype=torch.bool)
+    given[:, 0], placed[3, 1] = True, False
+    tremble = path(0, 1, 0, 1, 0, 1)
+    moved = (smoothed_path(tremble, placed, given) != tremble).flatten(3).any(-1)[0]
+    assert moved.nonzero().tolist() == [[1, 1]]

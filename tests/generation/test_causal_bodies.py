@@ -18,6 +18,7 @@ from magnet.testing import random_scene
 
 TOKENS, PAST = 14, 4
 BARE = SamplerOptions(steps=2, keep_given=False, blend=0)
+SMOOTH = SamplerOptions(steps=2, smooth_path=True)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_a_block_is_decoded_from_its_own_and_earlier_tokens(model, scene):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("options", [BARE, SamplerOptions(steps=2), SamplerOptions(steps=2, blend=3)], ids=str)
+@pytest.mark.parametrize("options", [BARE, SamplerOptions(steps=2), SamplerOptions(steps=2, blend=3), SMOOTH], ids=str)
 def test_nothing_behind_a_block_reaches_its_bodies(model, scene, options):
     world, tokens = finished(model, scene, options)
     other, changed = finished(model, scene, options)

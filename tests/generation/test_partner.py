@@ -95,8 +95,10 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(model, 
         (3, FAST),
         (2, SamplerOptions(steps=2, guidance=Guidance("partner"))),
         (1, SamplerOptions(steps=3, keep_given=False, eta=0.0, placement="integrate")),
+        (1, SamplerOptions(steps=2, smooth_path=True)),
+        (2, SamplerOptions(steps=2, smooth_path=True, settle="firm")),
     ],
-    ids=["token by token", "three tokens", "guided", "bare"],
+    ids=["token by token", "three tokens", "guided", "bare", "smooth", "smooth and settled"],
 )
 def test_answers_are_what_motion_control_gives_bit_for_bit(model, block, options):
     """Live and offline score the same: fed as it comes, or all known at once."""

@@ -157,6 +157,8 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
         SamplerOptions(steps=2, stride=3, placement="anchor", keep_given=False),
         SamplerOptions(steps=2, stride=2, blend=17),
         SamplerOptions(steps=2, stride=2, requantize=False),
+        SamplerOptions(steps=2, stride=2, smooth_path=True),
+        SamplerOptions(steps=2, stride=2, smooth_path=True, keep_given=False),
         SamplerOptions(steps=4, pyramid_offset=2),
         SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
         SamplerOptions(steps=4, pyramid_offset=2, eta=0.5),

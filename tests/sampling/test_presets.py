@@ -66,7 +66,7 @@ def test_fields_replace_those_of_a_preset():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "hint"), [("papr", "did you mean paper?"), ("xyz", "there are default, steady, strides, paper")]
+    ("wrong", "hint"), [("papr", "did you mean paper?"), ("xyz", "there are default, steady, plain, strides, paper")]
 )
 def test_a_wrong_name_suggests_the_closest(wrong: str, hint: str):
     import argparse

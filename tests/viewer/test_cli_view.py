@@ -130,9 +130,9 @@ def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]
 
 
-def test_live_begins_so_that_it_holds_unless_something_is_said() -> None:
-    """Steady and apart from the couple that comes along; a sampler that is named is taken as it is."""
-    assert sampler_options(arguments_of(["--live"])) == SamplerOptions.preset("steady", steps=10, apart="light")
+def test_live_takes_few_steps_unless_something_is_said() -> None:
+    """A sampler that is named is taken as it is."""
+    assert sampler_options(arguments_of(["--live"])) == SamplerOptions(steps=10, apart="light")
     assert sampler_options(arguments_of(["--live", "--steps", "16"])).steps == 16
     assert sampler_options(arguments_of(["--live", "--sampler", "paper"])) == SamplerOptions.preset("paper")
     assert sampler_options(arguments_of(["a.npz", "--record", "b.npz"])) == SamplerOptions(steps=10)
