@@ -53,7 +53,7 @@ def sampled(model: magnet.Model, people: int, frames: int, spacing: float) -> tu
         done = sum(each.frames for each in pieces)
         print(f"  {people} people, {done} frames after {time.perf_counter() - began:.0f} s, {peak:.2f} GB", flush=True)
     scene = cat_time(pieces)
-    scene = settled_moments(scene, ~scene.given[0]) if people > model.denoiser.layout.agents else scene
+    scene = settled_moments(scene) if people > model.denoiser.layout.agents else scene
     took, cpu = time.perf_counter() - began, time.process_time() - used
     views = stats.windows / stats.calls
     cost = Cost(people, stats.calls, views, 1000 * cpu / stats.calls, frames / took, frames / cpu, peak)

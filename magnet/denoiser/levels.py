@@ -26,9 +26,6 @@ FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.6
 """Share of roll-outs without any past: chance alone would start one in N there, and every generation does. More of
 those with mixed roles: with a past, where a partner is need not be told from the other's motion, as inpainting must."""
 
-BURST, GAP = 3.0, 6.0
-"""Mean tokens of a burst of missing ones, and between two of them."""
-
 ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
@@ -105,25 +102,3 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: fl
     levels = torch.where(role == 1, given, generated)
     levels = torch.where(role == 2, torch.zeros_like(levels), levels)
     return torch.where(role == 3, hidden, levels)
-
-
-def missing_bursts(levels: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Levels in which a partner's tokens are missing in bursts, as an agent sees who loses messages. -> (B, N, P) int
-
-    Args:
-        levels: (B, N, P) int, of all tokens.
-        share: of the scenes in which somebody's tokens get lost; never everybody's.
-        generator: source of all randomness.
-    """
-    B, N, P = levels.shape
-    if not share or P == 1:
-        return levels
-    draw = torch.rand(N + 2, B, P, generator=generator, device=levels.device)
-    lost = draw[-1] < BURST / (BURST + GAP)
-    steps = []
-    for step in range(N):
-        lost = torch.where(lost, draw[step] >= 1 / BURST, draw[step] < 1 / GAP)
-        steps.append(lost)
-    heard = draw[-2].argmax(dim=-1, keepdim=True) == torch.arange(P, device=levels.device)
-    scenes = torch.rand(B, 1, 1, generator=generator, device=levels.device) < share
-    return levels.masked_fill(torch.stack(steps, dim=1) & ~heard[:, None] & scenes, LEVELS)

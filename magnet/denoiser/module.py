@@ -13,7 +13,7 @@ from magnet import checkpoints
 from magnet.checks import require_choice
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
-from magnet.denoiser.levels import draw_levels, missing_bursts
+from magnet.denoiser.levels import draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, Sampling, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
@@ -230,7 +230,6 @@ class Denoiser(TokenModel):
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
-            levels = missing_bursts(levels, self.noise.bursts, generator)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.placement import Placement
-from magnet.sampling.options import Settling
+from magnet.sampling.options import SamplerOptions, Settling
 
 Rope = Literal["hidden", "heads", "none"]
 Distribution = Literal["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -81,22 +81,18 @@ class NoiseOptions:
             token as the paper reads literally, which leaks where unknown agents are.
         pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
             smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
-        bursts: share of scenes in which all but one of the people miss tokens in bursts of three on average, as agents
-            do whose messages get lost (ours).
     """
 
     distribution: Distribution = "per_token"
     shift: float = 1.0
     pairwise: PairwiseNoise = "noisier_end"
     pairwise_metres: float = 0.0
-    bursts: float = 0.0
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
-        require_number("bursts", self.bursts, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -188,3 +184,6 @@ class Sampling:
     pyramid_offset: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
+
+    def __post_init__(self) -> None:
+        SamplerOptions().filled(self)  # which refuses what no sampler takes

@@ -54,17 +54,11 @@ AGAINST_RECORDING = ("mpj", "hand_contact_")
 
 
 def planned(
-    task: Task,
-    context: int,
-    horizon: int,
-    agents: int,
-    window: int = 16,
-    sampler: SamplerOptions | None = None,
+    task: Task, context: int, horizon: int, agents: int, window: int = 16, sampler: SamplerOptions | None = None
 ) -> MaskSchedule:
     """A task's plan for scenes of so many frames and people."""
     tokens = -(-(context + horizon) // TOKEN_FRAMES)
-    options = sampler or SamplerOptions()
-    return task.schedule(planning_grid(tokens, agents, context // TOKEN_FRAMES, window, options))
+    return task.schedule(planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions()))
 
 
 @dataclass(frozen=True)

@@ -81,15 +81,11 @@ def generate_crowd(
             _refuse(model, one, TOKEN_FRAMES, options or SamplerOptions())
             start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
             whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *more).chunks()))
-            whole = settled_moments(whole, torch.ones_like(whole.present).expand(whole.frames, -1))
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
-            made.append(whole.replace(given=nobody).slice(0, frames))
-            continue
-        rollout = CrowdRollout(model, one, task, context, frames, *more)
-        whole = cat_time(list(rollout.chunks()))
-        if rollout.crowd and whole.given is not None:
-            whole = settled_moments(whole, ~whole.given[0])
-        made.append(whole)
+            whole = whole.replace(given=nobody).slice(0, frames)
+        else:
+            whole = cat_time(list(CrowdRollout(model, one, task, context, frames, *more).chunks()))
+        made.append(settled_moments(whole) if scene.agents > model.layout.agents else whole)
     return concatenate(made)
 
 

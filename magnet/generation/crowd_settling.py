@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.body.apart import APART, REACH, excess_depth, near_pairs
 from magnet.body.repair import repaired
 from magnet.generation.separation import open_body_on
-from magnet.generation.settling import CHUNK, LEAD
+from magnet.generation.settling import FINISHED, LEAD
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
 
@@ -34,21 +34,22 @@ class Encounter(NamedTuple):
 
 
 @torch.no_grad()
-def settled_moments(scene: Scene, free: Tensor) -> Scene:
+def settled_moments(scene: Scene) -> Scene:
     """A crowd out of each other's bodies: `apart` moves whole people over longer stretches and sees no quick passes.
 
-    Args:
-        scene: (1, T, P) of any body.
-        free: (T, P) bool, who may be moved.
+    scene (1, T, P), with what is `given`, which stays; None: nothing
     """
-    body = open_body_on(scene.device)
+    body, moved = open_body_on(scene.device), False
     for _ in range(ROUNDS):
         joints = body.joints(scene.replace(body=body.id, valid=None, given=None))[0]
         moments = deep_moments(joints, scene.present[0])
         if not moments:
             break
+        if not moved:
+            scene = scene.replace(body_rot=scene.body_rot.clone(), T_world_root=scene.T_world_root.clone())
+        moved = True
         for moment in moments:
-            scene = _settled(scene, free, moment, joints[:, :, 0, [0, 2]])
+            _settle(scene, moment, joints[:, :, 0, [0, 2]])
     return scene
 
 
@@ -66,27 +67,23 @@ def deep_moments(joints: Tensor, present: Tensor) -> list[Encounter]:
     return found
 
 
-def _settled(scene: Scene, free: Tensor, moment: Encounter, ground: Tensor) -> Scene:
-    """A scene with one moment settled. ground (T, P, 2): where people are"""
+def _settle(scene: Scene, moment: Encounter, ground: Tensor) -> None:
+    """Settle one moment of a scene in place. ground (T, P, 2): where people are"""
+    body = open_body_on(scene.device)
     start, stop = max(moment.start - AROUND // 2, 0), min(moment.stop + AROUND // 2, scene.frames)
     two = torch.tensor([moment.one, moment.other], device=scene.device)
     away = torch.cdist(ground[start:stop, two], ground[start:stop]).amin(dim=(0, 1))
     away[two] = torch.inf
     beside = away.argsort()[:BESIDE]
-    who = torch.cat([two, beside[away[beside] < REACH]])
-    fixed = ~free[start:stop, who.to(free.device)]
+    part = scene.slice(start, stop).permute_agents(torch.cat([two, beside[away[beside] < REACH]]))
+    fixed = torch.zeros_like(part.T_world_root[0, ..., 0, 0], dtype=torch.bool) if part.given is None else part.given[0]
+    fixed = fixed.clone()
     fixed[:, 2:] = True
     fixed[: LEAD * (start > 0)] = True
     fixed[len(fixed) - LEAD * (stop < scene.frames) :] = True
-    part = scene.slice(start, stop).replace(valid=None, given=None, names=()).permute_agents(who)
-    made = repaired(
-        part.replace(body=open_body_on(scene.device).id),
-        open_body_on(scene.device),
-        "firm",
-        fixed,
-        CHUNK,
-        drifting=False,
+    part = part.replace(body=body.id, valid=None, given=None, names=())
+    made = repaired(part, body, "firm", fixed, FINISHED, drifting=False)
+    scene.body_rot[:, start:stop, two], scene.T_world_root[:, start:stop, two] = (
+        made.body_rot[:, :, :2],
+        made.T_world_root[:, :, :2],
     )
-    body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
-    body_rot[:, start:stop, two], root[:, start:stop, two] = made.body_rot[:, :, :2], made.T_world_root[:, :, :2]
-    return scene.replace(body_rot=body_rot, T_world_root=root)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view
@@ -115,9 +116,9 @@ def stream(
         ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
     """
     options = options or SamplerOptions()
-    if chunk is None and options.settle is None:
-        options = dataclasses.replace(options, settle="off")
-    chunk = CHUNK if chunk is None and options.settle != "off" else chunk
+    if chunk is None:
+        options = options.filled(Sampling(settle="off"))
+        chunk = None if options.settle == "off" else CHUNK
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
     more = (options, generator, progress, stats, chunk, cond)

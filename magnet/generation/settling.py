@@ -22,7 +22,7 @@ LEAD = 2
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 """How a block is corrected before the model goes on from it: stiffly, since it is short; the end sees to the rest."""
 
-CHUNK = Settle(iterations=8, inner=24, bend=100.0)
+FINISHED = Settle(iterations=8, inner=24, bend=100.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too (docs/tasks.md)."""
 
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
@@ -141,7 +141,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
     offset, holding = (None, None) if past is None else past[:2]
     still = fixed[:, there.to(fixed.device)]
-    offset = settling(shaped, body, how, still, CHUNK, begun, offset, holding=holding)
+    offset = settling(shaped, body, how, still, FINISHED, begun, offset, holding=holding)
     made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()

@@ -1,17 +1,7 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import (
-    BURST,
-    FROM_NOTHING,
-    FROM_NOTHING_MIXED,
-    GAP,
-    MIXED,
-    ROLES,
-    draw_levels,
-    missing_bursts,
-    rollout_levels,
-)
+from magnet.denoiser.levels import FROM_NOTHING, FROM_NOTHING_MIXED, MIXED, ROLES, draw_levels, rollout_levels
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -64,27 +54,6 @@ def test_a_shift_draws_high_levels_more_often_and_keeps_both_ends(kind, generato
     assert moved.mean() > even.mean() + 40
     if kind != "mixture":
         assert moved.median() == pytest.approx(750, abs=30)  # 3 / 2 over 1 + 2 / 2
-
-
-def test_bursts_last_three_tokens_on_average_and_never_take_everybody(generator):
-    levels = missing_bursts(torch.zeros(2000, 200, 2, dtype=torch.long), 1.0, generator)
-    assert set(levels.unique().tolist()) == {0, LEVELS}
-    assert not (levels == LEVELS).all(dim=2).any()
-    lost = (levels == LEVELS).any(dim=2)
-    assert lost.double().mean() == pytest.approx(BURST / (BURST + GAP), abs=0.01)
-    bursts = (lost[:, 1:] & ~lost[:, :-1]).sum()
-    assert lost[:, 1:].sum() / bursts == pytest.approx(BURST, abs=0.1)
-
-
-def test_bursts_strike_their_share_of_the_scenes_and_leave_the_rest(generator):
-    before = draw_levels("mixture", 4000, 16, 2, generator)
-    after = missing_bursts(before, 0.25, generator)
-    assert (after >= before).all()
-    struck = (after != before).flatten(1).any(dim=1).double().mean()
-    assert 0.15 < struck < 0.25
-    assert torch.equal(missing_bursts(before, 0.0, generator), before)
-    alone = before[..., :1]
-    assert torch.equal(missing_bursts(alone, 1.0, generator), alone)
 
 
 def test_an_unknown_kind_is_named(generator):

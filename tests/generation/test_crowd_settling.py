@@ -29,7 +29,7 @@ def depth(scene: Scene) -> float:
 
 def test_who_walks_through_somebody_goes_around_them_and_nobody_else_moves() -> None:
     scene = passing()
-    made = settled_moments(scene, torch.ones(FRAMES, 5, dtype=torch.bool))
+    made = settled_moments(scene)
     assert depth(scene) > 0.10 and depth(made) < 0.05
     assert torch.equal(made.T_world_root[:, :, 2:], scene.T_world_root[:, :, 2:])
     assert torch.equal(made.T_world_root[:, [0, -1]], scene.T_world_root[:, [0, -1]]), (
@@ -40,16 +40,16 @@ def test_who_walks_through_somebody_goes_around_them_and_nobody_else_moves() -> 
 
 
 def test_who_is_given_does_not_make_way() -> None:
-    free = torch.ones(FRAMES, 5, dtype=torch.bool)
-    free[:, 0] = False
-    scene = passing()
-    made = settled_moments(scene, free)
+    given = torch.zeros(1, FRAMES, 5, dtype=torch.bool)
+    given[..., 0] = True
+    scene = passing().replace(given=given)
+    made = settled_moments(scene)
     assert torch.equal(made.body_rot[:, :, 0], scene.body_rot[:, :, 0]) and depth(made) < depth(scene)
 
 
 def test_a_crowd_that_keeps_apart_is_left_as_it_is() -> None:
     scene = passing().permute_agents(torch.tensor([0, 2, 3, 4]))
-    assert settled_moments(scene, torch.ones(FRAMES, 4, dtype=torch.bool)) is scene
+    assert settled_moments(scene) is scene
 
 
 def test_a_moment_is_found_with_its_frames() -> None:
