@@ -157,7 +157,10 @@ class Smoothness:
         T = self.cost.shape[0]
         own = self.cost[:, self.lead :].double()
         eye = torch.eye(T, dtype=own.dtype, device=own.device)
-        return torch.linalg.inv(torch.where(self.free, own + pull * eye, eye)).to(self.cost)
+        # Not linalg.inv: torch's batched LU fails on more than 150 rows with several threads (pytorch issue 142815).
+        return torch.cholesky_inverse(torch.linalg.cholesky(torch.where(self.free, own + pull * eye, eye))).to(
+            self.cost
+        )
 
     def toward(self, ground: Tensor) -> Tensor:
         """A smooth correction that moves people about so far over the ground. (B, T, P, 2) metres -> (B, T, P, DOFS)"""

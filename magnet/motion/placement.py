@@ -137,7 +137,7 @@ def fuse(predicted: Predicted) -> Tensor:
         torch.zeros_like(each[:, :, :1]).expand(-1, -1, len(partner)).scatter_add(2, partner.expand(each.shape), each)
     )
     laplacian = torch.diag_embed(together.sum(-1) + together.sum(-2)) - (together + together.mT)
-    solve = torch.linalg.inv(torch.diag(own.to(start_yaw)) + laplacian)[:, None]
+    solve = torch.cholesky_inverse(torch.linalg.cholesky(torch.diag(own.to(start_yaw)) + laplacian))[:, None]
     keep = torch.eye(len(own), dtype=solve.dtype, device=solve.device) - solve @ laplacian[:, None]
     weight = each[:, None, ..., None]  # (B, 1, P, K, 1)
 

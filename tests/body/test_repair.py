@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -161,6 +162,22 @@ def test_a_correction_grows_from_nothing_where_the_past_stays(handshake: Scene) 
         made = repaired(high, BODY, begun=begun, drifting=False)
         steps[begun] = float((made.T_world_root - high.T_world_root)[0, 0, 1, 1, 3].abs())
     assert steps[True] < 0.04 < 0.12 < steps[False]
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(1)
+
+
+def test_long_batches_are_corrected_by_several_threads_as_by_one(two_threads: None) -> None:
+    pushed = arms_out(0.3, 0.1, 184)  # more than 150 frames: torch's batched LU fails then (pytorch issue 142815)
+    several = repaired(pushed.repeat(4), BODY, settle=Settle(iterations=2))
+    torch.set_num_threads(1)
+    one = repaired(pushed, BODY, settle=Settle(iterations=2))
+    assert float((one.T_world_root - pushed.T_world_root).abs().max()) > 0.01
+    torch.testing.assert_close(several.T_world_root, one.T_world_root.expand(4, -1, -1, -1, -1), rtol=0, atol=1e-4)
 
 
 def test_scenes_of_other_rates_are_corrected_as_smoothly(handshake: Scene) -> None:
