@@ -104,7 +104,7 @@ def with_measured(fitted: FittedCapsules, rest: Tensor) -> FittedCapsules:
 _KEPT: WeakKeyDictionary[Body, dict[bytes, FittedCapsules]] = WeakKeyDictionary()
 """Cache: while a scene is sampled, the same bodies are asked for many times."""
 
-MOST_KEPT = 8
+MOST_KEPT = 64
 
 
 def fit_capsules(body: Body, betas: Tensor) -> FittedCapsules:

@@ -24,6 +24,9 @@ DEEP: dict[str, Apart] = {
 UPRIGHT = 15.0
 """`Settle.tilt` where hands are drawn together: arms shall reach and people come nearer, not lean over."""
 
+POSES = 2400
+"""Poses that are corrected together: what is computed of them stays in the processor's caches."""
+
 LET_GO = 0.10
 """Metres that people may be moved apart before their held hands are let go."""
 
@@ -94,8 +97,30 @@ def settling(
 ) -> Tensor:
     """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
-    Arguments as for `repaired`, `Wishes.of` and `correction`.
+    Arguments as for `repaired`, `Wishes.of` and `correction`. Scenes are corrected a few at a time.
     """
+    B, T, P = scene.T_world_root.shape[:3]
+    few = max(POSES // (T * P), 1)
+    made = []
+    for start in range(0, B, few):
+        some = slice(start, start + few)
+        still = fixed[some] if fixed is not None and fixed.ndim == 3 and len(fixed) == B else fixed
+        before, hold = (None if each is None else each[some] for each in (past, holding))
+        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold))
+    return torch.cat(made)
+
+
+def _settling(
+    scene: Scene,
+    body: Body,
+    how: str,
+    fixed: Tensor | None,
+    settle: Settle | None,
+    begun: bool,
+    past: Tensor | None,
+    slides: float,
+    holding: Tensor | None,
+) -> Tensor:
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
     toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
     wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding)

@@ -112,10 +112,10 @@ def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tenso
     """
     joints = list(MOVED)
     parents = [max(PARENTS[joint], 0) for joint in MOVED]
-    arm = point[:, None] - seen.joints[node][:, joints]  # (M, joints, 3)
+    arm = point[:, None] - seen.joints[:, joints][node]  # (M, joints, 3)
     turn = torch.linalg.cross(arm, along[:, None].expand_as(arm), dim=-1)
-    R_world_parent = seen.R_world[node][:, parents]
-    own = (R_world_parent.transpose(-1, -2) @ turn[..., None])[..., 0]
+    R_world_parent = seen.R_world[:, parents][node]
+    own = (R_world_parent * turn[..., None]).sum(dim=-2)
     own[:, 0] = turn[:, 0]
     own = own * ANCESTRY.to(own.device)[:, bone].T[..., None]
     return torch.cat([along, own.flatten(1)], dim=-1)

@@ -106,24 +106,44 @@ def touching(
 ) -> Residuals:
     """Residuals of capsules deeper than allowed, or nearly so.
 
-    pairs: (M,) b, t and the two people; allowed (K, K) metres.
+    pairs: (M,) b, t and the two people; allowed (K, K) metres, for the first K capsules.
     """
     b, t, p, q = pairs
     i, j = allowed.isfinite().nonzero(as_tuple=True)
     bones = torch.tensor(capsules.bones, device=b.device)
-    one, other = seen.ends[b, t, p], seen.ends[b, t, q]  # (M, K, 2, 3)
-    first, second = nearest_points(one[:, i, 0], one[:, i, 1], other[:, j, 0], other[:, j, 1])
+    K = len(allowed)
+    one, other = seen.ends[b, t, p, :K], seen.ends[b, t, q, :K]  # (M, K, 2, 3)
+    reach = (capsules.radius[b, p, :K], capsules.radius[b, q, :K], allowed.to(one))
+    m, k = meeting(one, other, *reach)[:, i, j].nonzero(as_tuple=True)
+    i, j = i[k], j[k]
+    first, second = nearest_points(one[m, i, 0], one[m, i, 1], other[m, j, 0], other[m, j, 1])
     apart = first - second
-    gap = apart.norm(dim=-1)
-    depth = capsules.radius[b, p][:, i] + capsules.radius[b, q][:, j] - gap - allowed[i, j].to(gap)
-    m, k = (depth > -NEAR).nonzero(as_tuple=True)
-    pelvis = (seen.by_frame[b, t, p, 0] - seen.by_frame[b, t, q, 0])[m] * torch.tensor([1.0, 0.0, 1.0]).to(gap)
-    length = gap[m, k]
-    across = off_axis(pelvis, one[m, i[k], 1] - one[m, i[k], 0])
-    away = torch.where((length > 0.005)[:, None], apart[m, k] / length.clamp_min(0.005)[:, None], across)
+    length = apart.norm(dim=-1)
+    depth = reach[0][m, i] + reach[1][m, j] - length - reach[2][i, j]
+    near = depth > -NEAR
+    m, i, j, first, second, apart, length, depth = (x[near] for x in (m, i, j, first, second, apart, length, depth))
+    pelvis = (seen.by_frame[b[m], t[m], p[m], 0] - seen.by_frame[b[m], t[m], q[m], 0]) * torch.tensor(
+        [1.0, 0.0, 1.0]
+    ).to(one)
+    across = off_axis(pelvis, one[m, i, 1] - one[m, i, 0])
+    away = torch.where((length > 0.005)[:, None], apart / length.clamp_min(0.005)[:, None], across)
     node, others = seen.node(b, t, p)[m], seen.node(b, t, q)[m]
     # The value is the depth; moving along `away` reduces it.
-    return residuals_of(kind, node, bones[i[k]], first[m, k], -away, depth[m, k], (others, bones[j[k]], second[m, k]))
+    return residuals_of(kind, node, bones[i], first, -away, depth, (others, bones[j], second))
+
+
+def meeting(one: Tensor, other: Tensor, radius: Tensor, other_radius: Tensor, allowed: Tensor) -> Tensor:
+    """Which capsules may be near enough to count: the balls around them are. -> (M, K, K) bool
+
+    Args:
+        one, other: (M, K, 2, 3) ends of two people's capsules.
+        radius, other_radius: (M, K) metres.
+        allowed: (K, K) metres of depth that are none.
+    """
+    balls = [(ends.mean(dim=-2), (ends[..., 1, :] - ends[..., 0, :]).norm(dim=-1) / 2) for ends in (one, other)]
+    apart = torch.cdist(balls[0][0], balls[1][0], compute_mode="donot_use_mm_for_euclid_dist")
+    sizes = (balls[0][1] + radius)[..., None] + (balls[1][1] + other_radius)[..., None, :]
+    return sizes - apart - allowed > -NEAR - 1e-4
 
 
 def off_axis(pelvis: Tensor, axis: Tensor) -> Tensor:
