@@ -6,6 +6,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
@@ -18,6 +19,9 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
 from magnet.tokenizer.carried import Carried
 from magnet.tokenizer.lean import Growing, decoded
+
+EXPECTED = 1
+"""Token steps after a block, as they are expected, that its corrections must be able to go on to."""
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
@@ -110,24 +114,33 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
         expected: see `Expected.behind`, from `near` on.
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-    made = decode_bodies(world, tokens, world.finalized, stop, near, expected)
+    told = None if expected is None else expected[1]
+    more = EXPECTED if world.settle is not None and (near > stop or told is not None) else 0
+    made = decode_bodies(world, tokens, world.finalized, stop, near, expected, more)
     if world.settle is not None:
-        made = _settled(world, made, stop, world.settle)
+        made = _settled(world, made, stop, world.settle, None if near > stop else told)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
     world.finalized = stop
 
 
-def _settled(world: World, made: Scene, stop: int, how: str) -> Scene:
-    """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before."""
-    first = world.finalized * TOKEN_FRAMES
+def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None) -> Scene:
+    """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before.
+
+    Frames of `made` after them are what the corrections will have to go on to; they are not returned. told (P,) bool,
+    whose they are; None: everybody's.
+    """
+    first, own = world.finalized * TOKEN_FRAMES, (stop - world.finalized) * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
     new = world.by_frame(world.placed[rows] & ~world.known[rows])
+    after = new[-1:] if told is None else new[-1:] & told.to(new.device)
+    new = torch.cat([new, after.expand(made.frames - own, -1)])
     before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
-    world.uncorrected = made.slice(made.frames - LEAD)
+    world.uncorrected = made.slice(own - LEAD, own)
     unseen = world.known[rows].any(dim=0).to(new.device)
-    made, world.correction = settled_on(made, before, new, unseen, how, world.correction)
-    return made
+    made, offset = settled_on(made, before, new, unseen, how, world.correction)
+    world.correction = offset[:, own - LEAD : own]
+    return made.slice(0, own)
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:
@@ -140,9 +153,18 @@ def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Sce
 
 
 def decode_bodies(
-    world: World, tokens: Tensor, first: int, stop: int, near: int, expected: tuple[Tensor, Tensor] | None = None
+    world: World,
+    tokens: Tensor,
+    first: int,
+    stop: int,
+    near: int,
+    expected: tuple[Tensor, Tensor] | None = None,
+    more: int = 0,
 ) -> Scene:
-    """Token steps [first, stop) decoded from the tokens before `near` alone, continuing from finalized bodies."""
+    """Token steps [first, stop) decoded from the tokens before `near` alone, continuing from finalized bodies.
+
+    And `more` token steps behind them, as they are expected.
+    """
     model, options = world.model, world.options
     lead = LEAD if first else 0
     low = max(first - bool(first) - receptive_field(model)[0], 0)
@@ -151,35 +173,40 @@ def decode_bodies(
     if expected is not None:
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
-    frames = slice(first * TOKEN_FRAMES - lead, stop * TOKEN_FRAMES)
+    frames = slice(first * TOKEN_FRAMES - lead, (stop + more) * TOKEN_FRAMES)
     shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
     keep = world.by_frame(world.known[first:stop] & options.keep_given)
     there = world.there[~keep[:, world.there].all(dim=0)]  # of whom something is seen that is not given
     features = decoded_frames(world, latent, deltas, shown, low, near - low, there)
-    given, T_world_can = world.given.slice(frames.start, frames.stop), shown_path(world, near, ways)[:, frames]
+    keep, T_world_can = pad(keep, (0, 0, 0, more * TOKEN_FRAMES)), shown_path(world, near, ways, stop + more)[:, frames]
+    given = world.given.frames_at(torch.arange(frames.start, frames.stop).clamp(max=world.given.frames - 1))
     if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
         given = cat_time([world.uncorrected, given.slice(lead)])
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
-    return freeze_after(made, world.by_frame(world.placed[first:stop]), before)
+    placed = world.by_frame(world.placed[first:stop])
+    return freeze_after(made, torch.cat([placed, placed[-1:].expand(more * TOKEN_FRAMES, -1)]), before)
 
 
-def shown_path(world: World, near: int, ways: Tensor | None) -> Tensor:
-    """Canonical frames before row `near` as they are shown. -> (B, 4 near, P, 4, 4)
+def shown_path(world: World, near: int, ways: Tensor | None, stop: int) -> Tensor:
+    """Canonical frames before row `near`, or `stop` if that is later, as they are shown. -> (B, 4 n, P, 4, 4)
 
     The last of them is averaged with where the first of `ways` (B, n, P, 4, 9) leads: what is expected next.
     """
+    frames = max(near, stop) * TOKEN_FRAMES
     T_world_can = world.T_world_can[:, : near * TOKEN_FRAMES]
-    if not world.options.smooth_path:
-        return T_world_can
     placed, known = (world.by_frame(each[:near]) for each in (world.placed, world.known))
-    if ways is None:
-        return smoothed_path(T_world_can, placed, known)
-    ahead = T_world_can[:, -1:] @ from_9d(ways[:, :1, :, 0])
-    placed, known = (torch.cat([each, each[-1:]]) for each in (placed, known))
-    return smoothed_path(torch.cat([T_world_can, ahead], dim=1), placed, known)[:, :-1]
+    if ways is not None:
+        steps = from_9d(ways.transpose(2, 3).flatten(1, 2)[:, : frames + 1 - len(placed)])  # (B, f, P, 4, 4)
+        for step in steps.unbind(dim=1):
+            T_world_can = torch.cat([T_world_can, T_world_can[:, -1:] @ step[:, None]], dim=1)
+        behind = T_world_can.shape[1] - len(placed)
+        placed, known = (torch.cat([each, each[-1:].expand(behind, -1)]) for each in (placed, known))
+    if world.options.smooth_path:
+        T_world_can = smoothed_path(T_world_can, placed, known)
+    return T_world_can[:, :frames]
 
 
 def decoded_frames(

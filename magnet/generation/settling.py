@@ -25,8 +25,8 @@ BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 FINISHED = Settle(iterations=8, inner=24, bend=100.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too (docs/tasks.md)."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0)
-"""How a causal plan's next frames are corrected: what is held over fades soon where nothing asks for it."""
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=4000.0)
+"""How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
@@ -165,10 +165,10 @@ def settled_on(
         new: (T, P) bool, who may be moved.
         unseen: (P,) bool, of whom nobody knows more than `before`.
         how: `light`, `firm` or `hold`.
-        past: what the last call returned.
+        past: (B, 2, P, DOFS) corrections of the two frames before; None: none.
 
     Returns:
-        The scene, and the corrections of its last two frames.
+        The scene, and its corrections (B, T, P, DOFS).
     """
     body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None)
@@ -182,7 +182,7 @@ def settled_on(
             known = before.replace(body=body.id, valid=None, given=None)
             holding = hands_held(known, body) if how == "hold" else None
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, 0.0, holding)
+        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, holding=holding)
         offset[:, :, who] = one[:, :, who]
     made = corrected(shaped, offset)
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset[:, -2:]
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset

@@ -73,6 +73,36 @@ def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene)
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("smooth", [False, True])
+def test_what_is_expected_behind_a_block_is_decoded_where_its_steps_lead(model, scene, smooth):
+    world, tokens = finished(model, scene, dataclasses.replace(BARE, smooth_path=smooth))
+    ahead = receptive_field(model)[1]
+    behind = tokens[:, 8 : 9 + ahead], torch.ones(3, dtype=torch.bool)
+    expected = decode_bodies(world, tokens, 6, 8, 8, behind, more=1)
+    known = decode_bodies(world, tokens, 6, 9, 9 + ahead)
+    assert expected.frames == known.frames == 12
+    assert torch.allclose(expected.body_rot, known.body_rot, atol=1e-4)
+    before_last = slice(0, 11)  # the last one is averaged with what follows it
+    assert torch.allclose(expected.T_world_root[:, before_last], known.T_world_root[:, before_last], atol=1e-4)
+
+
+@torch.no_grad()
+def test_corrections_go_on_to_what_is_expected_of_those_who_told(model, scene):
+    def shown(lift: float, told: bool) -> Scene:
+        world, tokens = finished(model, scene, SamplerOptions(steps=2, settle="firm"))
+        finalize_bodies(world, tokens, 6, 6, None)
+        generator = torch.Generator().manual_seed(1)
+        behind = tokens[:, 7:8] + lift * torch.randn(tokens[:, 7:8].shape, generator=generator)
+        finalize_bodies(world, tokens, 7, 7, (behind, torch.tensor([told, True, True])))
+        assert world.correction is not None and world.correction.shape[1] == 2
+        return world.given.slice(24, 28)
+
+    made = shown(0.0, True)
+    assert made.frames == 4 and not same(made, shown(1.0, True))
+    assert same(shown(0.0, False), shown(1.0, False))
+
+
+@torch.no_grad()
 def test_what_has_been_shown_is_given_and_the_next_block_goes_on_from_there(model, scene):
     world, tokens = finished(model, scene, SamplerOptions(steps=2))
     finalize_bodies(world, tokens, 6, 6, None)
