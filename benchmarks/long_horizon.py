@@ -33,7 +33,8 @@ from magnet.evaluation.results import machine
 from magnet.export.picture import contact_sheet
 from magnet.generation.rollout import generate
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
-from magnet.metrics.frechet import moments
+from magnet.metrics.body_depth import deepest
+from magnet.metrics.frechet import Features, moments
 from magnet.motion.scene import Scene, concatenate
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
@@ -53,8 +54,8 @@ def windows(data: CMU, split: str, stride: int = 30) -> Scene:
     return aligned(concatenate(scenes), 0)
 
 
-def pooled(joints: Tensor, present: Tensor) -> FrechetDistance:
-    metric = FrechetDistance()
+def pooled(joints: Tensor, present: Tensor, features: Features = "world_joints") -> FrechetDistance:
+    metric = FrechetDistance(features)
     metric.update(joints[None], joints, present)
     return metric
 
@@ -77,6 +78,7 @@ def describe(joints: Tensor, present: Tensor) -> dict[str, float]:
         "lower foot m, median": float(feet.median()),
         "lower foot m, highest": float(feet.max()),
         "slowest second m/s": float(slowest(there)),
+        "over 10 cm deep": float((deepest(*joints.flatten(0, 1)[:, :2].unbind(dim=1)) > 0.1).float().mean()),
     }
 
 
@@ -86,8 +88,8 @@ def slowest(people: Tensor) -> Tensor:
     return speed.unfold(1, 29, 15).mean(dim=-1).min()
 
 
-def measured(long: Scene, body: Body, reference: FrechetDistance) -> list[dict[str, Any]]:
-    """What each 5 seconds after the context are like, beside the recorded ones."""
+def measured(long: Scene, body: Body, reference: FrechetDistance, pairs: FrechetDistance) -> list[dict[str, Any]]:
+    """What each 5 seconds after the context are like, beside the recorded ones (as placed, and as pairs)."""
     curve: list[dict[str, Any]] = []
     so_far: list[Tensor] = []
     for start in range(CONTEXT, long.frames - WINDOW + 1, WINDOW):
@@ -100,6 +102,7 @@ def measured(long: Scene, body: Body, reference: FrechetDistance) -> list[dict[s
             {
                 "second": (start - CONTEXT + WINDOW) / 30,
                 "fd": distance(pooled(joints, window.present), reference),
+                "fd pair": distance(pooled(joints, window.present, "pair"), pairs),
                 "cumulative fd": distance(pooled(cumulative, there), reference),
                 **describe(joints, window.present),
             }
@@ -114,15 +117,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/results/long"))
     parser.add_argument("--frames", type=int, default=1800)
     parser.add_argument("--scenes", type=int, default=6, help="starts, evenly spaced over the test takes")
-    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--steps", type=int, default=SamplerOptions().steps)
     parser.add_argument(
         "--pyramid_offset", type=int, default=None, help="0: in strides; default: as tasks do by themselves"
     )
     parser.add_argument("--guidance", type=float, default=0.0, help="weight of history guidance")
     parser.add_argument(
-        "--stabilization_level", type=int, default=100, help="noise level at which finished tokens are shown"
+        "--stabilization_level", type=int, default=0, help="noise level at which finished tokens are shown"
     )
-    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
+    parser.add_argument("--precision", choices=("bf16", "fp32"), default="fp32")
     given = parser.parse_args()
     body, model = load_body(), Denoiser.load(given.ckpt_path)
     data = CMU(singles=False, max_agents=model.layout.agents)
@@ -145,10 +148,12 @@ def main() -> None:
     real, training = windows(data, "test"), windows(data, "train")
     real_joints = body.joints(real)
     reference = pooled(real_joints, real.present)
-    floor = distance(pooled(body.joints(training), training.present), reference)
-    curve = measured(long, body, reference)
+    pairs, others = pooled(real_joints, real.present, "pair"), body.joints(training)
+    floor = distance(pooled(others, training.present), reference)
+    curve = measured(long, body, reference, pairs)
     facts = {
         "floor: training windows against test windows": floor,
+        "floor of FD pair": distance(pooled(others, training.present, "pair"), pairs),
         "recorded": describe(real_joints, real.present),
         "finite": all(bool(value.isfinite().all()) for value in long.tensors().values()),
         "seconds": round(seconds, 1),

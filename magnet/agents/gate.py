@@ -121,4 +121,4 @@ class Gate:
         if np.abs(flat[:, 1] - [0, 1, 0, 0]).max() > 1e-3 or np.abs(flat[:, 3] - [0, 0, 0, 1]).max() > 1e-6:
             raise RefusedMessage("rotation")
         if (np.abs(frames[:, [0, 2], 3] - place[:, [0, 2]]) > STEP).any():
-            raise RefusedMessage("range")
+            raise RefusedMessage("place")

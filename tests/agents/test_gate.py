@@ -72,8 +72,9 @@ WRONG = {
     "frame": [changed(frame=9), changed(frame=2**39), changed(frame=-1)],
     "range": [
         posed(0, np.nan), posed(2, 1e30), posed(1, 11), posed(9, np.inf), changed(betas=[11] + 9 * [0]),
-        told(0, np.nan), told(0, 101), told(LATENT + 3, 1.5), told(LATENT + 63, np.inf),
+        told(0, np.nan), told(0, 101), told(LATENT + 63, np.inf),
     ],
+    "place": [told(LATENT + 3, 1.5)],
     "speed": [posed(0, 1.2)],
     "rotation": [posed(6, 0.9), posed(6, -1e30), told(LATENT, 1.1), told(LATENT + 7, 0.2), told(LATENT + 12, 1e-3)],
     "size": [[], pack(message())[:4], [*pack(message()), b""], sealed([b"magnet/B", b"{}", b"\0" * 70000, b""])],

@@ -123,7 +123,7 @@ def breaking(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let poses look ahead in one way or another."""
     made, kept = causal_bodies.decode_bodies, causal_bodies.Expected.keep
 
-    def looking_ahead(world: Any, tokens: Any, first: int, stop: int, near: int, expected: Any = None) -> Any:
+    def looking_ahead(world: Any, tokens: Any, first: int, stop: int, near: int, *_: Any) -> Any:
         return made(world, tokens, first, stop, min(near + 2, tokens.shape[1]))
 
     def last_word(self: Any, *said: Any) -> None:
