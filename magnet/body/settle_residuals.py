@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -35,7 +34,7 @@ class Seen:
     ends: Tensor  # (B, T, P, K, 2, 3) of capsules
     by_frame: Tensor  # (B, T, P, 22, 3) the same joints
 
-    def node(self, b: Tensor, t: Tensor, p: Tensor | int) -> Tensor:
+    def node(self, b: Tensor, t: Tensor, p: Tensor) -> Tensor:
         """Numbers of nodes. (M,) int"""
         T, P = self.by_frame.shape[1:3]
         return (b * T + t) * P + p
@@ -89,9 +88,9 @@ def residuals_of(
 def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
     """All unmet wishes of people who can move. free (B, T, P) bool"""
     parts = [
-        *between_residuals(seen, capsules, wishes),
+        between_residuals(seen, capsules, wishes),
         within_residuals(seen, capsules, wishes),
-        *hold_residuals(seen, wishes),
+        hold_residuals(seen, wishes),
         stand_residuals(seen, wishes),
         height_residuals(seen, wishes),
         floor_residuals(seen, wishes),
@@ -158,16 +157,22 @@ def off_axis(pelvis: Tensor, axis: Tensor) -> Tensor:
     return torch.nn.functional.normalize(across + 0.1 * beside + 1e-6 * axes(1, axis)[0], dim=-1)
 
 
-def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> list[Residuals]:
+def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Residuals:
     """Depth between people."""
-    P, allowed = seen.by_frame.shape[2], allowed_between_measured(wishes.contact).to(seen.joints.device)
-    parts = []
-    for p, q in combinations(range(P), 2):
-        near = (seen.by_frame[:, :, p, 0] - seen.by_frame[:, :, q, 0]).norm(dim=-1) < REACH
-        b, t = (near & wishes.there(p, q)).nonzero(as_tuple=True)
-        pair = (b, t, torch.full_like(b, p), torch.full_like(b, q))
-        parts.append(touching(seen, capsules, pair, allowed, "between"))
-    return parts
+    allowed = allowed_between_measured(wishes.contact).to(seen.joints.device)
+    first, second = pairs_of(seen)
+    pelvis = seen.by_frame[..., 0, :]
+    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < REACH
+    both = (wishes.present[:, first] & wishes.present[:, second])[:, None]
+    b, t, pair = (near & both).nonzero(as_tuple=True)
+    return touching(seen, capsules, (b, t, first[pair], second[pair]), allowed, "between")
+
+
+def pairs_of(seen: Seen) -> tuple[Tensor, Tensor]:
+    """The people of each pair, in the order of `combinations`. -> (Q,) x 2"""
+    people = torch.arange(seen.by_frame.shape[2], device=seen.joints.device)
+    first, second = torch.combinations(people).unbind(dim=1)
+    return first, second
 
 
 def within_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Residuals:
@@ -182,20 +187,18 @@ def axes(count: int, like: Tensor) -> Tensor:
     return torch.eye(3).to(like).repeat(count, 1)
 
 
-def hold_residuals(seen: Seen, wishes: Wishes) -> list[Residuals]:
+def hold_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     """Hands that hold each other keep their distance vector."""
-    parts = []
     wrists = torch.tensor(WRISTS, device=seen.joints.device)
-    hands = hand_points(seen.by_frame)
-    for place, (p, q) in enumerate(combinations(range(seen.by_frame.shape[2]), 2)):
-        b, t, i, j = wishes.held[:, :, place].nonzero(as_tuple=True)
-        point, other = hands[b, t, p, i], hands[b, t, q, j]
-        off = point - other - wishes.between[b, t, place, i, j]
-        node, bone, end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, p), wrists[i], point))
-        others = [x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, q), wrists[j], other)]
-        reach = (others[0], others[1], others[2])
-        parts.append(residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach))
-    return parts
+    hands, (first, second) = hand_points(seen.by_frame), pairs_of(seen)
+    b, t, pair, i, j = wishes.held.nonzero(as_tuple=True)
+    p, q = first[pair], second[pair]
+    point, other = hands[b, t, p, i], hands[b, t, q, j]
+    off = point - other - wishes.between[b, t, pair, i, j]
+    node, bone, end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, p), wrists[i], point))
+    others, other_bone, other_end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, q), wrists[j], other))
+    reach = (others, other_bone, other_end)
+    return residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach)
 
 
 def stand_residuals(seen: Seen, wishes: Wishes) -> Residuals:

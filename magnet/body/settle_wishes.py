@@ -99,10 +99,6 @@ class Wishes:
             CONTACT[FIRM.get(how, how)], scene.present, above, stands, heights, highest, held, between, still, scene.fps
         )
 
-    def there(self, one: int, other: int) -> Tensor:
-        """Whether both of two people are there. -> (B, 1) bool"""
-        return (self.present[:, one] & self.present[:, other])[:, None]
-
     def everybody(self, frames: int) -> Tensor:
         """Who is there, by frame. -> (B, T, P) bool"""
         return self.present[:, None].expand(-1, frames, -1)

@@ -170,19 +170,22 @@ def settled_on(
     Returns:
         The scene, and its corrections (B, T, P, DOFS).
     """
-    body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
-    shaped = scene.replace(body=body.id, valid=None, given=None)
-    offset, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    holding = None
+    there = scene.present.any(dim=0).nonzero()[:, 0]  # empty slots would only cost time
+    body, agents = open_body_on(scene.device), torch.arange(len(there), device=scene.device)
+    shaped = scene.replace(body=body.id, valid=None, given=None).permute_agents(there)
+    known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
+    new, unseen, past = new[:, there], unseen[there], None if past is None else past[:, :, there]
+    offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
+    holding = None if known is None or how != "hold" else hands_held(known, body)
     for who in [agents == agent for agent in agents[moving]]:
         hidden = unseen | (moving & ~who)
-        if before is None:
+        if known is None:
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
-            known = before.replace(body=body.id, valid=None, given=None)
-            holding = hands_held(known, body) if how == "hold" else None
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = settling(seen, body, how, ~(new & who), SHOWN, before is not None, past, holding=holding)
+        one = settling(seen, body, how, ~(new & who), SHOWN, known is not None, past, holding=holding)
         offset[:, :, who] = one[:, :, who]
-    made = corrected(shaped, offset)
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), offset
+    whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
+    whole[:, :, there] = offset
+    made = corrected(scene, whole)
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), whole
