@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli import answers
-from magnet.cli.data_list import add_list, run_list
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
+    add_list,
     clips_by_people,
     file_bars,
+    run_list,
     show_gaps,
     show_notes,
     show_persons,
@@ -118,7 +119,7 @@ def add_work(one: argparse.ArgumentParser) -> None:
     add("--bodies", nargs="+", default=(), help=f"{bodies}expressed in the one --body")
     add("--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)")
     add("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
-    add("--limit", type=int, default=None, help="at most so many takes of each split, to try things out")
+    add("--limit", type=int, default=None, help="largest number of takes per split, to try things out")
     add("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
     add("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
     add("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
@@ -143,17 +144,17 @@ def add_prepare(one: argparse.ArgumentParser) -> None:
 def add_fake(one: argparse.ArgumentParser) -> None:
     one.add_argument("name", nargs="?", help="of the data set, see magnet data list; cmu as well")
     one.add_argument("out", nargs="?", help="folder to write to; new or empty")
-    one.add_argument("--takes", type=int, default=4, help="(default: %(default)s)")
-    one.add_argument("--frames", type=int, default=300, help="of a take at 30 fps, DuoBox: its test part (%(default)s)")
-    one.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
+    one.add_argument("--takes", type=int, default=4, help="number of takes (default: %(default)s)")
+    one.add_argument("--frames", type=int, default=300, help="frames at 30 fps, DuoBox: of the test part (%(default)s)")
+    one.add_argument("--seed", type=int, default=0, help="seed of the motion (default: %(default)s)")
 
 
 def add_download(one: argparse.ArgumentParser) -> None:
-    one.add_argument("name", nargs="?", help="cmu; the others are given out by their authors alone")
+    one.add_argument("name", nargs="?", help="cmu; all others come from their authors only")
     one.add_argument("out", nargs="?", help="folder to write to; run again to go on")
     one.add_argument("--subjects", default="60,61", help="numbers with commas (default: %(default)s, salsa couples)")
     one.add_argument("--base_url", default=None, help="another copy of the site")
-    anew = "take files, too, whose SHA-256 is known to be another: issued anew"
+    anew = "also take files whose SHA-256 differs from the known one: the site has reissued some"
     one.add_argument("--any_version", action="store_true", help=anew)
 
 

@@ -4,12 +4,96 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from magnet.datamodules.clip import Split
+
+
+import argparse
+from typing import TYPE_CHECKING
+
+from magnet.cli import answers
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from magnet.datamodules.reading.recording import Reader
+    from magnet.plugins import Registered
+
+BODIES = {"smplx": "--body SMPLX_NEUTRAL.npz", "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL"}
+"""The body that shape numbers need, by family: SMPL's are expressed in SMPL-X's."""
+WHERE = {
+    "smplx": "SMPL-X's file, npz or pkl, is from https://smpl-x.is.tue.mpg.de (register)",
+    "smpl": "SMPL: the folder of its files, npz or pkl, from https://smpl.is.tue.mpg.de (register)",
+}
+
+
+def add_list(one: argparse.ArgumentParser) -> None:
+    one.add_argument("name", nargs="?", help="the data set to tell of; default: all")
+
+
+def run_list(given: argparse.Namespace) -> int:
+    answers.show(f"data list {given.name or ''}", lambda console: draw_list(console, given.name))
+    return 0
+
+
+def draw_list(console: Console, name: str | None) -> bool:
+    """Print all data sets, or one in full. -> whether the same call will print the same again"""
+    from magnet.datamodules import registry
+
+    if name:
+        show_reader(console, registry.reader(name))
+        return True
+    for kind in registry.readers().values():
+        show_reader(console, kind)
+    for entry in registry.unprepared():
+        show_data(console, entry)
+    for plugin, error in registry.failures().items():
+        console.print(f"[bold red]{plugin}[/]", soft_wrap=True)
+        show(console, "failed to load", f"{type(error).__name__}: {error}")
+    return not registry.failures()
+
+
+def show_reader(console: Console, kind: type[Reader]) -> None:
+    """A data set whose download is prepared."""
+    from magnet.datamodules import registry
+
+    console.print(f"[bold cyan]{kind.name}[/]  {kind.title}", soft_wrap=True)
+    show(console, "who may use it", kind.licence)
+    show(console, "where to ask", kind.source)
+    wide = max((len(pattern) for pattern, _ in kind.layout), default=0)
+    for number, (pattern, what) in enumerate(kind.layout):
+        show(console, "" if number else "under --root", f"{pattern:<{wide}}  {what}")
+    body = BODIES.get(kind.family, "")
+    model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
+    show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
+    if kind.own:
+        show(console, "", "magnet fit --config configs/finetune.yaml --data.path STORE")
+    show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
+    if body:
+        show(console, "", WHERE[kind.family])
+    if kind.fake:
+        show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
+
+
+def show_data(console: Console, entry: Registered) -> None:
+    """A data set that trains without being prepared."""
+    from magnet.datamodules import registry
+
+    console.print(f"[bold cyan]{entry.name}[/]  of {entry.origin}", soft_wrap=True)
+    show(console, "what it is", (entry.kind.__doc__ or "").strip().partition("\n")[0])
+    show(console, "then", registry.fit_command(entry.name))
+
+
+def show(console: Console, what: str, text: str) -> None:
+    """A line of it, as it is."""
+    from rich.text import Text
+
+    console.print(Text.assemble((f"  {what:<16}", "dim"), text), soft_wrap=True)
+
 
 SKIPPED_SHOWN = 20
 PROBLEMS_SHOWN = 40
@@ -29,15 +113,20 @@ def show_splits(rows: list[tuple[str, ...]], title: str | None = None) -> None:
     Console().print(table)
 
 
+def show_some(lines: Sequence[str], most: int, more: str, file: TextIO | None = None) -> None:
+    """Print the first `most` lines, and how many more there are."""
+    for line in lines[:most]:
+        print(line, file=file)
+    if len(lines) > most:
+        print(f"  ... and {len(lines) - most} more{more}", file=file)
+
+
 def show_skipped(skipped: list[tuple[str, str]]) -> None:
     """Takes that were not used, and why."""
-    if not skipped:
-        return
-    print(f"skipped {len(skipped)} takes:")
-    for take, why in skipped[:SKIPPED_SHOWN]:
-        print(f"  {take}: {why}")
-    if len(skipped) > SKIPPED_SHOWN:
-        print(f"  ... and {len(skipped) - SKIPPED_SHOWN} more, all of them in the store's manifest.json")
+    if skipped:
+        print(f"skipped {len(skipped)} takes:")
+        lines = [f"  {take}: {why}" for take, why in skipped]
+        show_some(lines, SKIPPED_SHOWN, ", all of them in the store's manifest.json")
 
 
 def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
@@ -48,7 +137,7 @@ def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
 
 def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
     """Warn of what the splits lack, on the error stream."""
-    from magnet.datamodules.preparing.split_gaps import split_gaps
+    from magnet.datamodules.preparing.check import split_gaps
 
     for line in split_gaps(clips):
         print(f"WARNING: {line}", file=sys.stderr)
@@ -69,18 +158,14 @@ def show_notes(notes: list[str]) -> None:
 
 def show_problems(problems: list[str]) -> None:
     """Assertions that do not hold, on the error stream."""
-    for problem in problems[:PROBLEMS_SHOWN]:
-        print(f"PROBLEM: {problem}", file=sys.stderr)
-    if len(problems) > PROBLEMS_SHOWN:
-        print(f"  ... and {len(problems) - PROBLEMS_SHOWN} more", file=sys.stderr)
+    show_some([f"PROBLEM: {problem}" for problem in problems], PROBLEMS_SHOWN, "", sys.stderr)
 
 
 def show_persons(groups: list[tuple[list[str], int]]) -> None:
     """Names or roles of people who were recorded together, the most frequent first."""
-    for names, takes in sorted(groups, key=lambda group: -group[1])[:PERSONS_SHOWN]:
-        print(f"people: {' | '.join(names)} ({takes} takes)")
-    if len(groups) > PERSONS_SHOWN:
-        print(f"  ... and {len(groups) - PERSONS_SHOWN} more groups, all of them in the store's manifest.json")
+    groups = sorted(groups, key=lambda group: -group[1])
+    lines = [f"people: {' | '.join(names)} ({takes} takes)" for names, takes in groups]
+    show_some(lines, PERSONS_SHOWN, " groups, all of them in the store's manifest.json")
 
 
 def file_bars() -> AbstractContextManager[Callable[[str, int, int | None], None]]:

@@ -16,9 +16,8 @@ from magnet.body import Body, load_body
 from magnet.datamodules.clip import Clip, Split, at_least
 from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
-from magnet.datamodules.store.mapped import SplitData
-from magnet.datamodules.store.memory import MemoryStore
-from magnet.datamodules.store.window_index import WindowIndex
+from magnet.datamodules.store.memory import MemoryStore, WindowIndex
+from magnet.datamodules.store.reader import StoreSplit
 from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
@@ -27,13 +26,13 @@ __all__ = ["Clip", "EmptySplitError", "MotionDataModule", "Split"]
 
 
 class EmptySplitError(ValueError):
-    """A split without clips; names what else there is."""
+    """A split has no clips; the message names the splits that have some."""
 
 
 class MotionDataModule(LightningDataModule):
     """Base of all data sets; a subclass implements `clips` and perhaps `prepare_data`.
 
-    All frames of a split live in memory, on the trainer's device where there is one, and batches are gathered
+    All frames of a split are kept in memory, on the trainer's device if there is a trainer, and batches are gathered
     there. Without a trainer the loaders yield scenes on the CPU.
 
     Args:
@@ -43,15 +42,15 @@ class MotionDataModule(LightningDataModule):
         augment: what happens to training windows.
         test: scenes to test on.
         weights: share of each source of clips among training windows; None: as many as it has frames.
-        epoch_size: training windows an epoch over all processes; None: as many as fit side by side into the
-            training frames, times four.
+        epoch_size: training windows per epoch over all processes; None: four times as many as fit side by side into
+            the training frames.
         val_batch_size: scenes a validation batch.
-        seed: of all randomness here: sample i of epoch e depends only on (seed, e, i).
+        seed: seeds all randomness here: sample i of epoch e depends only on (seed, e, i).
         body_model: "open" or the path of a body file in SMPL-X's npz layout.
         device_resident: keep all frames on the trainer's device; False: gather on the CPU and send batches,
             for data sets larger than the GPU's memory.
-        read_ahead: training batches that threads read from a store on disk while the model computes; 0: none. Nothing
-            is read ahead of clips that are in memory.
+        read_ahead: training batches that threads read from disk while the model computes; 0: none. Clips in memory
+            need no reading ahead.
 
     Raises:
         ValueError: a number is out of its range.
@@ -135,10 +134,10 @@ class MotionDataModule(LightningDataModule):
             )
         return MemoryStore(clips, self.max_agents)
 
-    def split_data(self, split: Split) -> SplitData | None:
+    def split_data(self, split: Split) -> StoreSplit | None:
         """The clips of a split as rows to be read by memory map; None: there are none."""
         clips = self.clips(split)
-        return SplitData.encoded(clips) if clips else None
+        return StoreSplit.encoded(clips) if clips else None
 
     def _placed(self, split: Split) -> MemoryStore:
         """The split's store where the trainer computes."""
@@ -158,7 +157,7 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> TrainLoader:
         """Random windows (batch_size, window_frames, max_agents).
 
-        They continue at a loaded state, or where the last loader of the same trainer ended; with another trainer they
+        They continue from a loaded state, or where the last loader of the same trainer ended; for another trainer they
         start anew.
         """
         if self.trainer is not None and self.trainer is self._trained_by:
@@ -186,7 +185,7 @@ class MotionDataModule(LightningDataModule):
         return self._train_loader
 
     def statistics_batches(self, batches: int = 8) -> Iterator[Scene]:
-        """Training batches to take statistics from: the same on every rank, and no part of the training stream."""
+        """Training batches for statistics: the same on every rank, and separate from the training stream."""
         store = self.store("train")
         draws = RandomWindows(store, self.window_frames, self.weights, self.augment, derive(self.seed, "statistics"))
         for number in range(batches):
@@ -214,7 +213,7 @@ class MotionDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def _some(self, split: Split, windows: WindowIndex, frames: int) -> WindowIndex:
-        """The windows; an error if there are none."""
+        """The windows, of which there must be some."""
         if not len(windows):
             raise ValueError(
                 f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"
@@ -239,7 +238,7 @@ class MotionDataModule(LightningDataModule):
         return windows
 
     def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
-        """Clean training stretches of `frames` frames, `stride` apart, as recorded, and so many composed ones. -> Scene
+        """Valid training windows of `frames` frames, `stride` apart, and `composed` scenes made of two of them each.
 
         Raises:
             ValueError: no clip is long enough.
@@ -276,7 +275,7 @@ class MotionDataModule(LightningDataModule):
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def teardown(self, stage: str) -> None:
-        """End the threads that read ahead; they begin again when a batch is asked for."""
+        """End the threads that read ahead; the next batch starts new ones."""
         self._close()
 
     def _close(self) -> None:
@@ -288,7 +287,7 @@ class MotionDataModule(LightningDataModule):
         return {} if self._train_loader is None else self._train_loader.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Training goes on with the sample that comes next."""
+        """Continue training with the next sample."""
         if state_dict:
             self._resume = {"epoch": state_dict["epoch"], "sample": state_dict["sample"]}
             if self._train_loader is not None:

@@ -29,13 +29,13 @@ from magnet.motion.scene import Scene
 Unit = Literal["m", "cm", "mm", "inch", "foot"]
 LIMBS = sorted({joint + side for joint in TARGETS if joint != NECK for side in (0, 1)})
 MOST_SHAPE = 5.0
-"""Bound of shape numbers: odd proportions are better left as a residual than made a body that nobody has."""
+"""Largest shape number: unusual proportions are left as a residual rather than fitted by an impossible body."""
 SHOWN = 12
 
 
 @dataclass(frozen=True)
 class BvhTrack:
-    """One person's file: a skeleton with its motion, and how it is to be understood."""
+    """One person's file: a skeleton with its motion, and the options it is read with."""
 
     file: Bvh
     unit: Unit | None
@@ -65,7 +65,7 @@ class BvhTrack:
         return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
 
     def skeleton(self, up: str | None = None) -> Skeleton:
-        """Which joint is which, in what unit; y up as `up` or the motion says.
+        """The skeleton in metres, y up; the up axis is `up`, or is found from the motion.
 
         Raises:
             DataError: names, legs or the rest pose do not tell.
@@ -93,15 +93,15 @@ def _limbs(skeleton: Skeleton) -> tuple[list[int], list[int]]:
 
 @register_reader
 class BVHReader(OwnReader[BvhTrack]):
-    """A folder of BVH files, one person each; who belongs together is told by names, a pattern or a table.
+    """A folder of BVH files, one person each; names, a pattern or a table say which belong to one scene.
 
     Units, up axis and which joint is which are found in each file, as `magnet export` finds them.
 
     Args:
         root: the folder.
-        unit: of lengths, where legs do not tell it.
+        unit: of lengths; None: found from the length of the legs.
         joints: file of lines `OUR_NAME THEIR_NAME`, such as `left_hip Bone12`, for joints that no naming scheme knows.
-        worst_fit: metres that limb joints may be off on average when the body is fitted; takes above are refused.
+        worst_fit: largest mean distance of limb joints from the file's, in metres; takes with a worse fit are refused.
         **kwargs: as for OwnReader.
 
     Raises:
@@ -141,7 +141,7 @@ class BVHReader(OwnReader[BvhTrack]):
     def recording(
         self, where: str, tracks: Sequence[BvhTrack], names: Sequence[str], notes: Sequence[str]
     ) -> Recording:
-        """Skeletons, and of their joints those that say whether axis, unit and rate can be right."""
+        """Skeletons, and the joints by which axis, unit and rate are checked."""
         skeletons = [track.skeleton() for track in tracks]
         ours = [skeleton.naming.joints | {PELVIS: skeleton.chain[0]} for skeleton in skeletons]
         wanted = {PELVIS, HEAD, *LIMBS}
@@ -169,7 +169,7 @@ def _axis(up: str) -> Axis:
 
 
 def _said(track: BvhTrack, skeleton: Skeleton) -> str:
-    """How a file was understood, in words that files of one kind share."""
+    """How a file was read, in words that are the same for files of one kind."""
     naming, names = skeleton.naming, skeleton.file.names
     used = {*naming.joints.values(), *skeleton.chain}
     rest = [name for number, name in enumerate(names) if number not in used]

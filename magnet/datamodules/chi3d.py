@@ -26,9 +26,9 @@ PEOPLE = ("with markers", "without markers")
 class CHI3DReader(Reader):
     """CHI3D's `chi3d/{train,test}/<pair>/smplx/<action>.json`: rotation matrices (2, T, J, 3, 3).
 
-    The authors keep the motion of their own test pairs (s01, s05) to themselves. So `test_pairs` of the training
-    folder are for testing, and a tenth of the other takes, by a hash of their names, for validation. Where the test
-    folder does hold motion, that is for testing as well.
+    The authors do not publish the motion of their own test pairs (s01, s05). So `test_pairs` of the training folder
+    are for testing, and a tenth of the other takes, by a hash of their names, for validation. Motion in the test
+    folder, if there is any, is for testing as well.
 
     Args:
         root: the folder `chi3d`, or the one above.

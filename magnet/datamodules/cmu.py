@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,22 +13,20 @@ from lightning.pytorch.utilities import rank_zero_warn
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.preparing.fit_cache import FitCache
-from magnet.datamodules.preparing.fit_whole import Fitted, fit_whole
-from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import read_amc
-from magnet.datamodules.reading.cmu_glitches import Glitches
-from magnet.datamodules.reading.cmu_joints import check_rate, measured
+from magnet.datamodules.preparing.fit_cache import FitCache, Steps, fit_whole
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
+from magnet.datamodules.reading.cmu_joints import Glitches, check_rate, measured
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.recording import DataError, Family, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
-from magnet.datamodules.store.mapped import SplitData
 from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.reader import StoreSplit
 from magnet.motion.resample import at_speed
+from magnet.motion.scene import Scene
 
 FIT_VERSION = 4
-"""Raise it whenever the same recordings would be fitted otherwise: caches are then made anew."""
+"""Raise it when the same recordings would be fitted differently: caches are then made anew."""
 WHERE = (
     "CMU's recordings come from http://mocap.cs.cmu.edu: `magnet data download cmu FOLDER` fetches them, or put NN.asf "
     "and NN_TT.amc of couples (60 and 61 dance salsa) and of any single people into one folder yourself; say where "
@@ -40,9 +38,10 @@ VAL_SINGLES = ("02_03", "05_12")
 
 
 class CMUReader(Reader):
-    """NN.asf and NN_TT.amc anywhere in a folder; subjects who were recorded together make one take.
+    """NN.asf and NN_TT.amc anywhere in a folder; subjects who were recorded together form one take.
 
-    Where nothing at all of a partner is there, somebody is alone. Capture glitches are mended or masked.
+    A subject of a couple is read alone if the folder holds no file of the partner. Capture glitches are interpolated
+    or masked.
 
     Args:
         root: folder with the files, searched whole.
@@ -96,7 +95,7 @@ class CMUReader(Reader):
         self.fps, self.trim = {**RATES, **(fps or {})}, trim
 
     def found(self) -> list[Take]:
-        """Every take; a couple's without the partner's file is listed too, and refused when it is read."""
+        """Every take; one that lacks the partner's file is listed too, and refused when it is read."""
         takes = [take for take in self._all() if self.singles or is_couple(take)]
         if not takes:
             raise DataError(f"{self.root}: holds no files named NN_TT.amc, but {listing(self.root)}: no takes. {WHERE}")
@@ -130,7 +129,7 @@ class CMUReader(Reader):
         return self.measured(take)[0]
 
     def measured(self, take: Take) -> tuple[Recording, tuple[Glitches, ...]]:
-        """The recording, and what was mended in it.
+        """The recording, and the glitches that were repaired in it.
 
         Raises:
             DataError: a file is missing or damaged, lengths differ, or the frame rate is implausible.
@@ -165,9 +164,9 @@ class CMU(Prepared):
     """Couples of CMU (60 and 61, who dance salsa, and four others) and single people, as bodies at 30 fps.
 
     Recordings need no `magnet data prepare`: `prepare_data` fits the body to each take of `root` once, at full
-    precision and with glitches masked, and keeps it in a cache. A take that cannot be used is reported after all
-    others are done. Splits are by take. Sources of clips, for `weights`: "cmu-couples" and "cmu-singles". With `path`,
-    a store is trained on as of any other data set.
+    precision and with glitches masked, and caches the result. Takes that cannot be used are reported when all others
+    are done. Splits are by take. Sources of clips, for `weights`: "cmu-couples" and "cmu-singles". With `path`, it
+    trains on a prepared store like any other data set.
 
     Args:
         root: folder with the files, searched whole; None: the variable MAGNET_CMU.
@@ -181,7 +180,7 @@ class CMU(Prepared):
         fps: frame rate of a subject's recordings by its number, which AMC files do not say; adds to `RATES`, and
             others have 120.
         trim: cut two people's files of unequal length to the shorter instead of refusing them.
-        speeds: training recordings are also played at each of these speeds, such as 0.9 and 1.1; not of a store.
+        speeds: also train on the recordings played at these speeds, such as 0.9 and 1.1; not available for a store.
         path: a store of `magnet data prepare cmu`, in place of recordings.
         device_resident: keep all frames on the trainer's device.
         **kwargs: as for Prepared.
@@ -243,7 +242,7 @@ class CMU(Prepared):
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet" / "cmu"
         reader = self.recordings
 
-        def fit(take: Take, progress: Callable[[int, int], None]) -> Fitted:
+        def fit(take: Take, progress: Steps) -> tuple[Scene, dict[str, Any]]:
             return fit_whole(*reader.measured(take), self.body, progress)
 
         def facts(take: Take) -> tuple[Any, ...]:
@@ -252,7 +251,7 @@ class CMU(Prepared):
         return FitCache(Path(self.cache).expanduser() if self.cache else folder, self.body, facts, fit)
 
     def prepare_data(self) -> None:
-        """Fit what the cache lacks; of a store, look whether it is there and is of this body.
+        """Fit takes that are not in the cache; for a store, check that it exists and belongs to this body.
 
         Raises:
             DataError: no folder was given or it holds no recordings, or no take at all could be used.
@@ -290,7 +289,7 @@ class CMU(Prepared):
     def maps_files(self) -> bool:  # type: ignore[override]
         return bool(self.path) and not self.device_resident
 
-    def split_data(self, split: Split) -> SplitData | None:
+    def split_data(self, split: Split) -> StoreSplit | None:
         """The split's rows, on disk or encoded."""
         return super().split_data(split) if self.path else MotionDataModule.split_data(self, split)
 

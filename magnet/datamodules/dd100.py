@@ -78,7 +78,7 @@ class DD100Reader(Reader):
         self.folder, self.validation, self.orient = folder, validation, orient
 
     def found(self) -> list[Take]:
-        """One take a pair of files; a partner whose file is missing is found out by `read`."""
+        """One take per pair of files; `read` refuses one that lacks the partner's file."""
         found: dict[str, re.Match[str]] = {}
         for path in sorted(self.folder.iterdir()):
             if match := NAME.fullmatch(path.name):

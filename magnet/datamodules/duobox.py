@@ -55,7 +55,7 @@ class DuoBoxReader(Reader):
 
     Args:
         root: the folder of the two, or the one above.
-        form: "auto" takes the fit of a take, or its skeleton, to be fitted, where there is no fit.
+        form: "auto" takes the SMPL-X fit of a take, or its skeleton, which is then fitted, if there is no SMPL-X fit.
         phases: of training, 1 to 4; the authors use 4.
         validation: False leaves the official training part whole and validation empty.
 
@@ -114,7 +114,7 @@ class DuoBoxReader(Reader):
         return sorted((self.folder / FITS).glob(f"*.{ending}"))
 
     def read(self, take: Take) -> Recording:
-        """One part and phase of a take at 120 fps, z up; every fourth frame is the authors'."""
+        """One part and phase of a take at 120 fps, z up; the authors use every fourth frame."""
         path, part = take.files[0], take.name.rsplit("_", 1)[-1]
         held = mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path))
         if path.parent.name == SKELETONS:
@@ -152,7 +152,7 @@ class DuoBoxReader(Reader):
         return Recording(fps=RATE, up="+z", positions=positions, joints=joints, persons=names)
 
     def frames(self, where: object, total: int, part: str) -> slice:
-        """Frames of a file that a part such as "tr2" shows.
+        """Frames of a file that belong to a part such as "tr2".
 
         Raises:
             DataError: no such part, or the take is too short to have it.

@@ -54,12 +54,11 @@ class _Scene:
 class Embody3DReader(Reader):
     """Embody 3D's `datasets/<section>/<capture>/<subject>/<feature>/<capture>.npy`.
 
-    A scene is everybody whom a section's dataset.json lists or names for the same capture. Splits go by session, date
-    and time of the capture, so that scenes of one session are together: `split_sessions` gives test and val a tenth of
-    the frames of each number of people. It looks at the lists alone: first at acting's and daylife's, then at those of
-    each other section, in alphabetical order, where sessions seen before stay. So a scene is in the same split
-    whichever sections and numbers of people are chosen and whatever else was downloaded, as long as the same lists lie
-    there; the toolbox has them all.
+    A scene holds everybody whom a section's dataset.json lists or names for the same capture. Whole sessions (date and
+    time of the capture) go to one split: `split_sessions` gives test and val a tenth of the frames of each number of
+    people. It reads the lists alone, those of acting and daylife first, then those of each other section in
+    alphabetical order; sessions already assigned keep their split. So a scene's split does not depend on which sections
+    and numbers of people are chosen or downloaded, as long as the same lists are present; the toolbox has them all.
 
     Args:
         root: the folder `datasets`, the one above, or one section's.
@@ -224,7 +223,7 @@ class Embody3DReader(Reader):
 
 
 def _held(path: Path, array: Doubles, valid: NDArray[np.bool_]) -> Doubles:
-    """NaN is refused in good frames; in others, which nothing learns from, the last good number stands in."""
+    """Refuse NaN in valid frames; in other frames, which are not trained on, repeat the last finite numbers."""
     bad = ~np.isfinite(array).all(axis=1)
     if (bad & valid).any():
         raise DataError(f"{path}: NaN or infinity in {int((bad & valid).sum())} frames of good tracking; {AGAIN}")

@@ -29,7 +29,7 @@ class InterHumanReader(Reader):
 
     Args:
         root: the folder with `motions`.
-        fps: frame rate of the recordings, which files that name another one are refused for.
+        fps: frame rate of the recordings; files that state another rate are refused.
 
     Raises:
         DataError: no motions; says what was found.

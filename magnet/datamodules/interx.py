@@ -112,7 +112,7 @@ class InterXReader(Reader):
         return clips
 
     def found(self) -> list[Take]:
-        """One take a folder; a file that is missing in it is found out by `read`."""
+        """One take per folder; `read` refuses one with missing files."""
         found: dict[str, Path] = {}
         for folder in sorted(self.folder.iterdir()):
             if (match := CLIP.fullmatch(folder.name)) and folder.is_dir():

@@ -6,8 +6,9 @@ from typing import Any
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.registry import register_data
-from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.mapped import MappedStore
 from magnet.datamodules.store.memory import MemoryStore
+from magnet.datamodules.store.reader import StoreSplit
 
 
 class Parts(MotionDataModule):
@@ -45,9 +46,9 @@ class Parts(MotionDataModule):
 class Mixed(Parts):
     """Trains on several data sets at once; tests on one of them, or on all.
 
-    Of each data set only the clips are used: window, batch and augmentation are set here. Where one of them is a
-    prepared store read by memory map, all are: the frames of the others are held in memory as a store's rows, 188
-    bytes a frame and person, and each process reads lengths of its own of every source of clips.
+    Only the clips of each data set are used: window, batch and augmentation are set here. If one of them is a prepared
+    store read by memory map, all are treated as one: the frames of the others are kept in memory as rows of a store,
+    188 bytes per frame and person, and each process reads its own part of every source of clips.
 
     Args:
         data: the data sets; all of one body.
@@ -83,10 +84,10 @@ class Mixed(Parts):
         """Clips of all data sets, or of the one chosen for the split."""
         return [clip for part in self._used(split) for clip in part.clips(split)]
 
-    def split_data(self, split: Split) -> SplitData | None:
+    def split_data(self, split: Split) -> StoreSplit | None:
         """Rows of all data sets, or of the one chosen for the split."""
         parts = [data for part in self._used(split) if (data := part.split_data(split)) is not None]
-        return SplitData.concatenate(parts) if parts else None
+        return StoreSplit.concatenate(parts) if parts else None
 
     def open_store(self, split: Split) -> MemoryStore:
         """By memory map where a data set is; else all clips in memory."""

@@ -51,8 +51,8 @@ class HeldOutScenes:
         context_frames: known frames of a scene; 0 for tasks that start from nothing.
         horizon_frames: frames of a scene to predict; 150 are five seconds.
         stride: frames between the starts of scenes of a clip; None: they do not overlap.
-        limit: at most so many scenes, evenly spaced over all; None: all.
-        composed: so many more scenes of three and four people in turn, composed of two clips.
+        limit: largest number of scenes, evenly spaced over all; None: all.
+        composed: number of extra scenes, of three and four people in turn, each composed of two clips.
         batch_size: scenes a test and prediction batch.
 
     Raises:
@@ -78,4 +78,4 @@ class HeldOutScenes:
 
 
 AUGMENTATION, HELD_OUT = Augmentation(), HeldOutScenes()
-"""What data sets take unless told otherwise."""
+"""The defaults of data sets."""

@@ -9,25 +9,26 @@ from typing import Any, ClassVar
 from magnet.datamodules.base import Clip, EmptySplitError, MotionDataModule, Split
 from magnet.datamodules.reading.recording import Reader
 from magnet.datamodules.registry import register_data
-from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.mapped import MappedStore
 from magnet.datamodules.store.memory import MemoryStore
-from magnet.datamodules.store.reader import StoreError, StoreReader, body_hash
+from magnet.datamodules.store.reader import StoreError, StoreReader, StoreSplit, body_hash
 
 
 @register_data(combines=True)
 class Prepared(MotionDataModule):
-    """Random windows of a prepared store of any size; memory stays flat.
+    """Random windows of a prepared store of any size, in constant memory.
 
-    Several processes read different lengths of the store where it has enough clips: sample k of process r is sample
-    k * world + r of an epoch and depends only on (seed, epoch, k, r, world). Each process draws from its own length
-    alone; as lengths are equally likely, a step over all processes is as one over the whole store.
+    If the store has enough clips, each process reads its own part of it: sample k of process r is sample k * world + r
+    of an epoch and depends only on (seed, epoch, k, r, world). Parts are equally likely, so that a step over all
+    processes draws like one over the whole store.
 
     Args:
         path: the store's folder, as `magnet data prepare` wrote it.
         root: another name of `path`, as the folders of other data sets are called.
-        spread: let each process read a length of its own, where there are enough clips; False: all draw from all.
-        roles: words such as leader and follower; people whose names in the store hold the first stand in the first
-            slots, and so on, others after them in the order of the recording. To be seen with `augment.shuffle` off.
+        spread: let each process read its own part if there are enough clips; False: all draw from all clips.
+        roles: words such as leader and follower; people whose names in the store hold the first word get the first
+            slots, and so on; others follow in the order of the recording. Without effect unless `augment.shuffle` is
+            off.
         device_resident: keep all frames decoded in memory, on the trainer's device; for stores that fit there.
         body_model: "open", or the path of the body file that the store was prepared with.
         max_agents: slots P of every batch; at least the store's largest group.
@@ -39,7 +40,7 @@ class Prepared(MotionDataModule):
     """
 
     reader: ClassVar[type[Reader] | None] = None
-    """Whose stores these are; None: anybody's."""
+    """Reader of the data set whose stores these are; None: any store."""
 
     def __init__(
         self,
@@ -92,22 +93,22 @@ class Prepared(MotionDataModule):
         return folder
 
     def prepare_data(self) -> None:
-        """Look whether the store is there and is of this body."""
+        """Check that the store exists and belongs to this body."""
         assert self.folder
 
     def clips(self, split: Split) -> list[Clip]:
         """All clips of a split in memory, of `self.body`."""
         return self.folder.clips(split, self.roles)
 
-    def split_data(self, split: Split) -> SplitData | None:
+    def split_data(self, split: Split) -> StoreSplit | None:
         """The split's rows on disk."""
-        data = SplitData.stored(self.folder, split, self.roles)
-        return data if data.sources else None
+        part = self.folder.split(split, self.roles)
+        return part if part.name else None
 
     def open_store(self, split: Split) -> MemoryStore:
         """The split by memory map; in memory if `device_resident`."""
-        data = self.split_data(split)
-        if data is None:
+        part = self.split_data(split)
+        if part is None:
             has = [name for name, facts in self.folder.manifest["splits"].items() if facts["clips"]]
             raise EmptySplitError(
                 f"{self.folder.path}: split {split} is empty, the store has {', '.join(has)}; prepare it with a list "
@@ -115,4 +116,4 @@ class Prepared(MotionDataModule):
             )
         if self.device_resident:
             return super().open_store(split)
-        return MappedStore(data, self.max_agents, self.spread)
+        return MappedStore(part, self.max_agents, self.spread)

@@ -63,7 +63,7 @@ _combining: set[type] = set()  # that train on other data sets
 
 
 def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D], D]:
-    """Class decorator that makes a LightningDataModule known by its name, and the `reader` that it may have.
+    """Class decorator that registers a LightningDataModule by its name, and its `reader` if it has one.
 
     Raises:
         TypeError: no LightningDataModule.
@@ -80,7 +80,7 @@ def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D
 
 
 def register_reader(kind: R) -> R:
-    """Class decorator that makes a reader of downloads known to `magnet data` by its `name`.
+    """Class decorator that registers a reader of downloads for `magnet data` by its `name`.
 
     Raises:
         TypeError: no Reader.
@@ -92,7 +92,7 @@ def register_reader(kind: R) -> R:
 
 
 def reader_of(data: type) -> type[Reader] | None:
-    """How the download of a data set is read; None: there is nothing to prepare."""
+    """The reader of a data set's download; None: there is nothing to prepare."""
     return getattr(data, "reader", None)
 
 
@@ -102,7 +102,7 @@ def _known_readers() -> list[type[Reader]]:
 
 
 def unregister(data: type[LightningDataModule]) -> None:
-    """Take a data set and its reader back, such as one that a test has registered."""
+    """Remove a data set and its reader, such as one that a test has registered."""
     del DATA.known[data.__name__]
 
 
@@ -118,7 +118,7 @@ def entries() -> list[Registered]:
 
 
 def unprepared() -> list[Registered]:
-    """Data sets of their own that train without being prepared, ours first."""
+    """Data sets that train without being prepared and combine no others, ours first."""
     return [entry for entry in entries() if reader_of(entry.kind) is None and entry.kind not in _combining]
 
 
@@ -179,7 +179,7 @@ def fit_command(data: str) -> str:
 
 
 def import_local(path: str) -> None:
-    """Make `module.Class` known where the module lies in the working directory and Python finds it nowhere else.
+    """Import the module of `module.Class`, also from the working directory if Python finds it nowhere else.
 
     Raises:
         ValueError: there is no such module, or it cannot be imported, or has no such class; says what there is.

@@ -29,11 +29,11 @@ FIT_ENDINGS = ("npz", "npy", "pkl")
 class ReMoCapReader(Reader):
     """ReMoCap/LindyHop/{train,test}/SEQUENCE/{0,1}/ with motion.bvh and csv files of positions in millimetres.
 
-    README and code of its authors spell the files differently; motion_worldpos*.csv, motion_rotation*.csv and any
-    sequence folder with a number in its name are taken. Joints are found by the csv's own headings (Hips.X), or else
-    in the order of the BVH file. Positions are fitted by `canonicalize`; rotations only prove that joints and units
-    are what they are taken for: some Euler order must lead from motion_offsets.pkl to the positions within 1 cm. Two
-    people's files of unequal length are cut to the shorter, as the authors' process_LindyHop.py does, with a note.
+    The authors' README and code name the files differently, so motion_worldpos*.csv, motion_rotation*.csv and any
+    sequence folder with a number in its name are accepted. Joints are found by the csv's headings (Hips.X), or else by
+    the order of the BVH file. `canonicalize` fits the body to the positions; rotations only check joints and units:
+    with some Euler order, motion_offsets.pkl must lead to the positions within 1 cm. Two people's files of unequal
+    length are cut to the shorter, with a note, as the authors' process_LindyHop.py does.
 
     Args:
         root: the folder LindyHop or one above; or one of ready fits.
@@ -82,7 +82,7 @@ class ReMoCapReader(Reader):
             raise self._no("sequences train/*/0 and test/*/0")
 
     def found(self) -> list[Take]:
-        """One take a sequence; files that are missing in it are found out by `read`."""
+        """One take per sequence; `read` refuses one with missing files."""
         found: dict[int, tuple[Path, ...]] = {}
         if self.fits is None:
             found = {number: _files(folder) for number, folder in self._folders().items()}

@@ -1,4 +1,4 @@
-"""A user's own scenes: SMPL-X npz as AMASS has them, SMPL and SMPL-X pickles, and the scenes that magnet writes."""
+"""A user's own scenes: AMASS-like npz, SMPL and SMPL-X pickles, and the scenes that magnet writes."""
 
 from __future__ import annotations
 
@@ -79,13 +79,13 @@ class PosedTrack:
 class ScenesReader(OwnReader[PosedTrack]):
     """A folder of npz and pkl files of SMPL's family, one person or several each, or of scenes that magnet wrote.
 
-    Keys are found by the names in use (poses or root_orient and pose_body, trans or transl, betas, mocap_frame_rate or
-    fps); pickles are read without running anything in them. SMPL's two hand joints are left out, SMPL-X's fingers and
-    face too.
+    Keys may have any of the usual names (poses or root_orient and pose_body, trans or transl, betas, mocap_frame_rate
+    or fps). Pickles are read without running code in them. SMPL's hand joints and SMPL-X's fingers and face are left
+    out.
 
     Args:
         root: the folder.
-        fps: of files that do not say it.
+        fps: frame rate of files that do not state one.
         **kwargs: as for OwnReader.
 
     Raises:
@@ -255,7 +255,7 @@ def _ours(path: Path) -> list[PosedTrack]:
 
 
 def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Each person's arrays in a file: it holds one's, a list of people's, or a dict of them by name."""
+    """Each person's arrays in a file, which holds one person, a list of people, or a dict of people by name."""
     if isinstance(held, np.ndarray) and held.dtype == object:
         held = held.item() if held.ndim == 0 else held.tolist()
     if isinstance(held, list | tuple):
@@ -281,10 +281,10 @@ def _posed(held: Mapping[str, Any]) -> bool:
 
 
 def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise: Any) -> Any:
-    """What the first of several keys holds.
+    """The value of the first of several keys that is present.
 
     Raises:
-        DataError: none is there, and there is nothing to take otherwise.
+        DataError: none is present, and no default was given.
     """
     for key in keys:
         if held.get(key) is not None:
@@ -346,7 +346,7 @@ def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doub
 
 
 def _one_of(value: Any, person: int) -> Any:
-    """What a file says of a person: of one, or of all."""
+    """A person's entry of a value that a file gives once, or once per person."""
     return (
         value[person]
         if isinstance(value, list | tuple | np.ndarray) and np.ndim(value) == 1 and len(value) > person
@@ -355,7 +355,7 @@ def _one_of(value: Any, person: int) -> Any:
 
 
 def _standing(root: Doubles) -> Axis:
-    """The axis of the file's world along which pelvises stand. (T, P, 3) axis-angle -> +x ... -z"""
+    """The up axis of a file, found from the pelvises' rotations. (T, P, 3) axis-angle -> +x ... -z"""
     up = roma.rotvec_to_rotmat(torch.from_numpy(root))[..., 1].mean(dim=(0, 1))
     axis = int(up.abs().argmax())
     return ("-" if up[axis] < 0 else "+") + "xyz"[axis]  # type: ignore[return-value]

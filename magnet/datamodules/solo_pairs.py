@@ -19,7 +19,7 @@ from magnet.seeding import derive
 SHORTEST = 48
 """Frames that a pair has at least, after a follower's delay."""
 TRIES = 8
-"""How often another distance is tried where the two come too close, before a clip is left out."""
+"""How many distances are tried if the two come too close, before a clip is left out."""
 
 Place = Callable[[Tensor, float], Tensor]
 """distance in metres, side -1 or 1 -> T_mid_copy (4, 4), from the person's frame in the middle of the motion"""
@@ -43,17 +43,16 @@ PAIRINGS: dict[str, tuple[Place, float, float]] = {
 
 @register_data(combines=True)
 class SoloPairs(Parts):
-    """Pairs made of the single people of other data sets: a copy mirrors, circles, passes, walks beside or follows.
+    """Pairs made of single people of other data sets: a copy mirrors, circles, passes, walks beside or follows them.
 
-    The motion of each is real, and so is how it goes with the other: the copy's place follows from its own motion.
-    Recorded couples have no such variety of places. Only training clips are made; pairs whose pelvises come nearer
-    than `clearance` are placed anew, further apart, or left out. Sources of clips, for `weights`: "solo-mirror" and
-    so on.
+    Both motions are real, and coupled: the copy's place follows from the person's own motion. Recorded couples do not
+    have this variety of relative places. Only training clips are made; pairs whose pelvises come nearer than
+    `clearance` are placed further apart, or left out. Sources of clips, for `weights`: "solo-mirror" and so on.
 
     Args:
         data: the data sets; their scenes of one person are used.
         pairings: which of `PAIRINGS`; None: all.
-        delay: most frames that the copy comes later, drawn at random from 0; a follower always has one of these.
+        delay: largest delay of the copy in frames, drawn at random from 0; from 1 for a follower.
         clearance: metres between pelvises, at every frame.
         pair_seed: of distances, sides and delays.
         **kwargs: as for MotionDataModule.
@@ -98,7 +97,7 @@ class SoloPairs(Parts):
 
 
 def paired(solo: Scene, name: str, delay: int, clearance: float, generator: torch.Generator) -> Scene | None:
-    """A person and a copy of him as one scene; None: too short, or they come too close wherever the copy is put.
+    """A person and a copy of them as one scene; None: too short, or too close at every distance tried.
 
     solo (1, T, 1) -> (1, T - delay drawn, 2)
     """

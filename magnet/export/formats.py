@@ -19,8 +19,7 @@ from magnet.export.fbx import save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
-from magnet.export.retarget import load_bvh
-from magnet.export.retime import together
+from magnet.export.retarget import load_bvh, together
 from magnet.files import load_npz
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
@@ -46,15 +45,15 @@ class Read:
 
 @dataclass(frozen=True)
 class Reading:
-    """How to read what files do not say.
+    """Options for reading what files do not state.
 
     Args:
-        fps: bring everything to this rate; None: as recorded.
+        fps: resample to this rate; None: as recorded.
         trim: cut people of different lengths to the shortest.
         unit: of a BVH's lengths; None: by the length of its legs.
         up: axis of the file that points up; None: found.
-        joints: for BVH: our joint's name: theirs, where no naming scheme fits.
-        keep_floor: leave people of other programs' files at the height they were recorded at.
+        joints: for BVH: our joint's name to the file's, if no naming scheme fits.
+        keep_floor: keep people of other programs' files at the height they were recorded at.
     """
 
     fps: float | None = None
@@ -109,7 +108,7 @@ def read(
 
 
 def _grounded(scene: Scene, body: Body, notes: Sequence[str], moves: bool) -> Read:
-    """Everybody put on the floor where they are far from it and other programs made the file."""
+    """Put people on the floor if they are far from it and another program wrote the file."""
     metres = level(scene, body)
     if metres and moves:
         way = "lowered" if metres > 0 else "raised"
@@ -155,7 +154,7 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """What `write` was asked for, and the scene's body."""
+    """The arguments of `write`."""
 
     body: Body
     fps: float
@@ -179,9 +178,9 @@ class Format:
     """A kind of file that can be written.
 
     Attributes:
-        write: writes the file; gives back the paths written.
-        batch: it holds several scenes; else each of them gets a file.
-        own_rate: it chooses its frames itself; else the scene is brought to the rate asked for before.
+        write: writes the file and returns the paths written.
+        batch: one file holds several scenes; else each scene gets a file.
+        own_rate: it chooses its frames itself; else the scene is resampled to the requested rate first.
         nan: it may hold numbers that are not finite.
     """
 
@@ -263,8 +262,8 @@ def write(
         context_frames: how many first frames were given to a model, where the scene does not say; pictures mark them.
         style: how pictures show people: `body`, `light`, `capsules` or `skeleton`.
         title: of pictures.
-        progress: True for a bar while films are drawn, or a function told (done, all).
-        bones: how people hang in GLB, FBX and USD.
+        progress: True for a bar while films are drawn, or a function called with (done, all).
+        bones: names and hierarchy of bones in GLB, FBX and USD.
         size: pixels of a film's panel, width and height, even numbers.
 
     Returns:
@@ -298,7 +297,7 @@ def write(
 
 
 def _require_finite(scene: Scene) -> None:
-    """Other programs choke on NaN; only scenes of ours may hold it."""
+    """Refuse NaN, which other programs cannot read; only our own scene files may hold it."""
     finite = scene.T_world_root.flatten(3).isfinite().all(-1) & scene.body_rot.flatten(3).isfinite().all(-1)
     bad = (~finite & scene.present[:, None]).nonzero().tolist()
     if bad:

@@ -22,29 +22,29 @@ from magnet.body.joints import (  # isort: skip
 from magnet.body.fit import fit_body, floor_height, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
-from magnet.export.retime import together
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood
 from magnet.motion.frames import rigid
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.resample import resampled
+from magnet.motion.scene import BODY_JOINTS, Scene, cat_agents
 
 Floats = NDArray[np.float64]
 
 TARGETS = {
     L_HIP: 1.0, L_KNEE: 1.0, L_ANKLE: 1.0, L_FOOT: 0.5, NECK: 0.1, L_SHOULDER: 1.0, L_ELBOW: 1.0, L_WRIST: 2.0,
 }  # fmt: skip
-"""Left joints (and the neck) that the body's joints are drawn to, with weights. Spine, collars and head lie elsewhere
-in every rig: of them only rotations are taken."""
+"""Left joints (and the neck) that the body is fitted to, with weights. Spine, collars and head lie elsewhere in every
+rig: only their rotations are used."""
 FARTHEST_SWING = math.radians(110.0)
-"""Between the bone of our rest pose and of theirs; beyond it nobody can say how the bone is rolled."""
+"""Largest angle between a bone in our rest pose and in theirs; beyond it the bone's roll is ambiguous."""
 SAME_BODY = 0.002
-"""Metres that rest joints may differ by from a body's own for a skeleton to be that body's."""
+"""Largest difference of rest joints, in metres, for a skeleton to count as the body's own."""
 POOR_FIT, REFUSED_FIT = 0.04, 0.15
-"""Mean distance of joints in metres that is worth a warning, and that is no fit."""
+"""Mean distance of joints, in metres, above which a fit is reported as poor, and above which it is refused."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """How one file was interpreted."""
+    """How one file was read."""
 
     path: Path
     scheme: str
@@ -74,7 +74,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Imported:
-    """People read from BVH files as one scene (B = 1), and how each file was interpreted."""
+    """People read from BVH files as one scene (B = 1), and how each file was read."""
 
     scene: Scene
     sources: tuple[Source, ...]
@@ -92,18 +92,18 @@ def load_bvh(
     joints: Mapping[str, str] | None = None,
     keep_floor: bool = False,
 ) -> Imported:
-    """Read BVH files, one a person, of our own writing or of any skeleton with known joint names.
+    """Read BVH files, one per person: our own files, or any skeleton with known joint names.
 
-    A skeleton that is the body's own comes back exactly; any other is fitted: limbs to positions, all else to
+    A skeleton that is the body's own is restored exactly; any other is fitted: limbs to positions, all else to
     rotations relative to the file's rest pose, which may be a T or an A pose.
 
     Args:
-        fps: bring all files to this rate; None: the files' own, which must agree.
+        fps: resample all files to this rate; None: the files' own rate, which must agree.
         trim: cut files of different lengths to the shortest.
-        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: by the length of the legs.
-        up: `y`, `z`, `-y` ...; None: by where the torso points.
-        joints: our joint's name: theirs, for names that no scheme knows.
-        keep_floor: leave fitted people at the height they were recorded at.
+        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs.
+        up: `y`, `z`, `-y` ...; None: found from where the torso points.
+        joints: our joint's name to theirs, for names that no scheme knows.
+        keep_floor: keep fitted people at the height they were recorded at.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -137,11 +137,11 @@ def load_bvh(
 def onto(
     skeleton: Skeleton, body: Body, refuse_above: float = REFUSED_FIT, most_shape: float | None = None
 ) -> tuple[Scene, Source]:
-    """One person on a body, and how the file was interpreted.
+    """One person on a body, and how the file was read.
 
     Args:
-        refuse_above: mean distance of limb joints in metres that is no fit.
-        most_shape: bound of fitted shape numbers; None: whatever lies nearest to the bones' lengths.
+        refuse_above: mean distance of limb joints, in metres, above which a fit is refused.
+        most_shape: largest fitted shape number; None: no bound.
 
     Raises:
         ValueError: no fit.
@@ -285,3 +285,49 @@ def _spine(bones: int) -> tuple[list[int], list[int]]:
     if last == 2:
         return [PELVIS, SPINE1, SPINE3], [0, 1, 2]
     return list(SPINE), [0, 1, (1 + last) // 2, last]
+
+
+def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | None = None, trim: bool = False) -> Scene:
+    """Several people, each a scene with B = 1, as one scene in one world.
+
+    Args:
+        labels: what to call each in errors, such as its file.
+        fps: bring all to this rate; None: they must agree.
+        trim: cut all to the shortest; else lengths must agree.
+
+    Raises:
+        ValueError: rates, lengths or bodies differ.
+    """
+    if fps is not None:
+        people = [resampled(person, fps) for person in people]
+    rates = {person.fps for person in people}
+    if len(rates) > 1:
+        raise ValueError(
+            f"frame rates differ: {_each(labels, [f'{person.fps:g} fps' for person in people])}; "
+            f"bring all to one with --fps 30 (fps=30)"
+        )
+    bodies = {person.body for person in people}
+    if len(bodies) > 1:
+        raise ValueError(f"bodies differ: {_each(labels, [person.body for person in people])}")
+    shortest = min(person.frames for person in people)
+    if not trim and any(person.frames != shortest for person in people):
+        raise ValueError(
+            f"lengths differ: {_each(labels, [f'{person.frames} frames' for person in people])}; people of one scene "
+            f"share their frames: cut all to the shortest with --trim (trim=True)"
+        )
+    people = [person.slice(0, shortest) for person in people]
+    valid = None
+    if any(person.valid is not None for person in people):
+        all_good = torch.ones(1, shortest, dtype=torch.bool)
+        valid = torch.stack([all_good if p.valid is None else p.valid for p in people]).all(dim=0)
+    given = None
+    if any(person.given is not None for person in people):
+        given = [
+            torch.zeros_like(p.T_world_root[..., 0, 0], dtype=torch.bool) if p.given is None else p.given
+            for p in people
+        ]
+    return cat_agents(people).replace(valid=valid, given=None if given is None else torch.cat(given, dim=2))
+
+
+def _each(labels: Sequence[str], what: Sequence[str]) -> str:
+    return ", ".join(f"{label} {value}" for label, value in zip(labels, what, strict=True))

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from magnet.body import base, floor, load_body
 from magnet.body.floor import JUMP, lowest, off_floor, on_floor, standing
-from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import read_amc
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.synthetic import Synthetic
 from magnet.export.bvh_read import read_bvh
 from magnet.motion.frames import from_planar

@@ -200,7 +200,9 @@ SAID = {
 """Where it is said otherwise."""
 
 
-@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d", "remocap, ready fits"))
+@pytest.mark.parametrize(
+    "form", some_slow(FORMS, "bvh", "chi3d", "duobox, bare skeleton", "hi4d", "remocap, ready fits")
+)
 def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

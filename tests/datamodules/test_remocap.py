@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from magnet.datamodules.fakes import remocap as fake
-from magnet.datamodules.reading.bvh_header import read_bvh_header
 from magnet.datamodules.reading.recording import DataError, Recording
+from magnet.datamodules.reading.remocap_track import read_bvh_header
 from magnet.datamodules.remocap import ReMoCapReader
 from magnet.unpickle import load_pickle
 

@@ -2,8 +2,7 @@ import pytest
 import roma
 import torch
 
-from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import read_amc
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.motion.frames import (
     align_planar,
     canonical_deltas,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import roma
@@ -84,8 +85,7 @@ class WorldMotion:
         return replace(self, pelvis=self.pelvis - down, joints=self.joints - down.float())
 
 
-@dataclass(frozen=True)
-class Canonicalized:
+class Canonicalized(NamedTuple):
     """The clips of one take, and what should be known about them."""
 
     clips: list[Clip]
@@ -101,7 +101,7 @@ def canonicalize(
     family: Family = "smplx",
     options: CanonicalizeOptions | None = None,
 ) -> Canonicalized:
-    """A recording as read to clips of `body`.
+    """Convert a recording as read to clips of `body`.
 
     Args:
         recording: as read, at any rate and with any up axis.

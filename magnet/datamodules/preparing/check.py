@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -159,9 +159,11 @@ def _wrong_rows(part: StoreSplit, clip: int) -> str | None:
 
 def _wrong_people(part: StoreSplit, clip: int, own: bool) -> list[str]:
     """By person and frame; shape numbers only where they are those of the data set, and not of another body."""
-    names, rows = part.persons_of()[clip], part.rows(clip)
+    names, rows = part.persons[clip], part.rows(clip)
     quat, pelvis = (rows[key].swapaxes(0, 1).astype(np.float32) for key in ("rotations", "pelvis"))
-    flags = check_people.seen(quat, pelvis, np.ones(pelvis.shape[:2], dtype=bool))
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    valid = np.ones(pelvis.shape[:2], dtype=bool)
+    flags = check_people.frozen(*check_people.held(pelvis, quat), valid) + check_people.jumps(quat, None, valid)
     said = check_people.described(flags, names, FPS, met=False)
     try:
         check_people.check_shapes(part.betas_of(clip) if own else part.betas_of(clip)[:0], names)
@@ -301,3 +303,32 @@ def lines(found: CheckReport) -> Iterator[tuple[str, ...]]:
         people = ", ".join(f"{n} {what}" for what, n in sorted(count.items()) if what.startswith("of "))
         minutes = count["frames"] / FPS / 60
         yield split, f"{count['takes']}", f"{count['clips']} ({people})", f"{count['frames']:,}", f"{minutes:.1f}"
+
+
+WITHOUT: dict[Split, str] = {
+    "train": "nothing can be trained on it",
+    "val": "training goes without validation",
+    "test": "magnet test has no scenes",
+}
+YOURS = "a split of your own is given to prepare with --splits FILE, lines NAME SPLIT; --limit may be too low"
+
+
+def split_gaps(clips: Mapping[Split, Mapping[int, int]]) -> list[str]:
+    """A sentence for every gap, then what to do; none where every split has clips of every number of people.
+
+    Somebody alone is no gap where others are together: data sets hold such clips to learn bodies from.
+
+    Args:
+        clips: number of clips by number of people, of each split that has any.
+    """
+    counts = {split: {n: count for n, count in clips.get(split, {}).items() if count} for split in SPLITS}
+    if not any(counts.values()):
+        return []
+    said = [f"split {split} is EMPTY: {WITHOUT[split]}" for split in SPLITS if not counts[split]]
+    sizes = sorted({n for of in counts.values() for n in of})
+    for people in sizes if sizes == [1] else [n for n in sizes if n > 1]:
+        lacking = [split for split in SPLITS if counts[split] and people not in counts[split]]
+        if lacking:
+            has = ", ".join(f"{split} {of[people]}" for split, of in counts.items() if people in of)
+            said.append(f"no clip of {people} people in {' and '.join(lacking)} ({has})")
+    return [*said, YOURS] if said else []

@@ -192,19 +192,6 @@ def held_points(points: Array) -> tuple[Bools, Bools]:
     return place < STILL, pose < STILL
 
 
-def seen(quat: Array, pelvis: Array, valid: Bools, joints: Array | None = None) -> list[Flag]:
-    """Everything of this part that is wrong with motion at 30 fps: who is held, and what jumps.
-
-    Args:
-        quat: (T, P, 22, 4) quaternions of any one length, the pelvis's in the world.
-        pelvis: (T, P, 3) metres.
-        valid: (T, P).
-        joints: (T, P, 22, 3) metres, where a body is at hand.
-    """
-    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    return frozen(*held(pelvis, quat), valid) + jumps(quat, joints, valid)
-
-
 def jumps(quat: Array | None, joints: Array | None, valid: Bools, but: Sequence[Flag] = ()) -> list[Flag]:
     """Joints that turn or move from one frame to the next as none does.
 

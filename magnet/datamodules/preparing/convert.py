@@ -7,7 +7,7 @@ import json
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -183,8 +183,8 @@ class ConvertedTake:
             shortened(error), (), (), (), (), np.zeros((0, 10), dtype=np.float32), np.zeros(0, dtype=ROW)
         )
 
-    def save(self, path: Path) -> None:
-        """Write it, all or nothing."""
+    def saved(self, path: Path) -> ConvertedTake:
+        """Write it, all or nothing. Returns it without its rows."""
         facts = {name: getattr(self, name) for name in ("error", "notes", "names", "frames", "people", "persons")}
         text = np.array(json.dumps(facts))
 
@@ -193,15 +193,11 @@ class ConvertedTake:
                 np.lib.format.write_array(out, array, allow_pickle=False)
 
         write_whole(path.parent, path.name, write)
-
-    def saved(self, path: Path) -> ConvertedTake:
-        """Write it, and return it without its rows."""
-        self.save(path)
         return replace(self, rows=self.rows[:0])
 
     @staticmethod
     def load(path: Path, rows: bool = True) -> ConvertedTake:
-        """What `save` wrote, with or without its rows.
+        """What `saved` wrote, with or without its rows.
 
         Raises:
             ValueError: it is damaged.
@@ -223,15 +219,16 @@ def convert(
         if recording.betas is not None:
             check_shapes(recording.betas, recording.persons)
         recording = one_body(recording, bodies or {}, body)
-        made = canonicalize(recording, body, take.name, reader.name, take.split or "train", reader.family, options)
+        clips, notes = canonicalize(
+            recording, body, take.name, reader.name, take.split or "train", reader.family, options
+        )
     except (ValueError, OSError) as error:
         return ConvertedTake.failed(about(take, str(error) or type(error).__name__, reader.root))
     except Exception as error:  # a reader that does not know what to say: the others go on
         return ConvertedTake.failed(about(take, f"{type(error).__name__}: {error}", reader.root))
-    clips = made.clips
     return ConvertedTake(
         error=None,
-        notes=tuple(relative(note, reader.root) for note in made.notes),
+        notes=tuple(relative(note, reader.root) for note in notes),
         names=tuple(clip.name for clip in clips),
         frames=tuple(clip.frames for clip in clips),
         people=tuple(clip.agents for clip in clips),
@@ -290,6 +287,11 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many bytes of the download are done, and how many there are."""
 
 
+def sizes(takes: Sequence[Take]) -> dict[str, int]:
+    """Bytes of each take's files, by name; at least 1."""
+    return {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
+
+
 def convert_all(
     job: PrepareJob,
     takes: list[Take],
@@ -302,7 +304,7 @@ def convert_all(
     Raises:
         OSError: a worker process died.
     """
-    size = {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
+    size = sizes(takes)
     total, done = sum(size.values()), 0
     progress = progress or (lambda name, done, total: None)
     if takes:

@@ -1,62 +1,137 @@
-"""Cache of whole takes fitted to a body: a file per take, whose name holds a hash of all that it was made from."""
+"""Whole takes fitted to a body, and a cache of them: a file per take, named by a hash of all that it was made from."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
 from lightning.pytorch.utilities import rank_zero_info
+from torch import Tensor
 
 from magnet.body import Body
-from magnet.datamodules.preparing.fit_whole import Fitted, report_of
+from magnet.body.fit import floor_height
+from magnet.body.joints import ELBOWS, FEET, HIPS, KNEES, SHOULDERS, WRISTS
+from magnet.datamodules.preparing.canonicalize import fit_positions
+from magnet.datamodules.preparing.convert import sizes
 from magnet.datamodules.preparing.progress import progress_bar
-from magnet.datamodules.reading.recording import Take
+from magnet.datamodules.reading.cmu_joints import Glitches
+from magnet.datamodules.reading.recording import Recording, Take
 from magnet.datamodules.store.reader import body_hash
 from magnet.files import write_whole, writing
 from magnet.motion.scene import Scene
 from magnet.threads import one_thread
 
+LIMBS = (*HIPS, *KNEES, *FEET, *SHOULDERS, *ELBOWS, *WRISTS)
+HELD = 0.20
+"""Metres between two people's wrists below which they may hold hands."""
 ADVICE = "give another --data.cache; then run the same command again, which keeps fitted takes"
+Steps = Callable[[int, int], None]
+"""Called with the steps of a fit that are done, and how many there are."""
+
+
+def fit_whole(
+    recording: Recording, glitches: Sequence[Glitches], body: Body, progress: Steps | None = None
+) -> tuple[Scene, dict[str, Any]]:
+    """A whole take as bodies in one scene at 30 fps, feet at rest on y = 0, and a report on the fit.
+
+    Of the lower sole of each person and frame, the median over valid frames is taken to rest on the floor: people
+    stand on at least one foot most of the time. Lengths in the report are in centimetres.
+
+    Raises:
+        ValueError: the body does not fit.
+    """
+    assert recording.positions is not None and recording.valid is not None
+    targets, good = torch.from_numpy(recording.positions), torch.from_numpy(recording.valid)
+    fit = fit_positions(recording, targets, recording.valid, body, progress=progress)
+    joints, scene = list(recording.joints), fit.scene
+    found = body.joints(scene)[0]
+    limbs, wrists = ([joints.index(joint) for joint in some] for some in (LIMBS, WRISTS))
+    recorded, fitted = (wrists_apart(each, good) for each in (targets[:, :, wrists], found[:, :, WRISTS]))
+    valid = torch.ones(1, scene.frames, dtype=torch.bool) if scene.valid is None else scene.valid
+    floor = float(floor_height(found, body, scene.betas[0])[valid[0]].median())
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[..., 1, 3] -= floor
+
+    def rounded(value: float | Tensor, digits: int = 2) -> float | None:
+        return None if math.isnan(value) else round(100 * float(value), digits)
+
+    def nearest(apart: Tensor) -> float | None:
+        return rounded(apart.amin()) if len(apart) else None
+
+    report = {
+        "frames": scene.frames,
+        "frames masked": int((~valid).sum()),
+        "limb error cm": rounded(fit.residual[good][:, limbs].mean()),
+        "wrist error cm": rounded(fit.residual[good][:, wrists].mean()),
+        "nearest wrists recorded cm": nearest(recorded),
+        "nearest wrists fitted cm": nearest(fitted),
+        "wrists under 20 cm recorded %": rounded((recorded < HELD).double().mean(), 1),
+        "wrists under 20 cm fitted %": rounded((fitted < HELD).double().mean(), 1),
+        "floor cm": rounded(floor),
+        "largest shape number": round(float(scene.betas.abs().max()), 2),
+        "glitches": [
+            {
+                "jumps": glitch.jumps,
+                "jumps of modelled joints": glitch.body_jumps,
+                "frames interpolated": int(glitch.repaired.sum()),
+                "frames masked": int(glitch.masked.sum()),
+            }
+            for glitch in glitches
+        ],
+    }
+    return scene.replace(T_world_root=T_world_root), report
+
+
+def wrists_apart(wrists: Tensor, valid: Tensor) -> Tensor:
+    """Metres between the nearest wrists of two people, in frames with two who are valid; none for one person.
+
+    (T, P, 2, 3), (T, P) -> (frames,)
+    """
+    pairs = [(p, q) for p in range(wrists.shape[1]) for q in range(p)]
+    nearest = torch.full((len(wrists), 1), torch.inf, dtype=wrists.dtype)
+    for p, q in pairs:
+        apart = torch.cdist(wrists[:, p], wrists[:, q]).amin(dim=(-1, -2))
+        nearest = torch.cat([nearest, torch.where(valid[:, p] & valid[:, q], apart, torch.inf)[:, None]], dim=1)
+    nearest = nearest.amin(dim=1)
+    return nearest[nearest.isfinite()]
 
 
 @dataclass(frozen=True)
 class FitCache:
-    """Fitted takes of one data set and body, and a report beside each.
+    """Fitted takes of one data set and body, with a report beside each.
 
     Args:
         folder: where they lie.
-        body: that is fitted.
+        body: the body that is fitted.
         facts: what a take's fit depends on besides its files and the body's joints.
-        fit: fits a take; is told of progress.
+        fit: fits a take, and reports on it; its second argument is told of progress.
     """
 
     folder: Path
     body: Body
     facts: Callable[[Take], tuple[Any, ...]]
-    fit: Callable[[Take, Callable[[int, int], None]], Fitted]
-
-    @cached_property
-    def _keys(self) -> dict[str, str]:
-        return {}
+    fit: Callable[[Take, Steps], tuple[Scene, dict[str, Any]]]
+    keys: dict[str, str] = field(default_factory=dict)
 
     def file(self, take: Take) -> Path:
         """Where a fitted take lies or will lie."""
-        if take.name not in self._keys:
+        if take.name not in self.keys:
             key = hashlib.sha256(bytes.fromhex(body_hash(self.body)))
             key.update(repr(self.facts(take)).encode())
             for path in take.files:
                 key.update(path.read_bytes() if path.is_file() else b"missing")
-            self._keys[take.name] = key.hexdigest()[:16]
-        return self.folder / f"{take.name}.{self._keys[take.name]}.npz"
+            self.keys[take.name] = key.hexdigest()[:16]
+        return self.folder / f"{take.name}.{self.keys[take.name]}.npz"
 
     def report(self, take: Take) -> dict[str, Any]:
-        """What became of these very files: `report_of`, or an "error"; empty while that is not known."""
+        """The report on a take with these very files, or an "error"; empty while it has not been fitted."""
         report = self.file(take).with_suffix(".json")
         return json.loads(report.read_text()) if report.exists() else {}
 
@@ -65,11 +140,11 @@ class FitCache:
         return Scene.load(self.file(take)) if self.file(take).exists() else None
 
     def lacking(self, takes: Sequence[Take]) -> list[Take]:
-        """Those that have neither a fit nor an error yet."""
+        """Takes that have neither a fit nor an error yet."""
         return [take for take in takes if not (self.file(take).exists() or "error" in self.report(take))]
 
     def fill(self, title: str, takes: Sequence[Take]) -> dict[str, str]:
-        """Fit what is lacking. Returns why takes cannot be used, by name.
+        """Fit the takes that are lacking. Returns why takes cannot be used, by name.
 
         Raises:
             CannotWrite: the disk is full, or the folder does not take files.
@@ -78,37 +153,24 @@ class FitCache:
             with writing(self.folder, ADVICE):
                 self.folder.mkdir(parents=True, exist_ok=True)
             rank_zero_info(f"{title}: fitting {len(todo)} takes to body {self.body.id} once, into {self.folder}")
-            size = {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in todo}
-            total, before = sum(size.values()), 0
+            size, before = sizes(todo), 0
             # The fit's tensors are so small that threads cost more than they give, many times more on a busy machine.
             with one_thread(), progress_bar() as tell:
                 for take in todo:
-                    name, bytes_of, begun = take.name, size[take.name], before
-                    self._fill_one(
-                        take,
-                        lambda done, steps, n=name, b=bytes_of, s=begun: tell(n, s + b * done // steps, total),  # type: ignore[misc]
-                    )
-                    before += bytes_of
-                    tell(take.name, before, total)
+                    self._fill_one(take, lambda n, b, s=before: tell(n, s + b, sum(size.values())), size[take.name])  # type: ignore[misc]
+                    before += size[take.name]
         return {take.name: str(report["error"]) for take in takes if "error" in (report := self.report(take))}
 
-    def _fill_one(self, take: Take, progress: Callable[[int, int], None]) -> None:
-        report: dict[str, Any]
+    def _fill_one(self, take: Take, tell: Callable[[str, int], None], size: int) -> None:
         target = self.file(take)
         try:
-            fitted = self.fit(take, progress)
+            scene, report = self.fit(take, lambda done, steps: tell(take.name, size * done // steps))
         except ValueError as error:
-            report = {"take": take.name, "error": str(error)}
+            report = {"error": str(error)}
         else:
-            report = {"take": take.name, **report_of(fitted)}
-            scene = fitted.fit.scene.replace(names=(take.name,))
-            content = _saved(scene)
+            with TemporaryDirectory() as folder:
+                content = scene.replace(names=(take.name,)).save(Path(folder) / "scene.npz").read_bytes()
             write_whole(self.folder, target.name, content, advice=ADVICE)
-        text = json.dumps(report, indent=1).encode()
+        text = json.dumps({"take": take.name, **report}, indent=1).encode()
         write_whole(self.folder, target.with_suffix(".json").name, text, advice=ADVICE)
-
-
-def _saved(scene: Scene) -> bytes:
-    """What `Scene.save` writes."""
-    with TemporaryDirectory() as folder:
-        return scene.save(Path(folder) / "scene.npz").read_bytes()
+        tell(take.name, size)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,17 +30,15 @@ class PackSource:
 
     def head(self, old: StoreReader | None) -> ConvertedTake:
         """All but the rows."""
-        return self._stored(old, False) if self._kept(old) else ConvertedTake.load(self.file, rows=False)
+        return self._load(old, rows=False)
 
     def whole(self, old: StoreReader | None) -> ConvertedTake:
         """With its rows."""
-        return self._stored(old, True) if self._kept(old) else ConvertedTake.load(self.file)
+        return self._load(old, rows=True)
 
-    def _kept(self, old: StoreReader | None) -> bool:
-        return self.place is not None and old is not None
-
-    def _stored(self, old: StoreReader | None, rows: bool) -> ConvertedTake:
-        assert self.place is not None and old is not None
+    def _load(self, old: StoreReader | None, rows: bool) -> ConvertedTake:
+        if self.place is None or old is None:
+            return ConvertedTake.load(self.file, rows)
         split, first, count = self.place["split"], self.place["first"], self.place["clips"]
         part = old.split(split)
         mine = range(first, first + count)
@@ -54,7 +52,7 @@ class PackSource:
             people=tuple(int(part.people[c]) for c in mine),
             betas=np.array(part.betas[low : int(end[first + count - 1])]),
             rows=np.concatenate([part.rows(c).reshape(-1) for c in mine]) if rows else np.zeros(0, dtype=ROW),
-            persons=part.persons_of()[first],
+            persons=part.persons[first],
         )
 
 
@@ -94,12 +92,13 @@ def pack(
     failed = {s.take.name: (s.take.split, h.error) for s, h in zip(sources, heads, strict=True) if h.error is not None}
     notes = [(note, s.take.name) for s, h in zip(sources, heads, strict=True) for note in h.notes]
     persons = [(h.persons, s.take.name) for s, h in zip(sources, heads, strict=True) if h.error is None]
+    shapes = np.concatenate(betas).astype("<f4")
     manifest = {
         **facts,
         "format": FORMAT,
         "fps": FPS,
-        "clips": write_npy_or_json(out, "clips", table),
-        "betas": write_npy_or_json(out, "betas", np.concatenate(betas).astype("<f4")),
+        "clips": _written(out, "clips", "json", as_json(table)),
+        "betas": _written(out, "betas", "npy", lambda file: np.lib.format.write_array(file, shapes, version=(1, 0))),
         "splits": shown,
         "skipped": [{"take": name, "split": split, "why": why} for name, (split, why) in failed.items()],
         "notes": [{"note": note, "takes": takes} for note, takes in by_first(notes)],
@@ -146,17 +145,12 @@ def write_shard(
         for source in sources:
             file.write(np.ascontiguousarray(source.whole(old).rows).tobytes())
 
-    file, digest = write_whole(out, lambda digest: f"{split}-{number:05d}-{digest[:8]}.npy", write)
-    return {"file": file, "sha256": digest, "rows": rows}
+    return {**_written(out, f"{split}-{number:05d}", "npy", write), "rows": rows}
 
 
-def write_npy_or_json(out: Path, name: str, value: Any) -> dict[str, str]:
-    """An array or a table, named by its content. Returns its entry in the manifest."""
-    if isinstance(value, np.ndarray):
-        suffix, write = "npy", lambda file: np.lib.format.write_array(file, value, version=(1, 0), allow_pickle=False)
-    else:
-        suffix, write = "json", lambda file: file.write(as_json(value))
-    file, digest = write_whole(out, lambda digest: f"{name}-{digest[:8]}.{suffix}", write)
+def _written(out: Path, name: str, suffix: str, content: bytes | Callable[[Any], object]) -> dict[str, str]:
+    """A file named by its content. Returns its entry in the manifest."""
+    file, digest = write_whole(out, lambda digest: f"{name}-{digest[:8]}.{suffix}", content)
     return {"file": file, "sha256": digest}
 
 

@@ -100,7 +100,8 @@ def prepare(
             )
         folder = StoreReader(out)
         done = {keys[name]: place for name, place in packed.items()}
-        remember(state, folder, done)
+        record = {"manifest": file_hash(out / MANIFEST), "takes": done}
+        write_whole(state, "state.json", as_json(record))
         clean(folder, state, set(done))
     return PrepareReport(folder, len(todo), len(takes) - len(todo))
 
@@ -267,11 +268,6 @@ def remembered(state: Path, old: StoreReader | None) -> dict[str, Any]:
         if not (old.path / name).is_file() or file_hash(old.path / name) != digest
     ]
     return {} if damaged else found["takes"]
-
-
-def remember(state: Path, folder: StoreReader, done: dict[str, Any]) -> None:
-    facts = {"manifest": file_hash(folder.path / MANIFEST), "takes": done}
-    write_whole(state, "state.json", as_json(facts))
 
 
 OURS = re.compile(r"((train|val|test)-\d{5}|clips|betas)-[0-9a-f]{8}\.(npy|json)|\.new-.*")

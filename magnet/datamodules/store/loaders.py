@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
-from magnet.datamodules.store.window_index import WindowIndex
+from magnet.datamodules.store.memory import WindowIndex
 from magnet.motion.scene import Scene
 
 Gather = Callable[[WindowIndex], Scene]
@@ -23,12 +23,12 @@ Cursor = tuple[int, int]
 
 
 class Prefetcher:
-    """Computes batches in threads before they are asked for. Those that are never asked for are dropped.
+    """Computes batches in threads before they are requested; those that are never requested are dropped.
 
     Args:
         make: a cursor's batch; depends on the cursor alone, and may be called by several threads at once.
         after: the cursor that follows.
-        depth: batches begun while the last one given is used, each in a thread of its own.
+        depth: batches in progress while the last one is used, each in a thread of its own.
     """
 
     def __init__(self, make: Callable[[Cursor], Any], after: Callable[[Cursor], Cursor], depth: int) -> None:
@@ -72,9 +72,9 @@ class Prefetcher:
 class TrainLoader:
     """An endless stream of epochs: each pass yields the rest of the current epoch, the next pass the next epoch.
 
-    Global batch g of an epoch covers its samples g * world * batch_size and on; each rank takes its own part
-    of them, so that the samples seen do not depend on how many processes share the work. Where every process
-    draws from clips of its own, its samples are numbered on their own.
+    Global batch g of an epoch starts at sample g * world * batch_size; each rank takes its own part of it, so that the
+    samples do not depend on the number of processes. If every process draws from its own clips, each numbers its own
+    samples.
 
     Args:
         draw: the windows of some samples: (epoch, first sample, count) -> WindowIndex.
@@ -85,7 +85,7 @@ class TrainLoader:
         rank: of this process.
         world: number of processes.
         shared: `draw` numbers the samples of this process alone.
-        ahead: batches fetched ahead; 0: each when it is asked for. They are no part of the state before they are seen.
+        ahead: batches fetched ahead; 0: none. They do not count as seen in the state.
     """
 
     def __init__(
@@ -134,11 +134,11 @@ class TrainLoader:
             self.ahead.close()
 
     def state_dict(self) -> dict[str, int]:
-        """Where the stream stands: what comes next is this sample of this epoch."""
+        """Epoch and number of the next sample."""
         return {"epoch": self.epoch, "sample": self.batch * self.batch_size * self.world}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from there; with another number of processes or batch size, from the batch that it lies in."""
+        """Continue there; with another batch size or number of processes, at the batch that holds the sample."""
         self.epoch, self.batch = state["epoch"], state["sample"] // (self.batch_size * self.world)
         if self.batch >= self.batches:
             self.epoch, self.batch = self.epoch + 1, 0
@@ -147,8 +147,8 @@ class TrainLoader:
 class FixedLoader:
     """The same windows in the same order at every pass; process r of n takes every n-th, none twice.
 
-    All processes get equally many batches, at least one each: a model that talks to its copies in every
-    step (DDP does, where there are buffers) would otherwise wait for ever.
+    All processes get equally many batches, at least one each: otherwise a model that communicates in every step (DDP
+    does if it has buffers) would wait forever.
 
     Args:
         windows: all windows.

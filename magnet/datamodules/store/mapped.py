@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -15,81 +13,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import MIRROR
-from magnet.datamodules.clip import Clip, Ints, Split
-from magnet.datamodules.store.memory import MemoryStore
-from magnet.datamodules.store.reader import StoreReader, StoreSplit
-from magnet.datamodules.store.rows import ROW, SCALE, encode, matrices
-from magnet.datamodules.store.window_index import WindowIndex
+from magnet.datamodules.clip import Ints
+from magnet.datamodules.store.memory import MemoryStore, WindowIndex
+from magnet.datamodules.store.reader import StoreSplit
+from magnet.datamodules.store.rows import ROW, SCALE, matrices
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 UNEVEN = 0.1
-"""Shares of processes may differ by so much; else everybody draws from everything."""
+"""Largest difference between the shares of processes; if it is larger, all processes draw from all clips."""
 QUAT = 4 * ROW["rotations"].subdtype[0].itemsize  # type: ignore[index]
 """Bytes of a rotation."""
 PELVIS: int = ROW.fields["pelvis"][1]  # type: ignore[index]
 """Byte of a row at which the pelvis's place begins."""
 OTHER_SIDE = [joint - 1 for joint in MIRROR[1:]]
-
-
-@dataclass(frozen=True)
-class SplitData:
-    """Clips of one split as rows, and what is known of them besides."""
-
-    part: StoreSplit
-    sources: list[str]
-    fps: float
-    body: str
-    slot_order: Ints  # (C, P) which person of a clip is shown as its first, second and so on
-    bad: Mapping[int, NDArray[np.bool_]]  # clips with invalid frames: which are valid (T,)
-
-    @staticmethod
-    def stored(folder: StoreReader, split: Split, roles: Sequence[str] = ()) -> SplitData:
-        """Of a prepared store, people in the order of `roles`; may be empty."""
-        part = folder.split(split)
-        sources = [folder.manifest["name"]] * len(part.name)
-        return SplitData(part, sources, folder.fps, folder.body, part.slot_order(roles), {})
-
-    @staticmethod
-    def encoded(clips: Sequence[Clip]) -> SplitData:
-        """Of clips in memory, as a store would hold them; at least one."""
-        rows = [encode(clip.scene) for clip in clips]
-        part = StoreSplit(
-            name=[clip.name for clip in clips],
-            take=[clip.name for clip in clips],
-            frames=np.array([clip.frames for clip in clips], dtype=np.int64),
-            people=np.array([clip.agents for clip in clips], dtype=np.int64),
-            betas=np.concatenate([clip.scene.betas[0].float().cpu().numpy() for clip in clips]),
-            files=[Path("in memory")],
-            ends=np.array([sum(map(len, rows))], dtype=np.int64),
-            maps={0: np.concatenate(rows)},
-        )
-        goods = {c: good for c, clip in enumerate(clips) if not (good := clip.good()).all()}
-        first = clips[0].scene
-        return SplitData(part, [clip.source for clip in clips], first.fps, first.body, part.slot_order(()), goods)
-
-    @staticmethod
-    def concatenate(parts: Sequence[SplitData]) -> SplitData:
-        """One after the other.
-
-        Raises:
-            ValueError: bodies or rates differ.
-        """
-        first, clips = parts[0], 0
-        bad: dict[int, NDArray[np.bool_]] = {}
-        most = max(data.slot_order.shape[1] for data in parts)
-        for data in parts:
-            if (data.fps, data.body) != (first.fps, first.body):
-                raise ValueError(
-                    f"clip {data.part.name[0]}: {data.fps:g} fps and body {data.body}, but clip "
-                    f"{first.part.name[0]} has {first.fps:g} fps and body {first.body}"
-                )
-            bad |= {clips + c: good for c, good in data.bad.items()}
-            clips += len(data.sources)
-        part = StoreSplit.concatenate([data.part for data in parts])
-        orders = [np.pad(data.slot_order, ((0, 0), (0, most - data.slot_order.shape[1]))) for data in parts]
-        order, sources = np.concatenate(orders), [source for data in parts for source in data.sources]
-        return SplitData(part, sources, first.fps, first.body, order, bad)
 
 
 @dataclass(frozen=True)
@@ -107,10 +44,10 @@ class RawBatch:
 class MappedStore(MemoryStore):
     """Like `MemoryStore`, with rows read through memory maps and decoded on `device`.
 
-    Only the index is held in memory: some hundred bytes a clip. Rows travel to the device as they lie on disk.
+    Only the index is kept in memory, some hundred bytes per clip. Rows go to the device in the format on disk.
 
     Args:
-        data: the clips; at least one.
+        part: the clips; at least one.
         max_agents: slots P of every batch.
         spread: let each process read its own part of every source, where there are enough clips.
 
@@ -121,18 +58,17 @@ class MappedStore(MemoryStore):
 
     on_disk: ClassVar[bool] = True
 
-    def __init__(self, data: SplitData, max_agents: int, spread: bool = True) -> None:
-        self.part = part = data.part
-        self.slot_order, self.bad = data.slot_order, data.bad
+    def __init__(self, part: StoreSplit, max_agents: int, spread: bool = True) -> None:
+        self.part, self.bad = part, part.bad
         self._index(
             names=part.name,
-            sources=data.sources,
+            sources=part.source,
             length=part.frames,
             people=part.people,
             whole=[c not in self.bad for c in range(len(part.name))],
             max_agents=max_agents,
-            fps=data.fps,
-            body=data.body,
+            fps=part.fps,
+            body=part.body,
         )
         self.shards: dict[int, NDArray[np.void]] = {}
         self.device = torch.device("cpu")
@@ -154,8 +90,8 @@ class MappedStore(MemoryStore):
     def owners(self, mass: NDArray[np.float64], world: int) -> Ints | None:
         """Which process reads each clip: every source is cut into parts of equal probability, one per process. (C,)
 
-        A process reads the shards of its parts alone, and shares the first and the last with its neighbours. None
-        where clips are too few for loads that differ by less than a tenth: then all processes draw from all clips.
+        A process only reads the shards of its parts; it shares the first and the last with its neighbours. None if
+        there are too few clips for shares that differ by less than a tenth: then all processes draw from all clips.
         """
         owner = np.zeros(len(mass), dtype=np.int64)
         for source in set(self.sources):
@@ -168,28 +104,28 @@ class MappedStore(MemoryStore):
     # -- from disk -----------------------------------------------------------------------------
 
     def fetch(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> RawBatch | Scene:
-        """All that a CPU has to do for a batch: rows in pinned memory for a GPU; without one, the batch itself."""
+        """The CPU's part of a batch: rows in pinned memory for a GPU; the whole batch without a GPU."""
         rows = self.read(windows, frames)
         return self.decoded(rows, clearance) if self.device.type == "cpu" else rows
 
     def finish(self, fetched: RawBatch | Scene, clearance: float = 0.0) -> Scene:
-        """What `fetch` gave, as a batch on `device`."""
+        """The batch on `device` from the result of `fetch`."""
         return fetched if isinstance(fetched, Scene) else self.decoded(fetched, clearance)
 
     def gather(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Scene:
-        """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
+        """The windows, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
 
         Beyond a clip's end its last frame is repeated with `valid` False.
         """
         return self.finish(self.fetch(windows, frames, clearance), clearance)
 
     def read(self, windows: WindowIndex, frames: int) -> RawBatch:
-        """Copy the windows drawn out of the maps; computes nothing."""
+        """Copy windows out of the memory maps, without computing anything."""
         B, P = windows.members.shape
         present = windows.members >= 0
         clip = np.take_along_axis(np.maximum(windows.clips, 0), windows.groups, 1)  # (B, P)
         start = np.take_along_axis(windows.starts, windows.groups, 1)
-        member = self.slot_order[clip, np.maximum(windows.members, 0)]
+        member = self.part.slot_order[clip, np.maximum(windows.members, 0)]
         row = self.part.first[clip] + member * self.length[clip] + start
         count = np.minimum(frames, self.length[clip] - start)
         shard = np.searchsorted(self.part.ends, row, side="right")
@@ -242,7 +178,7 @@ class MappedStore(MemoryStore):
     # -- on the device -------------------------------------------------------------------------
 
     def decoded(self, rows: RawBatch, clearance: float) -> Scene:
-        """Rows to the batch that they are, on `device`."""
+        """Decode rows to a batch on `device`."""
         raw = rows.raw.to(self.device, non_blocking=True)
         present, groups = rows.present.to(self.device), torch.from_numpy(rows.windows.groups).to(self.device)
         root = raw[..., :QUAT].contiguous().view(torch.int16)

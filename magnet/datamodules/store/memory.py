@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,9 +14,31 @@ from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules.clip import Clip, Ints
-from magnet.datamodules.store.compose import place_apart
-from magnet.datamodules.store.window_index import WindowIndex
+from magnet.motion.frames import from_planar
+from magnet.motion.planar import rotate_ground
 from magnet.motion.scene import BODY_JOINTS, Scene
+
+
+@dataclass(frozen=True)
+class WindowIndex:
+    """What a batch of B windows shows: up to two clips each and who stands in which of the P slots."""
+
+    clips: Ints  # (B, 2) index of the clip; the second is -1 unless the scene is composed
+    starts: Ints  # (B, 2) first frame
+    members: Ints  # (B, P) which person of the clip a slot shows, -1: nobody
+    groups: Ints  # (B, P) which of the two clips the person comes from
+    mirrored: NDArray[np.bool_]  # (B,)
+    relative_pose: NDArray[np.float64]  # (B, 3) of the second group: yaw, direction in radians, distance in metres
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, part: slice) -> WindowIndex:
+        return WindowIndex(*(getattr(self, f)[part] for f in self.__dataclass_fields__))
+
+    @staticmethod
+    def concatenate(draws: Sequence[WindowIndex]) -> WindowIndex:
+        return WindowIndex(*(np.concatenate([getattr(d, f) for d in draws]) for f in WindowIndex.__dataclass_fields__))
 
 
 class MemoryStore:
@@ -67,7 +90,7 @@ class MemoryStore:
         fps: float,
         body: str,
     ) -> None:
-        """Keep what is known of each clip besides its frames, and check the number of people."""
+        """Keep all facts of each clip but its frames, and check the number of people."""
         self.names, self.sources = list(names), np.array(sources, dtype=object)
         self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
         self.whole = np.array(whole, dtype=bool)  # every frame is valid
@@ -127,11 +150,11 @@ class MemoryStore:
         return self.gather(windows, frames, clearance)
 
     def finish(self, fetched: Any, clearance: float = 0.0) -> Scene:
-        """What `fetch` gave, as a batch on the store's device."""
+        """The batch on the store's device from the result of `fetch`."""
         return fetched
 
     def gather(self, windows: WindowIndex, frames: int, clearance: float = 0.0) -> Scene:
-        """The windows drawn, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
+        """The windows, each `frames` long. -> Scene (B, frames, max_agents) on the store's device
 
         Beyond a clip's end its last frame is repeated with `valid` False.
         """
@@ -197,3 +220,48 @@ class MemoryStore:
             label(a, s) if b < 0 else f"composed: {label(a, s)} + {label(b, z)}"
             for (a, b), (s, z) in zip(windows.clips.tolist(), windows.starts.tolist(), strict=True)
         )
+
+
+def place_apart(
+    T_world_root: Tensor, present: Tensor, second: Tensor, relative_pose: Tensor, clearance: float
+) -> Tensor:
+    """Turn each scene's second group about its own centre and put it beside the first.
+
+    A group's centre is the mean of its pelvises over people and frames. Where pelvises of the two groups
+    would come closer than `clearance` at any frame, the groups move further apart in the same direction.
+    Heights do not change.
+
+    Args:
+        T_world_root: (B, T, P, 4, 4) pelvis poses; each group in its own recording's world.
+        present: (B, P) bool.
+        second: (B, P) bool, True for people of the second group.
+        relative_pose: (B, 3) radians that the second group turns; direction in radians, 0 along +z, of its centre as
+            seen from the first group's; least metres between the centres.
+        clearance: metres between pelvises of different groups, at every frame.
+
+    Returns:
+        (B, T, P, 4, 4) in the first group's world.
+    """
+    yaw, direction, distance = relative_pose.unbind(-1)
+    ground = T_world_root[..., [0, 2], 3]
+    ours, theirs = present & ~second, present & second
+
+    def centre(group: Tensor) -> Tensor:
+        people = group.sum(dim=1).clamp_min(1) * ground.shape[1]
+        return (ground * group[:, None, :, None]).sum(dim=(1, 2)) / people[:, None]
+
+    near, far = centre(ours), centre(theirs)
+    turned = rotate_ground(yaw[:, None, None], ground - far[:, None, None])
+    # At distance d along u, a pair is |d u - offset| apart: solve for the largest d where that is `clearance`.
+    offset = (ground - near[:, None, None])[:, :, :, None] - turned[:, :, None]  # (B, T, P, P, 2)
+    x, z = offset.unbind(-1)
+    sin, cos = direction.sin()[:, None, None, None], direction.cos()[:, None, None, None]
+    along, across = x * sin + z * cos, x * cos - z * sin
+    reach = (clearance**2 - across**2).clamp_min(0.0).sqrt()
+    matters = ours[:, None, :, None] & theirs[:, None, None, :] & (across.abs() < clearance)
+    needed = torch.where(matters, along + reach, -torch.inf).flatten(1).amax(dim=1)
+    distance = torch.maximum(distance, needed)
+
+    heading = torch.stack([direction.sin(), direction.cos()], dim=-1)
+    T_new_world = from_planar(yaw, near + distance[:, None] * heading - rotate_ground(yaw, far))
+    return torch.where(theirs[:, None, :, None, None], T_new_world[:, None, None] @ T_world_root, T_world_root)

@@ -11,18 +11,18 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnet.body import Body
 from magnet.datamodules.clip import SPLITS, Clip, Ints, Split
-from magnet.datamodules.store.rows import ROW, scene_of
+from magnet.datamodules.store.rows import ROW, encode, scene_of
 from magnet.files import inside
 
 FORMAT = 1
@@ -32,21 +32,18 @@ STATE = ".prepare"
 
 
 class StoreError(ValueError):
-    """A folder that is no store, is damaged, or is of a later version; says what to do."""
+    """A folder is no store, is damaged, or is of a later version; the message says what to do."""
 
 
 def body_hash(body: Body) -> str:
-    """What stored shape numbers belong to: a hash of the joints at rest, whatever the file was called."""
+    """A hash of a body's joints at rest, which identifies the body whatever its file is called."""
     joints = body.J_template.numpy().tobytes() + body.J_shapedirs.numpy().tobytes()
     return hashlib.sha256(joints).hexdigest()
 
 
 def as_json(value: Any) -> bytes:
-    """Always the same bytes for the same value."""
+    """A value as JSON: always the same bytes for the same value."""
     return (json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode()
-
-
-# -- reading -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -55,49 +52,80 @@ class StoreSplit:
 
     name: list[str]
     take: list[str]
+    source: list[str]  # what mixture weights refer to
     frames: Ints
     people: Ints
     betas: NDArray[np.float32]  # (people of all clips, 10)
     files: list[Path]
     ends: Ints  # rows up to the end of each shard
-    persons: list[tuple[str, ...]] = field(default_factory=list)  # names or roles; none where none are known
+    persons: list[tuple[str, ...]]  # names or roles of each clip's people; () where the data set gives none
+    slot_order: Ints  # (C, P) which person of a clip is shown as its first, second and so on
+    fps: float
+    body: str
+    bad: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)  # clips with invalid frames: valid ones (T,)
     maps: dict[int, NDArray[np.void]] = field(default_factory=dict, repr=False)
 
     @staticmethod
+    def encoded(clips: Sequence[Clip]) -> StoreSplit:
+        """Clips in memory as the rows that a store would hold; at least one clip."""
+        rows = [encode(clip.scene) for clip in clips]
+        people, first = [clip.agents for clip in clips], clips[0].scene
+        return StoreSplit(
+            name=[clip.name for clip in clips],
+            take=[clip.name for clip in clips],
+            source=[clip.source for clip in clips],
+            frames=np.array([clip.frames for clip in clips], dtype=np.int64),
+            people=np.array(people, dtype=np.int64),
+            betas=np.concatenate([clip.scene.betas[0].float().cpu().numpy() for clip in clips]),
+            files=[Path("in memory")],
+            ends=np.array([sum(map(len, rows))], dtype=np.int64),
+            persons=[()] * len(clips),
+            slot_order=np.tile(np.arange(max(people)), (len(clips), 1)),
+            fps=first.fps,
+            body=first.body,
+            bad={c: good for c, clip in enumerate(clips) if not (good := clip.good()).all()},
+            maps={0: np.concatenate(rows)},
+        )
+
+    @staticmethod
     def concatenate(parts: Sequence[StoreSplit]) -> StoreSplit:
-        """Several parts one after the other, each with shards of its own."""
-        before = np.cumsum([0, *(int(part.ends[-1]) for part in parts)])
+        """Several parts one after the other, each with shards of its own.
+
+        Raises:
+            ValueError: bodies or rates differ.
+        """
+        first, clips, rows, shards = parts[0], 0, 0, 0
+        most = max(part.slot_order.shape[1] for part in parts)
+        ends: list[Ints] = []
+        bad: dict[int, NDArray[np.bool_]] = {}
         maps: dict[int, NDArray[np.void]] = {}
-        number = 0
         for part in parts:
-            maps |= {number + k: rows for k, rows in part.maps.items()}
-            number += len(part.files)
+            if (part.fps, part.body) != (first.fps, first.body):
+                raise ValueError(
+                    f"clip {part.name[0]}: {part.fps:g} fps and body {part.body}, but clip {first.name[0]} has "
+                    f"{first.fps:g} fps and body {first.body}"
+                )
+            ends.append(part.ends + rows)
+            bad |= {clips + c: good for c, good in part.bad.items()}
+            maps |= {shards + k: shard for k, shard in part.maps.items()}
+            clips, rows, shards = clips + len(part.name), int(ends[-1][-1]), shards + len(part.files)
+        orders = [np.pad(part.slot_order, ((0, 0), (0, most - part.slot_order.shape[1]))) for part in parts]
         return StoreSplit(
             name=[name for part in parts for name in part.name],
             take=[take for part in parts for take in part.take],
+            source=[source for part in parts for source in part.source],
             frames=np.concatenate([part.frames for part in parts]),
             people=np.concatenate([part.people for part in parts]),
             betas=np.concatenate([part.betas for part in parts]),
             files=[file for part in parts for file in part.files],
-            ends=np.concatenate([part.ends + rows for part, rows in zip(parts, before[:-1], strict=True)]),
-            persons=[names for part in parts for names in part.persons_of()],
+            ends=np.concatenate(ends),
+            persons=[names for part in parts for names in part.persons],
+            slot_order=np.concatenate(orders),
+            fps=first.fps,
+            body=first.body,
+            bad=bad,
             maps=maps,
         )
-
-    def persons_of(self) -> list[tuple[str, ...]]:
-        """Names or roles of each clip's people; () where the data set gives none."""
-        return self.persons or [()] * len(self.name)
-
-    def slot_order(self, roles: Sequence[str]) -> Ints:
-        """Each clip's people in the order of their roles: the first whose name holds the first word, and so on. (C, P)
-
-        People of none of the roles come last, in the order of the recording.
-        """
-        order = np.tile(np.arange(int(self.people.max(initial=1))), (len(self.name), 1))
-        for clip, names in enumerate(self.persons_of() if roles else []):
-            rank = [next((r for r, role in enumerate(roles) if role in words(name)), len(roles)) for name in names]
-            order[clip, : len(names)] = np.argsort(rank, kind="stable")
-        return order
 
     def shard(self, number: int) -> NDArray[np.void]:
         """The rows of a shard, mapped when first asked for.
@@ -142,9 +170,20 @@ class StoreSplit:
         return self.betas[end - int(self.people[clip]) : end]
 
 
-def words(name: str) -> set[str]:
-    """What a person is called: the whole name and each word of it, so that "P1, actor" is an "actor"."""
-    return {name, *re.findall(r"[^\s,;:()]+", name)}
+def in_roles(persons: Sequence[Sequence[str]], roles: Sequence[str], slots: int) -> Ints:
+    """The order in which each clip's people fill the slots: first who has the first role, and so on. -> (C, slots)
+
+    "P1, actor" has the role "actor". People of none of the roles come last, in the order of the recording.
+    """
+    order = np.tile(np.arange(slots), (len(persons), 1))
+    for clip, names in enumerate(persons if roles else []):
+        words = [{name, *re.findall(r"[^\s,;:()]+", name)} for name in names]
+        rank = [next((r for r, role in enumerate(roles) if role in mine), len(roles)) for mine in words]
+        order[clip, : len(names)] = np.argsort(rank, kind="stable")
+    return order
+
+
+T = TypeVar("T")
 
 
 class StoreReader:
@@ -167,8 +206,8 @@ class StoreReader:
             raise StoreError(f"{self.path / MANIFEST} cannot be read ({error}); prepare the store again") from error
         if version != FORMAT:
             raise StoreError(f"{self.path}: store format {version}, this version reads {FORMAT}; prepare it again")
-        self._splits: dict[str, StoreSplit] = {}
         self.body: str = self.manifest["body"]["id"]
+        self._splits: dict[tuple[Split, tuple[str, ...]], StoreSplit] = {}
 
     @property
     def fps(self) -> float:
@@ -176,25 +215,18 @@ class StoreReader:
 
     @cached_property
     def _clips(self) -> dict[str, list[Any]]:
-        path = self._file(self.manifest["clips"])
-        try:
-            return json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{path}: the index cannot be read ({error}); prepare the store again") from error
+        return self._load("clips", lambda path: json.loads(path.read_text()))
 
     @cached_property
     def _betas(self) -> NDArray[np.float32]:
-        path = self._file(self.manifest["betas"])
-        try:
-            return np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise StoreError(f"{path}: the shapes cannot be read ({error}); prepare the store again") from error
+        return self._load("betas", lambda path: np.load(path, allow_pickle=False))
 
-    def split(self, split: Split) -> StoreSplit:
-        """The clips of a split; none where it is empty."""
-        if split not in self._splits:
-            self._splits[split] = self._part(split)
-        return self._splits[split]
+    def _load(self, entry: str, read: Callable[[Path], T]) -> T:
+        path = self._file(self.manifest[entry])
+        try:
+            return read(path)
+        except (OSError, ValueError, EOFError) as error:
+            raise StoreError(f"{path}: the {entry} cannot be read ({error}); prepare the store again") from error
 
     def _file(self, entry: Any) -> Path:
         """A file that the manifest names; it lies in the store's own folder, wherever the store came from."""
@@ -203,31 +235,42 @@ class StoreReader:
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{self.path / MANIFEST}: damaged ({error}); prepare the store again") from error
 
-    def _part(self, split: Split) -> StoreSplit:
+    def split(self, split: Split, roles: tuple[str, ...] = ()) -> StoreSplit:
+        """The clips of a split, people in the order of `roles` as `in_roles` says; no clips where it is empty."""
+        if (split, roles) not in self._splits:
+            self._splits[split, roles] = self._split(split, roles)
+        return self._splits[split, roles]
+
+    def _split(self, split: Split, roles: tuple[str, ...]) -> StoreSplit:
         table = self._clips
         mine = [i for i, name in enumerate(table["split"]) if name == split]
         people = np.array(table["people"], dtype=np.int64)
         end = np.cumsum(people)
         low, high = (int(end[mine[0]] - people[mine[0]]), int(end[mine[-1]])) if mine else (0, 0)
+        people = people[mine] if mine else people[:0]
+        persons = [tuple(table["persons"][i]) if "persons" in table else () for i in mine]
         shards = self.manifest["splits"][split]["shards"]
         return StoreSplit(
             name=[table["name"][i] for i in mine],
             take=[table["take"][i] for i in mine],
+            source=[self.manifest["name"]] * len(mine),
             frames=np.array([table["frames"][i] for i in mine], dtype=np.int64),
-            people=people[mine] if mine else people[:0],
+            people=people,
             betas=self._betas[low:high],
             files=[self._file(shard) for shard in shards],
             ends=np.cumsum([shard["rows"] for shard in shards], dtype=np.int64),
-            persons=[tuple(table["persons"][i]) for i in mine] if "persons" in table else [],
+            persons=persons,
+            slot_order=in_roles(persons, roles, int(people.max(initial=1))),
+            fps=self.fps,
+            body=self.body,
         )
 
-    def clips(self, split: Split, roles: Sequence[str] = ()) -> list[Clip]:
-        """All clips of a split in memory, people in the order of `roles`, as `StoreSplit.slot_order` says."""
-        part = self.split(split)
-        slot_order = part.slot_order(roles)
+    def clips(self, split: Split, roles: tuple[str, ...] = ()) -> list[Clip]:
+        """All clips of a split in memory, people in the order of `roles`."""
+        part = self.split(split, roles)
         clips = []
         for c, name in enumerate(part.name):
-            order = slot_order[c, : part.people[c]]
+            order = part.slot_order[c, : part.people[c]]
             scene = scene_of(part.rows(c)[order], part.betas_of(c)[order], self.body, self.fps, name)
             clips.append(Clip(scene, name, self.manifest["name"], split))
         return clips

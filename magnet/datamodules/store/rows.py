@@ -60,7 +60,7 @@ def nine_at_once(rotations: Tensor) -> Tensor:
 
 
 def _nine(rotations: NDArray[np.int16]) -> NDArray[np.float32]:
-    """The same, bit for bit, piece by piece in a CPU's cache; numpy's calls cost a third of torch's."""
+    """The same, bit for bit, in pieces that fit a CPU's cache; numpy's calls cost a third of torch's."""
     N = len(rotations)
     out = np.empty((N, 9), dtype=np.float32)
     room = np.empty((26, min(CACHED, N)), dtype=np.float32)
@@ -88,7 +88,7 @@ def _nine(rotations: NDArray[np.int16]) -> NDArray[np.float32]:
 
 
 def scene_of(rows: NDArray[np.void], betas: NDArray[np.float32], body: str, fps: float, name: str = "") -> Scene:
-    """The scene (B = 1) that rows (P, T) of `ROW` are of people with shapes (P, 10)."""
+    """Decode rows (P, T) of `ROW`, of people with shapes (P, 10), to a scene (B = 1)."""
     body_rot, T_world_root = decode(*(torch.from_numpy(rows[key].copy()) for key in ("rotations", "pelvis")))
     return Scene(
         body_rot=body_rot.transpose(0, 1)[None],

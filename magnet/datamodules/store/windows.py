@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.checks import require_whole
 from magnet.datamodules.clip import Ints
 from magnet.datamodules.options import Augmentation
-from magnet.datamodules.store.memory import MemoryStore
-from magnet.datamodules.store.window_index import WindowIndex, all_starts, spaced_starts
+from magnet.datamodules.store.memory import MemoryStore, WindowIndex
 from magnet.seeding import derive
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,7 @@ def uniforms(seed: int, epoch: int, first: int, count: int, columns: int) -> Flo
 class RandomWindows:
     """Training windows: sample i of epoch e depends only on (seed, e, i) and the clips.
 
-    Where the store divides its clips among processes, a process draws from its own alone. Sample k of process r is
+    If the store divides its clips among processes, each process draws from its own clips only. Sample k of process r is
     then sample k * world + r of the epoch and depends on (seed, e, k, r, world).
 
     Args:
@@ -44,7 +44,7 @@ class RandomWindows:
         world: number of processes.
 
     Raises:
-        ValueError: no clip has a valid frame, or a weight names no source, or they leave nothing.
+        ValueError: no clip has a valid frame, a weight names no source, or all weights are zero.
     """
 
     COLUMNS = 12
@@ -146,7 +146,7 @@ def slot_assignment(first: Ints, joining: Ints, second: Ints, turn: Ints, slots:
 
 
 def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
-    """Who of so many people is masked: 1 to `at_most` of them, each number equally likely, but never everybody.
+    """Which people are masked: 1 to `at_most`, each number equally likely, but never everybody.
 
     share, which: uniform numbers in [0, 1), for how many and for who.
     """
@@ -165,6 +165,38 @@ def without_empty_groups(windows: WindowIndex) -> WindowIndex:
             windows.groups[gone] = 0
         windows.clips[gone, 1] = -1
     return windows
+
+
+def all_starts(good: NDArray[np.bool_], frames: int) -> Ints:
+    """First frames of every window of a clip to train on. good: (T,) bool
+
+    Windows that hold an invalid frame are left out, unless the clip has no other: then the best ones stay.
+    A clip shorter than the window has one, which starts at 0.
+    """
+    if len(good) <= frames:
+        return np.zeros(1 if good.any() else 0, dtype=np.int64)
+    total = np.concatenate([[0], np.cumsum(good)])
+    count = total[frames:] - total[:-frames]
+    best = count.max()
+    return np.flatnonzero(count == best) if best else np.zeros(0, dtype=np.int64)
+
+
+def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
+    """First frames of clean whole windows, `stride` apart; an invalid frame is stepped over. good: (T,) bool
+
+    Raises:
+        ValueError: the stride is less than a frame.
+    """
+    require_whole("stride", stride, 1)
+    starts, start = [], 0
+    while start + frames <= len(good):
+        bad = np.flatnonzero(~good[start : start + frames])
+        if len(bad):
+            start += int(bad[-1]) + 1
+        else:
+            starts.append(start)
+            start += stride
+    return np.array(starts, dtype=np.int64)
 
 
 def fixed_windows(store: MemoryStore, frames: int, stride: int, pad: bool = False) -> WindowIndex:

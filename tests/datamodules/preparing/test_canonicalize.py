@@ -15,8 +15,7 @@ from magnet.body import load_body
 from magnet.datamodules.fakes.motion import UP, made_up_body, people, turned
 from magnet.datamodules.preparing import check_motion
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
-from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import read_amc
+from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.recording import DataError
 from magnet.motion.resample import resample_rotations, resample_valid, times
 from magnet.motion.runs import true_runs

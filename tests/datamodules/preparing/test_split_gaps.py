@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from magnet.datamodules.preparing.split_gaps import YOURS, split_gaps
+from magnet.datamodules.preparing.check import YOURS, split_gaps
 
 FULL = {"train": {2: 9, 3: 4}, "val": {2: 1, 3: 1}, "test": {2: 2, 3: 1}}
 

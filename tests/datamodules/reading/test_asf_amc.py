@@ -11,9 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
-from magnet.datamodules.reading.asf import read_asf
-from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, together
-from magnet.datamodules.reading.cmu_glitches import repaired
+from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, read_asf, together
+from magnet.datamodules.reading.cmu_joints import repaired
 from magnet.motion.runs import true_runs
 from tests.datamodules.slow_cmu import slow_ends
 

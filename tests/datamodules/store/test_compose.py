@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.datamodules.options import Augmentation, HeldOutScenes
-from magnet.datamodules.store.compose import place_apart
+from magnet.datamodules.store.memory import place_apart
 from magnet.motion.frames import inverse
 from magnet.motion.scene import Scene, concatenate
 from magnet.testing import random_scene

@@ -39,7 +39,7 @@ def test_mapped_training_windows_are_those_from_memory(store):
 
 def test_memory_holds_only_the_index(store):
     mapped = data(store).store("train")
-    held = mapped.slot_order.nbytes + mapped.part.betas.nbytes
+    held = mapped.part.slot_order.nbytes + mapped.part.betas.nbytes
     assert not hasattr(mapped, "tensors") and held < 200 * len(mapped.names)
     assert all(isinstance(shard, np.memmap) for shard in mapped.part.maps.values())
     for batch in data(store, read_ahead=0).train_dataloader():

@@ -15,7 +15,7 @@ from magnet.datamodules.options import Augmentation
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
-from magnet.datamodules.store.mapped import MappedStore, SplitData
+from magnet.datamodules.store.mapped import MappedStore
 from magnet.datamodules.store.reader import StoreReader
 from magnet.datamodules.store.rows import ROW
 from magnet.datamodules.store.windows import RandomWindows
@@ -177,7 +177,7 @@ def test_shares_are_a_function_of_seed_epoch_sample_rank_and_world(store):
 def test_too_few_clips_are_drawn_from_by_everybody(store):
     mapped = data(store).store("train")
     assert mapped.owners(np.ones(len(mapped.names)), 100) is None
-    alone = MappedStore(SplitData.stored(StoreReader(store), "train"), 2, spread=False)
+    alone = MappedStore(StoreReader(store).split("train"), 2, spread=False)
     assert alone.owners(np.ones(len(mapped.names)), 2) is None
     owners = mapped.owners(mapped.length / mapped.length.sum(), 2)
     assert owners is not None and owners.tolist() == [0] * 6 + [1] * 6
