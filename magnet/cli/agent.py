@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from magnet.motion.scene import Scene
 
 EPILOG = """\
-START is a scene of everybody, the same for all processes: a second is enough. Each process generates one agent of it
-(or plays a recording, --play) and hears the others by ZeroMQ. What is lost or late is unknown to the model, and filled
-in when it comes. docs/agents.md describes the message, for programs of other kinds. Addresses of other machines need
+START is a scene of all agents, the same for all processes; a second of motion is enough. Each process generates one
+agent (or plays a recording, --play) and receives the others by ZeroMQ. Tokens that are lost or late are unknown to the
+model until they arrive. docs/agents.md describes the message, for other programs. Addresses of other machines need
 keys: `--make_keys --keys FOLDER --name A` writes A.key, which the others need, and A.key_secret, which stays here.
 
 for example, in two terminals:
@@ -35,22 +35,22 @@ def parser() -> argparse.ArgumentParser:
     options = PlainParser("agent", __doc__, EPILOG)
     add = options.add_argument
     add("--name", required=True, help="which agent this process is")
-    add("--scene", metavar="START", help="scene that it begins with, of everybody")
+    add("--scene", metavar="START", help="scene of all agents to start from")
     add("--names", metavar="A,B", help="all agents, in the order of the scene's slots (default: A, B, C ...)")
-    add("--listen", metavar="ADDRESS", help="where the others hear it, such as tcp://127.0.0.1:5601")
-    add("--connect", action="append", default=[], metavar="NAME=ADDRESS", help="where another is heard; repeated")
+    add("--listen", metavar="ADDRESS", help="where the others receive from it, such as tcp://127.0.0.1:5601")
+    add("--connect", action="append", default=[], metavar="NAME=ADDRESS", help="where another sends from; repeated")
     add("--task", choices=("agentic_sync", "agentic_async"), default="agentic_sync", help="in step, or in turns")
     add("--model", default=None, metavar="NAME", help="shipped model or checkpoint")
     add("--steps", type=int, default=4, help="denoising steps (default: %(default)s)")
     add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
     add("--seed", type=int, default=0, help="of the noise, the same for all (default: %(default)s)")
     add("--play", metavar="FILE", help="play the motion in this file instead of generating any")
-    add("--person", type=int, default=0, help="who of that file (default: the first)")
+    add("--person", type=int, default=0, help="person of that file (default: the first)")
     add("--seconds", type=float, default=None, help="how long to take part (default: until interrupted)")
-    add("--pace", choices=("real", "others"), default="real", help="of the clock, or as soon as all have told")
+    add("--pace", choices=("real", "others"), default="real", help="by the clock, or as soon as all tokens are there")
     add("--patience", type=float, default=5.0, help="seconds to wait for a token with --pace others")
-    add("--meet", type=float, default=30.0, help="seconds to wait for the others to come (default: %(default)s)")
-    add("--keys", type=Path, metavar="FOLDER", help="CURVE keys; without them only this machine is spoken to")
+    add("--meet", type=float, default=30.0, help="seconds to wait for the others to connect (default: %(default)s)")
+    add("--keys", type=Path, metavar="FOLDER", help="folder of CURVE keys; without them only this machine is reached")
     add("--make_keys", action="store_true", help="write this agent's keys into --keys, and stop")
     add("--threads", type=int, default=1, help="threads of torch (default: %(default)s)")
     add("--out", type=Path, metavar="NPZ", help="write the agent's own motion")
@@ -59,12 +59,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: scenes, addresses or keys that cannot be used; says what to do.
-    """
+    """Run the command. Returns the exit code."""
     given = parser().parse_args(list(arguments))
     from magnet.agents import zeromq
 

@@ -11,6 +11,7 @@ import io
 import os
 import sys
 import tempfile
+from importlib.metadata import entry_points
 
 from magnet.cli import answers, data, task_list  # isort: split
 
@@ -38,7 +39,7 @@ def ship() -> None:
         SystemExit: plug-ins are installed, whose names would be among the answers.
     """
     path = answers.shipped()
-    if path is None:
+    if path is None or any(entry_points(group=group) for group in answers.PLUGINS):
         sys.exit(
             f"answers of the package alone cannot be made where {answers.VARIABLE} is set or plug-ins are installed"
         )

@@ -1,14 +1,12 @@
 """Answers that need no model, kept from one call to the next: importing Torch and Lightning takes seconds.
 
-What is kept belongs to the code that it was made from: this package, Lightning, the parser and all plug-ins. Where any
-of it has changed, everything is made anew; of the package outside the commands and the registries, what functions do
-inside says nothing here and may change. `make setup` makes all there are (`python -m magnet.cli.all_answers`), and a
-wheel brings those of the code in it, for each Python that they were made with (`make wheel`).
+Kept answers belong to exactly the code that made them: this package, Lightning, the parser, Python and all plug-ins.
+Where any of it has changed, everything is made anew. `make setup` makes all there are (`python -m
+magnet.cli.all_answers`), and a wheel brings those of its own code, for each Python that made them (`make wheel`).
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import functools
 import hashlib
@@ -31,8 +29,6 @@ WIDTHS = (80, 100, 120)
 """Columns that answers are written for: the most that fit into the terminal."""
 KEPT = 4
 """Files of answers: of as many versions or copies of the code."""
-OUTLINES = "outlines.json"
-"""Digests of files' outlines by those of their code: to read 47,000 lines takes a second."""
 OURS = Path(__file__).parents[1]
 """Where this package's code lies."""
 FRESH = "torch" not in sys.modules
@@ -49,8 +45,7 @@ def recall(name: str) -> Any:
     """What came with the package or was kept under a name; None where nothing was, or where the code has changed."""
     if not FRESH:
         return None
-    brought = any((OURS / "cli").glob("answers-*.json"))  # else there is no need to read all code for its digest
-    found = _read(shipped()).get(name) if brought else None
+    found = _read(shipped()).get(name)
     return _read(place()).get(name) if found is None else found
 
 
@@ -108,22 +103,12 @@ def columns(number: int) -> Iterator[None]:
 
 def place() -> Path | None:
     """The file of all answers of this code; None where the code cannot be told, as with tasks out of a variable."""
-    if os.environ.get(VARIABLE):
-        return None
-    return folder() / f"answers-{code_digest()}.json"
+    return None if os.environ.get(VARIABLE) else folder() / f"answers-{code_digest()}.json"
 
 
-@functools.cache
 def shipped() -> Path | None:
-    """The file inside the package of all answers of exactly this code; None where plug-ins may change them."""
-    if os.environ.get(VARIABLE) or any(entry_points(group=group) for group in PLUGINS):
-        return None
-    digest = _packages()
-    digest.update("python {}.{}".format(*sys.version_info).encode())
-    for file in sorted(OURS.rglob("*.py")):
-        digest.update(f"{file.relative_to(OURS)}\n".encode())
-        digest.update(file.read_bytes())
-    return OURS / "cli" / f"answers-{digest.hexdigest()}.json"
+    """The file of all answers of this code inside the package, where it is found while no plug-in changes them."""
+    return None if os.environ.get(VARIABLE) else OURS / "cli" / f"answers-{code_digest()}.json"
 
 
 def folder() -> Path:
@@ -133,44 +118,20 @@ def folder() -> Path:
 
 @functools.cache
 def code_digest() -> str:
-    """Of all code that answers depend on: ours and plug-ins' by their files, packages by their versions."""
-    digest = _packages()
+    """Of all code that answers depend on: ours and plug-ins' by their files, packages and Python by their versions."""
+    digest = hashlib.blake2b("python {}.{}\n".format(*sys.version_info).encode(), digest_size=12)
+    for package in ("lightning", "jsonargparse"):
+        digest.update(f"{package} {version(package)}\n".encode())
     folders = {OURS}
     for group in PLUGINS:
         for point in entry_points(group=group):
             digest.update(f"{point.group} {point.name} {point.value}\n".encode())
             folders |= _home(point)
-    before, now = _read(folder() / OUTLINES), {}
     for home in sorted(folders):
         for file in sorted(home.rglob("*.py")) if home.is_dir() else [home]:
-            code = file.read_bytes()
-            if home == OURS and file.parent.name != "cli" and file.name != "registry.py":
-                key = hashlib.blake2b(code, digest_size=12).hexdigest()
-                now[key] = before.get(key) or hashlib.blake2b(outline(code).encode(), digest_size=12).hexdigest()
-                code = now[key].encode()
             digest.update(f"{file.relative_to(home)}\n".encode())
-            digest.update(code)
-    if now.keys() != before.keys():
-        with contextlib.suppress(OSError):
-            _write(folder() / OUTLINES, now)
+            digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-def outline(code: bytes) -> str:
-    """A module's code less what its functions do: their bodies but for docstrings."""
-    module = ast.parse(code)
-    for node in ast.walk(module):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            node.body = node.body[:1] if ast.get_docstring(node, clean=False) is not None else []
-    return ast.dump(module)
-
-
-def _packages() -> hashlib.blake2b:
-    """Begins a digest with the versions of the packages that answers depend on."""
-    digest = hashlib.blake2b(digest_size=12)
-    for package in ("lightning", "jsonargparse"):
-        digest.update(f"{package} {version(package)}\n".encode())
-    return digest
 
 
 def _home(point: EntryPoint) -> set[Path]:

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
 
 EPILOG = """\
-ms/eval is one run of the network on the whole batch; floor is its matrix products alone, timed in the same round, and
-x floor the ratio, which is what other machines and other days can be compared by. first is the time until the first
-frames. live is a partner who answers token by token, against the clock of the motion. --task.NAME VALUE sets an
-option of the tasks that have one of that name (magnet tasks lists them).
+ms/eval is one run of the network on the whole batch. "floor" is its matrix products alone, timed in the same round;
+compare other machines and days by the ratio, "x floor". "first" is the time until the first frames. "live" is a partner
+who answers token by token in real time. --task.NAME VALUE sets an option of all tasks that have it (magnet tasks lists
+them).
 
 for example:
   magnet bench --quick
@@ -49,12 +49,12 @@ def parser() -> argparse.ArgumentParser:
     add("--people", type=int, action="append", default=[], metavar="P", help="may be repeated (default: 1 to 4)")
     add("--batch", type=int, action="append", default=[], metavar="B", help="scenes at once (default: 1 and 10)")
     add("--quick", action="store_true", help="two people, batch 1, ten seconds live")
-    add("--frames", type=int, default=32, help="frames that are sampled (default: %(default)s)")
-    add("--rounds", type=int, default=3, help="medians are over so many (default: %(default)s)")
-    add("--sampler", default="default", metavar="PRESET", help="how is sampled (default: %(default)s)")
+    add("--frames", type=int, default=32, help="frames to sample (default: %(default)s)")
+    add("--rounds", type=int, default=3, help="rounds to take medians over (default: %(default)s)")
+    add("--sampler", default="default", metavar="PRESET", help="sampler preset (default: %(default)s)")
     add("--steps", type=int, default=None, help="denoising steps (default: the sampler's)")
     add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
-    add("--live", type=float, default=None, metavar="SECONDS", help="of live answers (default: 60); 0: none")
+    add("--live", type=float, default=None, metavar="SECONDS", help="seconds of live answers (default: 60); 0: none")
     add("--threads", type=int, default=None, help="threads of torch (default: its own choice)")
     add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: seconds of this process, for a busy machine")
     add("--device", default="cpu", help="where it runs (default: %(default)s)")
@@ -64,12 +64,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: no such model, task or preset; says what there is.
-    """
+    """Run the command. Returns the exit code."""
     taken, others = taken_out(arguments, r"--task\.")
     of_tasks = {words[0].removeprefix("--task.").partition("=")[0]: words for words in taken}
     given = parser().parse_args(others)

@@ -40,7 +40,7 @@ class Arguments:
 
     @classmethod
     def split(cls, arguments: Iterable[str]) -> Arguments:
-        """Take the configuration files out, so that they can go first and any flag beats any file.
+        """Take the configuration files out, so that they go first and any flag beats any file.
 
         Raises:
             CommandError: as `read_layers`.

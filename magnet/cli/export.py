@@ -64,12 +64,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: files that cannot be read or written; says what to do.
-    """
+    """Run the command. Returns the exit code."""
     options = parser().parse_args(list(arguments))
     from magnet.body import on_floor
     from magnet.export import formats

@@ -21,13 +21,7 @@ for example:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: another suffix, or no such checkpoint.
-        ImportError: a package is missing; says which.
-        ValueError: a model that cannot be exported.
-    """
+    """Run the command. Returns the exit code."""
     parser = PlainParser("export-model", __doc__, EPILOG)
     parser.add_argument("out", metavar="OUT.onnx", help="file to write; two more lie beside it")
     parser.add_argument("--ckpt_path", metavar="FILE", help="a checkpoint, or a model by name (default: duet)")

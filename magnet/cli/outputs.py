@@ -52,7 +52,7 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
 
 
 def cost(stats: dict[str, float]) -> str:
-    """What sampling cost, in a line."""
+    """One line on what sampling cost."""
     calls, evaluations = stats["calls"], stats["evaluations"]
     return f"sampling: {calls:.0f} network calls a batch, {evaluations:.0f} denoiser evaluations a scene"
 

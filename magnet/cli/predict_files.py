@@ -60,16 +60,14 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument_group("what is sampled").add_argument
     add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
     add("--task.FIELD", metavar="VALUE", help="an option of the task")
-    add(
-        "--people", type=int, metavar="P", help="how many in all, up to 200; those without a file are made from nothing"
-    )
+    add("--people", type=int, metavar="P", help="people in all, up to 200; those without a file are generated")
     add("--spacing", type=float, default=3.0, metavar="M", help="metres between the groups of a crowd (default: 3)")
     add("--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)")
     frames = f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})"
     add("--frames", type=int, metavar="T", help=frames)
-    add("--samples", type=int, default=1, metavar="S", help="so many answers (default: %(default)s)")
+    add("--samples", type=int, default=1, metavar="S", help="samples (default: %(default)s)")
     add = options.add_argument_group("how").add_argument
-    add("--seed", type=int, default=1111, help="all noise follows from it (default: %(default)s)")
+    add("--seed", type=int, default=1111, help="seed of all noise (default: %(default)s)")
     add("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
     add("--sampler", metavar="PRESET", help="default, plain, steady or paper")
     add("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
@@ -81,12 +79,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: files that cannot be read or written, or on which the task makes no sense; says what to do.
-    """
+    """Run the command. Returns the exit code."""
     if meant(arguments) and arguments[0].startswith("--help"):
         parser().print_help()
         return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,8 @@ from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from magnet.body import Body
     from magnet.motion.scene import Scene
 
@@ -41,25 +43,19 @@ def parser() -> argparse.ArgumentParser:
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
     add("--poses", choices=("correct", "keep"), default="correct", help=poses)
-    slides = "low toes slower than so many m/s are to stand still; 0: feet may slide (default: %(default)s)"
+    slides = "low toes slower than this, in m/s, shall stand still; 0: feet may slide (default: %(default)s)"
     add("--slides", type=float, default=0.6, metavar="SPEED", help=slides)
     add("--plot", metavar="SVG", help="draw depths, feet and hands over time, before and after")
     return options
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: an option that makes no sense.
-        ValueError: files that cannot be read or written; says what to do.
-    """
+    """Run the command. Returns the exit code."""
     options = parser().parse_args(list(arguments))
     from pathlib import Path
 
     from magnet.body.apart import APART
     from magnet.body.repair import fixed_agents, moved_apart, repaired
-    from magnet.cli import refine_plot
     from magnet.export import formats
 
     out = scene_files.path_to_write(options.out)
@@ -85,14 +81,14 @@ def main(arguments: Sequence[str] = ()) -> int:
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
         plot = Path(options.plot)
-        before, after = (refine_plot.by_frame(scene, got.body) for scene in (got.scene, refined))
-        plot.write_text(refine_plot.drawn(before, after, got.scene.fps), encoding="utf-8")
+        before, after = (by_frame(scene, got.body) for scene in (got.scene, refined))
+        plot.write_text(drawn(before, after, got.scene.fps), encoding="utf-8")
         scene_files.say_written([plot])
     return 0
 
 
 def told(scene: Scene, body: Body) -> str:
-    """How deep people are in each other, how fast their low toes slide, and how many feet are off the floor."""
+    """One line on how deep bodies overlap, how fast low toes slide, and how many feet are off the floor."""
     import torch
 
     from magnet.body.joints import FEET, TOES
@@ -117,3 +113,63 @@ def told(scene: Scene, body: Body) -> str:
         f"deepest {100 * float(worst.max()):.1f} cm, frames {shares}; low toes slide at {speed:.2f} m/s; feet in the "
         f"air {air:.1f} %, in the floor {under:.1f} %"
     )
+
+
+WIDTH, HEIGHT, LEFT, GAP = 900, 120, 70, 42
+"""Pixels of the picture and of one strip of it, of the margin and between strips."""
+
+
+def by_frame(scene: Scene, body: Body) -> dict[str, Tensor]:
+    """What is marked on bodies, in each frame of the first scene: by title, (T,)."""
+    import torch
+
+    from magnet.body.joints import FEET
+    from magnet.metrics import hand_distance
+    from magnet.metrics.body_depth import deepest
+    from magnet.metrics.skating import toe_steps
+
+    one = scene.select([0])
+    joints = body.joints(one)[0][:, one.present[0]]  # (T, P, 22, 3)
+    depth, hands = joints.new_zeros(len(joints)), joints.new_zeros(len(joints))
+    for i, j in combinations(range(joints.shape[1]), 2):
+        depth = torch.maximum(depth, deepest(joints[:, i], joints[:, j])[:, 0])
+        hands = hands + (hand_distance(joints[:, i], joints[:, j]) < 0.2)
+    speed, stands = toe_steps(joints[None], scene.fps)
+    slides = torch.where(stands[0], speed[0], 0.0).flatten(1).amax(dim=1)
+    lowest = joints[..., FEET, 1].amin(dim=-1)
+    return {
+        "depth between people, cm": 100 * depth,
+        "fastest standing toe, m/s": torch.nn.functional.pad(slides, (1, 0)),
+        "highest lower foot, cm": 100 * lowest.amax(dim=1),
+        "deepest foot in the floor, cm": 100 * (-lowest.amin(dim=1)).clamp_min(0),
+        "people hand in hand, pairs": hands,
+    }
+
+
+def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float) -> str:
+    """The picture as SVG: one strip for each title, before in red and after in green."""
+    from magnet.export.page.palette import COLLIDES, STANDS, hexed
+
+    parts = []
+    for row, title in enumerate(before):
+        top = GAP + row * (HEIGHT + GAP)
+        most = max(float(before[title].max()), float(after[title].max()), 1e-3)
+        parts.append(f'<text x="{LEFT}" y="{top - 8}">{title}</text>')
+        parts.append(f'<text x="{LEFT - 6}" y="{top + 10}" text-anchor="end">{most:.3g}</text>')
+        parts.append(f'<text x="{LEFT - 6}" y="{top + HEIGHT}" text-anchor="end">0</text>')
+        parts.append(f'<rect x="{LEFT}" y="{top}" width="{WIDTH - LEFT - 10}" height="{HEIGHT}" class="frame"/>')
+        for name, values in (("before", before[title]), ("after", after[title])):
+            across = (WIDTH - LEFT - 10) / max(len(values) - 1, 1)
+            heights = (top + HEIGHT - HEIGHT * values.clamp(0, most) / most).tolist()
+            points = " ".join(f"{LEFT + across * t:.1f},{y:.1f}" for t, y in enumerate(heights))
+            parts.append(f'<polyline points="{points}" class="{name}"/>')
+    bottom = GAP + len(before) * (HEIGHT + GAP)
+    seconds = len(next(iter(before.values()))) / fps
+    parts.append(f'<text x="{LEFT}" y="{bottom - 16}">0 to {seconds:.1f} s; red: before, green: after</text>')
+    red, green = hexed(COLLIDES), hexed(STANDS)
+    style = (
+        "text{font:13px sans-serif;fill:#333} .frame{fill:#fafafa;stroke:#ccc} polyline{fill:none;stroke-width:1.6}"
+        f" .before{{stroke:{red}}} .after{{stroke:{green}}}"
+    )
+    size = f'width="{WIDTH}" height="{bottom}" viewBox="0 0 {WIDTH} {bottom}"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}><style>{style}</style>{"".join(parts)}</svg>\n'

@@ -31,10 +31,10 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path("runs/report"),
         metavar="FOLDER",
-        help="of cells and page (default: %(default)s)",
+        help="folder for cells and page (default: %(default)s)",
     )
     add("--budget", choices=("tiny", "small", "paper"), default="small", help="of every cell (default: %(default)s)")
-    add("--ckpt_path", default="duet", metavar="MODEL", help="our row's weights (default: %(default)s)")
+    add("--ckpt_path", default="duet", metavar="MODEL", help="weights of our row (default: %(default)s)")
     add("--data", default="salsa", help="scenes of two people: salsa, synthetic2, or a file (default: %(default)s)")
     add("--configs", type=Path, default=Path("configs/report"), help="of trainings (default: %(default)s)")
     add("--shipped", action="store_true", help="leave out rows that would have to be trained")
@@ -45,11 +45,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code: 1 where a cell could not be done.
-
-    Raises:
-        ValueError: no such table.
-    """
+    """Run the command. Returns the exit code: 1 where a cell could not be done."""
     given = parser().parse_args(list(arguments))
     from magnet.cli import run_folder
     from magnet.cli.train import quiet, run_trainer

@@ -8,17 +8,17 @@ import subprocess
 import sys
 import time
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from magnet.cli.checkpoint_config import CONFIG_KEY
+from magnet.cli.doctor import version_of
 from magnet.cli.errors import CommandError
 from magnet.version import __version__
 
@@ -90,10 +90,6 @@ def progress_bar(sampling: bool = False) -> ProgressBar:
     if sampling:
         return SamplingProgress()
     return RichProgressBar() if sys.stdout.isatty() else ProgressLines()
-
-
-def learning_rate() -> Callback:
-    return LearningRateMonitor(logging_interval="step")
 
 
 class ProgressLines(ProgressBar):
@@ -260,16 +256,9 @@ def provenance() -> dict[str, Any]:
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "magnet": __version__,
         "python": sys.version.split()[0],
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {name: version_of(name) for name in PACKAGES},
         "git": git_state(Path(__file__).parents[1]),
     }
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:

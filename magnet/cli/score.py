@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 FILES are submissions to the benchmark "CMU salsa duets" (docs/benchmark.md says what they hold): npz files with the
-joints that a method makes of each test scene. Several are compared in one table for each task, beside baselines,
-recordings and, as a floor, real training windows in place of samples. Recordings come from
+joints that a method predicts for each test scene. Each task gets one table of all submissions, baselines, recordings
+and, as a lower bound, real training windows in place of samples. Get the recordings with
 `magnet data download cmu --subjects 60,61 FOLDER`.
 
 for example:
@@ -39,20 +39,15 @@ def parser() -> argparse.ArgumentParser:
     add("--inputs", type=Path, metavar="FILE", help="write what a method may read of the test scenes, then stop")
     add("--example", type=Path, metavar="FILE", help="write a submission by --method, then stop")
     add("--method", default="NN", help="NN, RS, zero_velocity, ridge or a model's checkpoint (default: %(default)s)")
-    add("--task", default="joint_future", help="of --inputs and --example (default: %(default)s)")
-    add("--samples", type=int, default=None, metavar="S", help="of --example: as many as the benchmark has, or 1")
-    add("--sampler", default="default", metavar="PRESET", help="of --example by a model (default: %(default)s)")
-    add("--seed", type=int, default=1111, help="of --example and of baselines (default: %(default)s)")
+    add("--task", default="joint_future", help="task of --inputs and --example (default: %(default)s)")
+    add("--samples", type=int, default=None, metavar="S", help="of --example: the benchmark's number, or 1")
+    add("--sampler", default="default", metavar="PRESET", help="sampler of --example by a model (default: %(default)s)")
+    add("--seed", type=int, default=1111, help="seed of --example and of baselines (default: %(default)s)")
     return options
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: nothing to do, or an option that makes no sense.
-        ValueError: a file that is no submission, or recordings that are others; says what to do.
-    """
+    """Run the command. Returns the exit code."""
     given = parser().parse_args(list(arguments))
     if not given.files and given.inputs is None and given.example is None:
         raise CommandError("nothing to score: name files, or write one with --example FILE; see magnet score --help")

@@ -14,7 +14,7 @@ from typing import Any, Literal
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's calls, not ours
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from magnet import checkpoints
@@ -195,7 +195,7 @@ class MagnetCLI(LightningCLI):
                 "--full", action="store_true", help="print all that was measured, with intervals, not the main numbers"
             )
         if self.command == "predict":
-            parser.add_argument("--pictures", type=int, default=1, help="so many of the first scenes are drawn")
+            parser.add_argument("--pictures", type=int, default=1, help="number of scenes to draw, from the first")
             parser.add_argument(
                 "--picture",
                 type=Literal["mp4", "gif", "webp", "none"],
@@ -249,7 +249,7 @@ class MagnetCLI(LightningCLI):
         if logger is None or logger is True:
             logger = run_folder.loggers(self.folder, self._option("wandb"), fit)
             if fit and logger:
-                callbacks.append(run_folder.learning_rate())
+                callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
             callbacks.append(Duration())
         if not fit and config.get("enable_checkpointing") is None:

@@ -35,49 +35,33 @@ over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:loc
 def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
-    parser.add_argument(
-        "files", nargs="*", metavar="FILE", help="scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
-    )
-    look = parser.add_argument_group("what is shown")
-    look.add_argument(
-        "--truth", metavar="FILE", help="a scene shown as ghosts in each of the others; without it there are none"
-    )
-    look.add_argument(
-        "--context",
-        type=int,
-        default=0,
-        metavar="N",
-        help="first frames that a model was given, in files that do not say",
-    )
-    look.add_argument("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
-    look.add_argument("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
-    look.add_argument(
-        "--style", choices=("body", "light", "capsules", "skeleton"), help="default: body, light for crowds"
-    )
-    look.add_argument(
-        "--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU"
-    )
-    look.add_argument("--html", metavar="OUT.html", help="write a page of its own that plays all of it, and end")
-    live = parser.add_argument_group("generating")
-    live.add_argument("--live", action="store_true", help="a model generates while you watch")
-    live.add_argument(
-        "--record", metavar="OUT.npz", help="continue FILE once, keep the steps of its denoising, and watch these"
-    )
-    live.add_argument("--frames", type=int, default=64, metavar="N", help="frames that --record adds (default: 64)")
-    live.add_argument("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
-    live.add_argument("--task", default="joint_future", help="task to begin with (default: %(default)s)")
-    live.add_argument(
-        "--people", type=int, metavar="N", help="so many people from nothing (default: a couple that comes along)"
-    )
-    live.add_argument("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
-    live.add_argument(
-        "--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)"
-    )
-    live.add_argument("--seed", type=int, default=1, help="of the sampling (default: %(default)s)")
-    web = parser.add_argument_group("where")
-    web.add_argument("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
-    web.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
-    web.add_argument("--no_browser", action="store_true", help="only say where it is")
+    files = "scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
+    parser.add_argument("files", nargs="*", metavar="FILE", help=files)
+    add = parser.add_argument_group("what is shown").add_argument
+    add("--truth", metavar="FILE", help="a scene to show as ghosts in each of the others (default: none)")
+    context = "first frames that a model was given, in files that do not say"
+    add("--context", type=int, default=0, metavar="N", help=context)
+    add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
+    add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
+    styles = ("body", "light", "capsules", "skeleton")
+    add("--style", choices=styles, help="default: body, light for crowds")
+    add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
+    add("--html", metavar="OUT.html", help="write a self-contained page that plays everything, and stop")
+    add = parser.add_argument_group("generating").add_argument
+    add("--live", action="store_true", help="a model generates while you watch")
+    record = "continue FILE once, keep the steps of its denoising, and watch these"
+    add("--record", metavar="OUT.npz", help=record)
+    add("--frames", type=int, default=64, metavar="N", help="frames that --record adds (default: 64)")
+    add("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
+    add("--task", default="joint_future", help="task to begin with (default: %(default)s)")
+    add("--people", type=int, metavar="N", help="people to generate from nothing (default: an example couple)")
+    add("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
+    add("--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)")
+    add("--seed", type=int, default=1, help="seed of the sampling (default: %(default)s)")
+    add = parser.add_argument_group("where").add_argument
+    add("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
+    add("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
+    add("--no_browser", action="store_true", help="only say where it is")
     return parser.parse_args(words)
 
 
