@@ -39,16 +39,16 @@ def load(
     steps: int | None = None,
     sampler: str = "default",
 ) -> Model:
-    """A trained model: one of the package by its name ("duet"), a hub's ("hub:owner/name"), or a checkpoint's path.
+    """Load a trained model: a shipped one by name ("duet"), one of a hub ("hub:owner/name"), or a checkpoint's path.
 
     Args:
-        device: where it runs.
+        device: device to run on.
         steps: denoising steps; fewer are faster and coarser. None: the sampler's.
-        sampler: how it samples: `default`, as the model is best sampled, `plain`, or another of
-            `magnet.sampling.presets`, such as `paper` for the paper's way.
+        sampler: preset of the sampler: `default`, the best for the model, `plain`, or another of
+            `magnet.sampling.presets`, such as `paper` for the paper's sampling.
 
     Raises:
-        ValueError: no such model or sampler, which names those there are; or no such device here.
+        ValueError: no such model or sampler (the message lists them), or no such device.
         ImportError: a hub's model without huggingface_hub, `pip install "magnet-motion[hub]"`.
 
     >>> model = load("duet", steps=2)
@@ -71,11 +71,11 @@ def read(
     joints: dict[str, str] | None = None,
     keep_floor: bool = False,
 ) -> Motion:
-    """A scene from a file of ours, SMPL-X npz files or BVH files of any skeleton; several files are several people.
+    """Read a scene from our own file, SMPL-X npz files or BVH files of any skeleton; several files are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
-        fps: brought to this rate, the models'; None: as recorded.
+        fps: resample to this rate, by default the models'; None: as recorded.
         trim, unit, up, joints, keep_floor: as in `magnet.export.load_bvh`.
 
     Raises:
@@ -92,19 +92,19 @@ def read(
 
 @dataclass(frozen=True)
 class Motion(Scene):
-    """A scene that knows its body, and how to show and save itself; it can stand wherever a `Scene` can."""
+    """A scene with its body, which can show and save itself; usable wherever a `Scene` is."""
 
     model: Body | None = None  # the body model `betas` belong to; None: the open one
-    notes: tuple[str, ...] = ()  # what is worth knowing about how it was read
+    notes: tuple[str, ...] = ()  # notes on how it was read
 
     @classmethod
     def of(cls, scene: Scene, model: Body | None = None, notes: Sequence[str] = ()) -> Motion:
-        """The same motion with what this class adds."""
+        """A `Motion` of a scene."""
         fields = {**scene.tensors(), "fps": scene.fps, "body": scene.body, "names": scene.names}
         return cls(**fields, model=model, notes=tuple(notes))  # type: ignore[arg-type]
 
     def plain(self) -> Scene:
-        """The scene without what this class adds."""
+        """The plain `Scene`."""
         tensors = self.tensors()
         return Scene(**tensors, fps=self.fps, body=self.body, names=self.names)
 
@@ -117,7 +117,7 @@ class Motion(Scene):
         return self._body().vertices(self)
 
     def on_floor(self) -> Motion:
-        """The same motion with whoever stands lowest on y = 0, where models have their floor; each scene by itself."""
+        """The same motion with the lowest standing person on y = 0, the models' floor; for each scene separately."""
         return Motion.of(on_floor(self.plain(), self._body()), self.model, self.notes)
 
     def save(self, path: str | Path, **options: Any) -> Path:
@@ -126,7 +126,7 @@ class Motion(Scene):
         Options are those of `magnet.export.formats.write`: fps, unit, smplx, style, title.
 
         Returns:
-            The path written; the first of them where a format needs several files (a BVH a person).
+            The path written; the first one if a format needs several files (one BVH per person).
 
         Raises:
             ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
@@ -138,19 +138,19 @@ class Motion(Scene):
 
     @property
     def context(self) -> int:
-        """How many first frames were given of everybody."""
+        """Number of first frames that were given of everybody."""
         if self.given is None:
             return 0
         whole = (self.given | ~self.present[:, None]).all(dim=0).all(dim=1)
         return int(whole.long().cumprod(dim=0).sum())
 
     def show(self, scene: int | None = None, player: Player = "page", **options: Any) -> NotebookView:
-        """Something a notebook plays inline.
+        """A view that a notebook plays inline.
 
         Args:
-            scene: which of the B scenes; None: all, side by side.
-            player: `page`, an interactive player that works without a server, or `film`, an animated picture.
-            options: of `save` for that kind: style, title, fps.
+            scene: number of the scene to show; None: all B scenes, side by side.
+            player: `page`, an interactive player that needs no server, or `film`, an animated picture.
+            options: options of `save` for that kind: style, title, fps.
         """
         if player not in get_args(Player):
             raise ValueError(f"player: got {player!r}, expected {' or '.join(get_args(Player))}")
@@ -170,7 +170,7 @@ class Motion(Scene):
 
 @dataclass(frozen=True, repr=False)
 class NotebookView:
-    """A page or a film: notebooks play it inline, elsewhere `save` it."""
+    """A page or a film: notebooks play it inline; elsewhere `save` it."""
 
     data: bytes
     kind: str  # .html or .webp
@@ -196,11 +196,11 @@ class NotebookView:
 
 @dataclass(frozen=True)
 class Model:
-    """A trained model and how it samples.
+    """A trained model with its sampler.
 
     Every method takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
-    b * samples + s of the result, which includes the given frames. `cond` is what a model with conditions is told of
-    each scene, as in `magnet.generation.rollout.generate`; `sampler.guidance.cond_weight` says how strongly.
+    b * samples + s of the result, which includes the given frames. `cond` is the condition of each scene, for models
+    with conditions, as in `magnet.generation.rollout.generate`; `sampler.guidance.cond_weight` is its weight.
     """
 
     denoiser: Denoiser
@@ -225,7 +225,7 @@ class Model:
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
-        """A scene from nothing, of people of average shape; a crowd, of more than `most_people`, begins as couples.
+        """Generate a scene of people of average shape; a crowd of more than `most_people` begins as couples.
 
         Raises:
             ValueError: more than 200 people, or too few frames for a crowd.
@@ -241,7 +241,7 @@ class Model:
     def start_crowd(
         self, people: int, groups: Sequence[Scene] = (), spacing: float = SPACING, *, seed: int | None = None
     ) -> Motion:
-        """How a crowd begins, see `magnet.generation.crowd_start.start_crowd`: for `predict` to go on from."""
+        """The first frames of a crowd, for `predict` to continue; see `magnet.generation.crowd_start.start_crowd`."""
         return Motion.of(start_crowd(self.denoiser, people, self.sampler, self._generator(seed), groups, spacing))
 
     def continue_(
@@ -254,11 +254,11 @@ class Model:
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
-        """How a scene goes on for everybody in it.
+        """Continue a scene for everybody in it.
 
         Args:
-            context: how many of its last frames the model starts from; None: all of them. Rounded down to a multiple
-                of 4; the result begins with them.
+            context: number of its last frames to start from, rounded down to a multiple of 4; None: all of them. The
+                result begins with them.
 
         Raises:
             ValueError: fewer than 4 frames.
@@ -283,16 +283,16 @@ class Model:
         seed: int | None = None,
         samples: int = 1,
     ) -> Motion:
-        """The whole motion of some agents, given all of the others'; nothing of their own motion in `scene` is read.
+        """Generate the whole motion of some agents, given all of the others'; their own motion in `scene` is not read.
 
         An agent who is not in the scene is added: `inpaint(solo, agent=1)` gives a person a partner.
 
         Args:
-            shape: their body's (10,) shape numbers, zeros for an average one. None: agents of the scene keep the
-                shape that they have there, which is read; who is added is of average shape.
+            shape: (10,) shape numbers of their bodies, zeros for an average one. None: agents of the scene keep their
+                shape; added agents have the average shape.
 
         Raises:
-            ValueError: no such agent, nobody left to be given, or a shape that is none.
+            ValueError: no such agent, nobody else in the scene, or a shape of the wrong size.
         """
         require_rate(scene)
         targets = _slots("agent", agent)
@@ -315,16 +315,16 @@ class Model:
     def react(
         self, scene: Scene, agent: int = 0, *, context: int = 32, seed: int | None = None, samples: int = 1
     ) -> Motion:
-        """An agent's answer, from its first `context` frames on, to what the others do up to each moment."""
+        """Generate an agent's reaction, from frame `context` on, to the others' motion up to each moment."""
         target = _slots("agent", agent)
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=target)
 
     def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> Partner:
-        """Agents who answer live: `partner(past).answer(frames)` with the others' newest frames, 4 or more at a time.
+        """Agents who react live: call `partner(past).answer(frames)` with the others' newest frames, at least 4 at once.
 
         Args:
-            past: how it began, of everybody; a second is enough.
-            agents: slots of those who answer.
+            past: recent motion of everybody; a second is enough.
+            agents: slots of the agents who react.
 
         Raises:
             ValueError: as `magnet.generation.partner.Partner`.
@@ -344,7 +344,7 @@ class Model:
         cond: Tensor | None = None,
         **fields: Any,
     ) -> Motion:
-        """Sample any task; see `magnet tasks`, and `fields` are its own.
+        """Sample any task with its options `fields`; `magnet tasks` lists both.
 
         Args:
             context: frames given of everybody at the start, a multiple of 4.

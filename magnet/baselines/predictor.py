@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from magnet.baselines.retrieval import Retrieval
 from magnet.body import Body
 from magnet.motion.scene import Scene, concatenate
 
@@ -81,3 +82,35 @@ class JointBaseline:
         with torch.autocast(scene.device.type, enabled=False):
             made = self.method(scene.slice(0, self.context), self.horizon)
         return made.expand(samples, *made.shape)
+
+
+class RandomSample(Retrieval):
+    """Each sample continues as another random training stretch with as many people; see `Retrieval`."""
+
+    def __call__(
+        self, context: Scene, horizon: int, samples: int = 1, generator: torch.Generator | None = None
+    ) -> Scene:
+        """-> (B * samples, horizon, P), sample s of scene b at b * samples + s."""
+        self.check(context, horizon)
+        chosen = []
+        for people in context.present.sum(dim=1).tolist():
+            among = self.candidates(people)
+            device = torch.device("cpu") if generator is None else generator.device
+            drawn = torch.randint(len(among), (samples,), generator=generator, device=device)
+            chosen.append(among[drawn.to(among.device)])
+        return self.answer(context.repeat(samples), horizon, torch.cat(chosen))
+
+
+class HoldPose:
+    """Everybody stands still from the last context frame on."""
+
+    def __call__(
+        self, context: Scene, horizon: int, samples: int = 1, generator: torch.Generator | None = None
+    ) -> Scene:
+        """-> (B * samples, horizon, P), sample s of scene b at b * samples + s; draws nothing from `generator`."""
+        last = context.slice(context.frames - 1).repeat(samples)
+        return last.replace(
+            body_rot=last.body_rot.expand(-1, horizon, -1, -1, -1, -1).clone(),
+            T_world_root=last.T_world_root.expand(-1, horizon, -1, -1, -1).clone(),
+            valid=None,
+        )

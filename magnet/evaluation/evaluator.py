@@ -15,8 +15,19 @@ from magnet.datamodules.base import MotionDataModule
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.token_model import TokenModel
 from magnet.evaluation.results import Results
-from magnet.evaluation.scoring import CONFIDENCE, TRAINING, TRUTH, UNALIGNED, Scoring, Sight, generators_of, planned
-from magnet.evaluation.worlds import aligned, in_slots, shared_world
+from magnet.evaluation.scoring import (
+    CONFIDENCE,
+    TRAINING,
+    TRUTH,
+    UNALIGNED,
+    Scoring,
+    Sight,
+    aligned,
+    generators_of,
+    in_slots,
+    planned,
+    shared_world,
+)
 from magnet.generation.conditioning import occupied
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats

@@ -18,10 +18,10 @@ from magnet.baselines.windows import moved_points
 from magnet.body import Body
 from magnet.datamodules.base import MotionDataModule
 from magnet.evaluation.results import Results
-from magnet.evaluation.worlds import shared_world
 from magnet.generation.conditioning import occupied
 from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
 from magnet.metrics.interval import Unit, independent_units
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.grid import planning_grid
@@ -29,6 +29,32 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
 from magnet.tasks.base import Task
+
+
+def in_slots(scene: Scene, slots: int) -> Scene:
+    """The same people in so many slots: free ones are added behind, or left out."""
+    if slots < scene.agents:
+        return scene.permute_agents(torch.arange(slots, device=scene.device))
+    return scene.pad_agents(slots)
+
+
+def aligned(scene: Scene, frame: int) -> Scene:
+    """The same motion in a world that all test scenes share: see `shared_world`."""
+    return scene.transformed(shared_world(scene, frame))
+
+
+def shared_world(scene: Scene, frame: int) -> Tensor:
+    """T_shared_world, with the origin between the people and facing as agent 0 does. -> (B, 1, 1, 4, 4)
+
+    Both are taken at one frame, the last recorded one, so that positions of different scenes can be compared.
+    """
+    yaw, ground = to_planar(canonical_frame(scene.T_world_root)[:, frame])  # (B, P), (B, P, 2)
+    there = scene.present[..., None].to(ground)
+    middle = (ground * there).sum(dim=1) / there.sum(dim=1).clamp_min(1)
+    first = scene.present.int().argmax(dim=1)
+    facing = yaw.gather(1, first[:, None])[:, 0]
+    return inverse(from_planar(facing, middle))[:, None, None]
+
 
 TRUTH, TRAINING = "ground truth", "training set"
 """The rows of the recorded futures, and of training windows in place of samples."""

@@ -1,4 +1,4 @@
-"""What leaves the project and comes back: moving and still pictures, and files other tools read and write."""
+"""Export and import: pictures, films, and files that other tools read and write."""
 
 from magnet.export.bvh import save_bvh
 from magnet.export.drawing import Camera

@@ -1,4 +1,4 @@
-"""How files for engines name and hang their bones."""
+"""Names and hierarchy of bones in files for game engines."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LIMBS: dict[str, tuple[str, str]] = {
     "elbow": ("LowerArm", "ForeArm"),
     "wrist": ("Hand", "Hand"),
 }
-"""SMPL-X's joint and what the bone that begins there is called: by VRM's humanoid (Unity's as well), and by Mixamo."""
+"""SMPL-X's joint, and the name of the bone that begins there in VRM's humanoid (and Unity), and in Mixamo."""
 
 
 def bone_names(names: Names) -> tuple[str, ...]:
@@ -54,13 +54,13 @@ def _renamed(joint: str, names: Names) -> str:
 
 @dataclass(frozen=True)
 class BoneOptions:
-    """How people hang in a GLB.
+    """How bones are named and arranged in GLB, FBX and USD files.
 
     Args:
-        names: of bones: SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's.
-        root: `floor`: a bone `root` on the floor under the pelvis, which carries where somebody walks and faces, as
-            engines want it for root motion; `none`: the pelvis carries it.
-        clips: one animation for the `scene`, or one for each `person`, as engines want it that play people apart.
+        names: bone names of SMPL-X, of VRM's humanoid, which Unity also knows, or of Mixamo.
+        root: `floor`: a bone `root` on the floor under the pelvis carries place and heading, as engines expect for root
+            motion; `none`: the pelvis carries them.
+        clips: one animation for the whole `scene`, or one per `person`, for engines that play people separately.
     """
 
     names: Names = "smplx"

@@ -1,4 +1,4 @@
-"""Scenes as BVH files, one a person, for Blender, MotionBuilder and whatever else reads skeletons."""
+"""Scenes as BVH files, one per person, for Blender, MotionBuilder and other tools that read skeletons."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ TIPS: dict[int, tuple[float, float, float]] = {
     L_FOOT: (0.0, 0.0, 0.07), R_FOOT: (0.0, 0.0, 0.07), HEAD: (0.0, 0.18, 0.02),
     L_WRIST: (0.17, 0.0, 0.0), R_WRIST: (-0.17, 0.0, 0.0),
 }  # fmt: skip
-"""Metres from a leaf joint to its End Site, which only says how long the last bone is drawn."""
+"""Metres from a leaf joint to its End Site, which only sets the drawn length of the last bone."""
 
 
 def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") -> list[Path]:
     """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
 
-    All people keep their places in the one world of the scene, y up. Joints carry SMPL-X's names; the root's position
-    is the pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
+    All people keep their places in the scene's world, y up. Joints have SMPL-X's names; the root's position is the
+    pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
 
     Args:
-        unit: of lengths, which the format does not name. Blender takes metres, MotionBuilder centimetres.
+        unit: unit of lengths, which the format does not state. Blender expects metres, MotionBuilder centimetres.
 
     Returns:
         The paths written, in the order of the slots.

@@ -1,4 +1,4 @@
-"""Reader of BVH files, anybody's: hierarchy and motion as written, and joints in the world."""
+"""Reader of BVH files: hierarchy and motion as written, and joints in the world."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Bvh:
 def read_bvh(path: str | Path) -> Bvh:
     """Read one BVH file.
 
-    Position channels of a joint replace its OFFSET, as most programs write them. If they are nearer to zero than to
+    Position channels of a joint replace its OFFSET, as most programs write them; if they are nearer to zero than to
     the OFFSET, they are added to it.
 
     Raises:

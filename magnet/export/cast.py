@@ -1,4 +1,4 @@
-"""Scenes made ready for drawing: who is present, in which colour, on which body."""
+"""Scenes prepared for drawing: present agents, their colours and their body."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Scenes = Scene | list[tuple[str, Scene]] | dict[str, Scene]
 Style = Literal["skeleton", "capsules", "light", "body"]
 STYLES: tuple[Style, ...] = ("skeleton", "capsules", "light", "body")
 LIGHT = 800
-"""Vertices of a light body in pictures, of 13,492; its triangles are made four, so that it looks round."""
+"""Vertices of a light body in pictures, of 13,492; each triangle is split into four, so that it looks round."""
 
 
 @dataclass(frozen=True)

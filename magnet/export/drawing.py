@@ -1,4 +1,4 @@
-"""What pictures are drawn with: camera, floor, shadows, and polygons painted from far to near.
+"""Drawing of pictures: camera, floor, shadows, and polygons painted from far to near.
 
 Arrays here are numpy, world metres, y up. Nothing is random.
 """
@@ -31,7 +31,7 @@ AGENTS: tuple[Colour, ...] = (
     (70, 178, 226),
     (176, 160, 20),
 )
-"""One colour an agent slot, told apart with any common colour blindness; none is pink."""
+"""One colour per agent slot, distinguishable with common colour blindness; none is pink."""
 
 CONTEXT: tuple[Colour, ...] = (
     (226, 62, 138),
@@ -50,7 +50,7 @@ HEAD_ROOM = 0.16  # metres around joints that a drawn body may fill
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the onlooker stands; it follows the middle of the group and keeps everybody in the picture."""
+    """The viewpoint; it follows the middle of the group and keeps everybody in the picture."""
 
     azimuth: float | None = None  # radians about the vertical, 0: from +z; None: where people hide each other least
     elevation: float = 0.30  # radians above the floor

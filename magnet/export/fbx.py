@@ -1,4 +1,4 @@
-"""Scenes as FBX, by way of a GLB that Blender converts: there is no kept, free library that writes skins and motion."""
+"""Scenes as FBX: Blender converts a GLB, because no maintained free library writes skins and motion."""
 
 from __future__ import annotations
 

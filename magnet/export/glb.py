@@ -24,18 +24,18 @@ from magnet.version import __version__
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125
 VERTEX_DATA, INDICES = 34962, 34963
 INFLUENCES = 4
-"""Joints that move one vertex; what engines take."""
+"""Joints that move one vertex at most, as engines expect."""
 
 
 def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
 
-    Each person present is a node `person_0`, `person_1` ... with a bone on the floor and the 22 joints below it, and a
-    mesh skinned to them in the colour that pictures give the slot. At rest everybody stands on the floor in the T pose.
-    People of one shape share their mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
+    Each person present is a node `person_0`, `person_1` ... with a bone on the floor, the 22 joints below it, and a
+    mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose. People of one shape
+    share a mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
 
     Args:
-        bones: their names, whether there is one on the floor, and into how many animations motion goes.
+        bones: names and hierarchy of bones, and the number of animations.
 
     Returns:
         The path written.
@@ -92,12 +92,12 @@ def _animation(name: str) -> dict[str, Any]:
 
 
 def standing(body: Body, betas: Tensor) -> Tensor:
-    """Joints at rest of somebody who stands on the floor. betas (10,) -> (22, 3) float64"""
+    """Joints of a body at rest that stands on the floor. betas (10,) -> (22, 3) float64"""
     return body.rest_joints(betas).detach().cpu().double() + _raised(_resting(body, betas))
 
 
 def standing_vertices(body: Body, betas: Tensor) -> NDArray[np.float64]:
-    """Vertices at rest of somebody who stands on the floor. betas (10,) -> (V, 3)"""
+    """Vertices of a body at rest that stands on the floor. betas (10,) -> (V, 3)"""
     vertices = _resting(body, betas)
     return (vertices + _raised(vertices)).numpy()
 

@@ -1,4 +1,4 @@
-"""Joint positions as a table, for spreadsheets, R and whoever needs no rotations."""
+"""Joint positions as a table, for spreadsheets and statistics."""
 
 from __future__ import annotations
 

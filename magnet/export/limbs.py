@@ -1,4 +1,4 @@
-"""Which joints are joined by limbs, how thick these are, and the ends of the body that no joint marks."""
+"""Limbs between joints and their radii, and body ends without a joint: crown, hands, toes and heels."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def extended(joints: Array) -> Array:
 
 
 def scale(joints: Array) -> Array:
-    """Size of a body against the one that the limb tables are made for. (..., 22, 3) -> (...)"""
+    """Size of a body relative to the one of the limb tables. (..., 22, 3) -> (...)"""
     upper, lower = [L_HIP, R_HIP, L_KNEE, R_KNEE], [L_KNEE, R_KNEE, L_ANKLE, R_ANKLE]
     legs = np.linalg.norm(joints[..., upper, :] - joints[..., lower, :], axis=-1).sum(axis=-1) / 2
     return np.clip(legs / LEG, 0.5, 1.4)

@@ -1,4 +1,4 @@
-"""Joints of foreign skeletons recognised by the naming schemes in use."""
+"""Recognises joints of other programs' skeletons by common naming schemes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIDED: dict[str, int] = {
 """Our left joint of each role; the right one follows it."""
 MIDDLE: dict[str, int] = {"neck": NECK, "head": HEAD}
 NEEDED = (*HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS, *WRISTS)
-"""Without these limbs nobody can be posed; the spine is found in the hierarchy, the rest may be missing."""
+"""Limb joints without which nobody can be posed; the spine is found in the hierarchy, the rest may be missing."""
 
 SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
     "SMPL-X, Biovision, Xsens": {
@@ -56,7 +56,7 @@ CMU's bone `wrist`, which its conversions call Hand, is the last third of the fo
 begins.
 """
 SIGNS = {"CMU": "left:hipjoint"}
-"""A joint without which a skeleton does not follow a scheme, where its other names are another scheme's as well."""
+"""A joint that identifies a scheme whose other names also occur in another scheme."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def recognised(names: Sequence[str], given: Mapping[str, str] | None = None) -> 
     """The scheme that explains most of a skeleton's names.
 
     Args:
-        given: our joint's name: their joint's name, where names alone do not tell; goes before any scheme.
+        given: our joint's name to theirs, if names alone do not tell; it overrides any scheme.
 
     Raises:
         ValueError: `given` names a joint that does not exist.

@@ -27,7 +27,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     Only SMPL-X's own betas look right in SMPL-X tools.
 
     Args:
-        apart: one file a person (path_0.npz, ...) without the axis P, as most tools read them.
+        apart: one file per person (path_0.npz, ...) without the axis P, as most tools expect.
 
     Returns:
         The paths written.

@@ -1,4 +1,4 @@
-"""Still pictures of scenes: strips of frames to judge bodies, feet and partners by."""
+"""Still pictures of scenes: strips of frames."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def contact_sheet(
     Args:
         scenes: a scene, each of its B a row, or labelled scenes; all of one length.
         columns: how many moments, evenly spread from the first frame to the last.
-        context_frames: how many first frames were given to the model, where the scene does not say; they are pink, and
-            times count from the last.
-        frames: which frames instead, in place of `columns`.
+        context_frames: number of first frames given to the model, if the scene does not say; they are pink, and times
+            count from the last one.
+        frames: the frames to show, in place of `columns`.
         body: the scenes' body model; the packaged one if None.
         cell: pixels of one picture in the sheet.
 

@@ -1,4 +1,4 @@
-"""Interpretation of a BVH file: its joints, unit, up axis and rest pose."""
+"""A BVH file's joints, unit, up axis and rest pose, stated or found."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ class Skeleton:
 
 
 def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
-    """A file's skeleton in metres, y up, with our joints; what is None is found out.
+    """A file's skeleton in metres, y up, with our joints; options that are None are found from the file.
 
     Args:
-        given: our joint's name: theirs, for names that no scheme knows.
+        given: our joint's name to theirs, for names that no scheme knows.
 
     Raises:
         ValueError: unknown names, a length of legs that fits no unit, or a rest pose without a front.
@@ -100,7 +100,7 @@ def _middle(at: Floats, ours: Mapping[int, int], a: int, b: int) -> Floats:
 
 
 def _up_axis(torso: Floats, rest: Floats, ours: Mapping[int, int]) -> str:
-    """Where torsos point on average, or in the rest pose where they lie about. torso (T, 3)"""
+    """Where torsos point on average, or in the rest pose if people lie down. torso (T, 3)"""
     mean = (torso / np.linalg.norm(torso, axis=-1, keepdims=True)).mean(axis=0)
     if np.abs(mean).max() < 0.7:
         mean = _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS)

@@ -1,4 +1,4 @@
-"""Pictures of mask schedules: the noise level of every token of every agent, moment by moment (paper Fig. A.3)."""
+"""Pictures of mask schedules: the noise level of every token of every agent over denoising (paper Fig. A.3)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_COLUMNS = 480
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The grid before one denoising step, as it looks to the agents that the step updates.
+    """The grid before one denoising step, as seen by the agents that the step updates.
 
     Attributes:
         number: denoising steps done.
@@ -46,8 +46,8 @@ class Moment:
 def moments(schedule: MaskSchedule, count: int = 16) -> list[Moment]:
     """At most `count` moments, the first and the last among them.
 
-    All steps where they are few; else the first stage more closely, and later ones halfway, which
-    show the window moving on.
+    All steps if they are few; else more of the first stage, and one of later stages each, which shows the window
+    moving on.
 
     Raises:
         ValueError: fewer than four moments.
@@ -288,7 +288,7 @@ Key = tuple[str, str]  # what is drawn, what it means
 
 
 def legend(schedule: MaskSchedule, rows: list[Moment]) -> list[Key]:
-    """What the picture needs to have explained."""
+    """Entries of the picture's legend."""
     keys = [("noise", "pure noise to generated")]
     known = schedule.known.numpy()
     if known.any():

@@ -1,4 +1,4 @@
-"""A sample with its denoising steps as one npz, which the viewer plays: what was expected after each step."""
+"""A sample with its denoising steps as one npz, which the viewer plays: the model's estimate after each step."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class DenoisingTrace:
         scene: the finished sample, B = 1, T frames.
         levels: (R, N, P) int16, noise levels of all tokens after each step; 0 is clean, 1000 pure noise.
         start: (R,) int, first frame of the window that the step worked on.
-        estimates: windows of W frames as the model expected them to end, one a step: R scenes. Frames in front
-            of a window are the finished sample's; those behind it are not known yet.
+        estimates: R scenes of W frames: the window as the model estimated it in each step. Frames before the window are
+            the finished sample's; those after it are not known yet.
     """
 
     scene: Scene
@@ -47,7 +47,7 @@ class DenoisingTrace:
         return len(self.levels)
 
     def at(self, step: int) -> Scene:
-        """The scene as it was expected to become after a step: B = 1, frames up to the end of its window."""
+        """The scene as estimated after a step: B = 1, frames up to the end of its window."""
         start, estimate = int(self.start[step]), self.estimates.select([step])
         stop = min(start + estimate.frames, self.scene.frames)
         front, window = self.scene.slice(0, start), estimate.slice(0, stop - start)

@@ -1,4 +1,4 @@
-"""Moving pictures of scenes: people on a floor, known motion pink, several recordings side by side."""
+"""Films of scenes: people on a floor, given motion in pink, several scenes side by side."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ def render_video(
     speed: float = 1.0,
     progress: bool | Report = False,
 ) -> Path:
-    """Write a moving picture of one scene, or of several side by side at one scale and from one side.
+    """Write a film of one scene, or of several side by side at one scale and from one side.
 
     Args:
         scenes: a scene, each of its B a panel, or labelled scenes; all of one length.
         path: .mp4 (needs PyAV), .gif or .webp.
-        context_frames: how many first frames were given to the model, where the scene does not say; they are pink and
-            marked in the time bar.
+        context_frames: number of first frames given to the model, if the scene does not say; they are pink and marked
+            in the time bar.
         body: the scenes' body model; the packaged one if None.
         style: `skeleton` strokes, `capsules` mannequins, the `body`'s own skin, or a `light` one of fewer triangles.
-        fps: frames a second of the picture; the scene's are repeated or left out.
+        fps: frames a second of the film; frames of the scene are repeated or left out.
         size: pixels of one panel, even numbers.
-        ghosts: a scene (B = 1) drawn pale behind every panel, such as the ground truth.
-        trail: seconds of the way of each pelvis that are drawn on the floor.
-        speed: seconds of the scene that pass in a second of the picture.
-        progress: True for a progress bar, or a function told (done, all) after each frame.
+        ghosts: a scene (B = 1) drawn pale in every panel, such as the ground truth.
+        trail: seconds of each pelvis's path that are drawn on the floor.
+        speed: seconds of the scene per second of the film.
+        progress: True for a progress bar, or a function called with (done, all) after each frame.
 
     Returns:
         The path written.
@@ -88,7 +88,7 @@ def render_video(
 
 
 class Film:
-    """The frames of a moving picture, drawn when asked for."""
+    """The frames of a film, drawn on request."""
 
     def __init__(
         self,
@@ -240,7 +240,7 @@ def _write_webp(film: Film, path: Path, report: Report) -> None:
 
 
 def _durations(film: Film, tick: int) -> list[int]:
-    """Milliseconds of each frame, whole ticks that keep to the true time on the whole."""
+    """Milliseconds of each frame, rounded to ticks so that errors do not add up."""
     ends = np.round(np.arange(film.frames + 1) * 1000 / film.fps / tick) * tick
     return np.maximum(np.diff(ends), tick).astype(int).tolist()
 

@@ -8,7 +8,6 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
-from magnet.metrics.bearing import PartnerBearing, TurnRate, bearing, turn_rate
 from magnet.metrics.body_depth import BodyDepth
 from magnet.metrics.columns import Better, Column, column, columns_of
 from magnet.metrics.diversity import Diversity, diversity
@@ -20,13 +19,11 @@ from magnet.metrics.interaction import MotionInteraction, pearson
 from magnet.metrics.interval import bootstrap_interval, independent_units
 from magnet.metrics.jitter import Jitter, jitter
 from magnet.metrics.memorisation import NearestTraining
-from magnet.metrics.partners import PartnerDistance, partner_distance
+from magnet.metrics.partners import PartnerBearing, PartnerDistance, TurnRate, bearing, partner_distance, turn_rate
 from magnet.metrics.penetration import Interpenetration, penetration_depth, segment_distance
-from magnet.metrics.position_error import PositionError, joint_error
-from magnet.metrics.skating import FootSkating, toe_steps
-from magnet.metrics.standing import StandingToes
+from magnet.metrics.position_error import PositionError, VelocityError, joint_error, velocity_error
+from magnet.metrics.skating import FootSkating, StandingToes, toe_steps
 from magnet.metrics.token_borders import TokenBorders
-from magnet.metrics.velocity_error import VelocityError, velocity_error
 from magnet.motion.scene import FPS
 
 __all__ = [

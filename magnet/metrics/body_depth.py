@@ -11,7 +11,7 @@ from torch import Tensor
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-from magnet.metrics.histogram import histogram_of, quantile
+from magnet.metrics.interval import histogram_of, quantile
 from magnet.metrics.penetration import CHUNK, FOREARMS, TOUCH, penetration_depth
 
 ARMS = slice(5, 9)

@@ -101,3 +101,21 @@ def bootstrap_interval(
     tail = (1 - level) / 2
     ends = torch.quantile(total / count, torch.tensor([tail, 1 - tail], dtype=torch.float64))
     return ends[0].to(totals.device), ends[1].to(totals.device)
+
+
+def histogram_of(values: Tensor, width: float, bins: int) -> Tensor:
+    """How many values lie in each bin: bin k holds ((k - 1) width, k width], bin 0 zero and below. (...) -> (bins,)
+
+    What is larger than all bins counts in the last one.
+    """
+    bin = (values.flatten() / width).ceil().long().clamp(0, bins - 1)
+    return torch.bincount(bin, minlength=bins).double()
+
+
+def quantile(histogram: Tensor, q: float, width: float) -> Tensor:
+    """The value with a share `q` of all counts below it, between the edges of its bin. (bins,), some count -> scalar"""
+    upto = histogram.cumsum(dim=0)
+    wanted = q * upto[-1]
+    bin = torch.searchsorted(upto, wanted)
+    inside = (wanted - upto[bin] + histogram[bin]) / histogram[bin]
+    return (bin - 1 + inside).clamp(min=0) * width

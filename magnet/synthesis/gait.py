@@ -12,7 +12,7 @@ from magnet.motion.scene import FPS
 from magnet.synthesis.people import People
 
 STEP_OVER = 0.07
-"""Metres a foot may be off its place before it takes a step."""
+"""Metres between a foot and its place above which it takes a step."""
 STEP_ROUND = 0.3
 """The same, in radians."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,11 +11,32 @@ import torch
 from magnet.body import Body
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import FPS, Scene
-from magnet.synthesis.couplings import COUPLINGS
-from magnet.synthesis.people import gather, uniform
+from magnet.synthesis.handshake import handshake
+from magnet.synthesis.imitation import follow, mirror
+from magnet.synthesis.people import People, gather, uniform
 from magnet.synthesis.planning import PAD, Truth
-from magnet.synthesis.pose import embody
+from magnet.synthesis.pose import Plan, embody
+from magnet.synthesis.ring import circle, patty_cake
 from magnet.threads import one_thread
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A builder of scenes and the group sizes that it supports."""
+
+    plan: Callable[[People, int, torch.Generator], tuple[Plan, Truth]]
+    fewest: int
+    most: int
+
+
+COUPLINGS = {
+    "mirror": Coupling(mirror, fewest=1, most=6),
+    "follow": Coupling(follow, fewest=1, most=6),
+    "handshake": Coupling(handshake, fewest=2, most=4),
+    "circle": Coupling(circle, fewest=2, most=8),
+    "patty_cake": Coupling(patty_cake, fewest=2, most=8),
+}
+
 
 FEWEST_FRAMES = 120
 """Shorter scenes have no room for an approach, a handshake and a parting."""
@@ -22,7 +44,7 @@ FEWEST_FRAMES = 120
 
 @dataclass(frozen=True)
 class CoupledScene:
-    """A scene and the closed form of its coupling; each builder says what its `truth` holds."""
+    """A scene and the closed form of its coupling; each builder documents its `truth`."""
 
     scene: Scene
     coupling: str
@@ -36,8 +58,8 @@ def synthesize(coupling: str, people: int, frames: int, generator: torch.Generat
         coupling: a name in `COUPLINGS`.
         people: P.
         frames: T, at least 120.
-        generator: on the CPU; all that varies comes from it: bodies, manners, paths, rhythms, noise.
-        body: whose shape numbers and joints at rest are used.
+        generator: CPU generator of all variation: bodies, manners, paths, rhythms, noise.
+        body: body of the people.
 
     Raises:
         ValueError: no such coupling, or a group size or length that it does not support.

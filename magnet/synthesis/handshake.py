@@ -20,7 +20,7 @@ FINGERS = (0.2, -0.15, 1.0)
 
 
 def handshake(people: People, frames: int, generator: torch.Generator) -> tuple[Plan, Truth]:
-    """Two people walk up to each other, shake right hands and go their ways; a third one watches, four are two pairs.
+    """Two people approach, shake right hands and part; a third person watches, four people form two pairs.
 
     truth: pairs (K, 2) int, contact (K, 2) seconds from grip to release, pumps (K,) Hz, gap (K,) metres
     between the wrists while they hold.
@@ -67,7 +67,7 @@ def _centre(k: int, pairs: int) -> Tensor:
 def _shake(
     plan: Plan, people: People, pair: tuple[int, int], centre: Tensor, contact: list[float], hertz: float, clock: Tensor
 ) -> None:
-    """Add to the plan how a pair's right hands move, where both look and how they bow."""
+    """Add a pair's right hands, gazes and bows to the plan."""
     grip, release = contact
     held = ease((clock - grip) / 0.25) * (1 - ease((clock - release + 0.3) / 0.3))
     pump = 0.035 * held * torch.sin(2 * math.pi * hertz * (clock - grip))

@@ -47,7 +47,7 @@ def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
 
 
 def basis(along: Tensor, beside: Tensor) -> Tensor:
-    """Right-handed frame: first axis `along`, the second as near to `beside` as can be. -> (..., 3, 3)"""
+    """Right-handed frame with first axis `along` and second axis nearest to `beside`. -> (..., 3, 3)"""
     first = F.normalize(along, dim=-1)
     third = F.normalize(torch.linalg.cross(first, beside.expand_as(first), dim=-1), dim=-1)
     return torch.stack([first, torch.linalg.cross(third, first, dim=-1), third], dim=-1)

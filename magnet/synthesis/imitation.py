@@ -113,7 +113,7 @@ def mirror(people: People, frames: int, generator: torch.Generator) -> tuple[Pla
 
 
 def follow(people: People, frames: int, generator: torch.Generator) -> tuple[Plan, Truth]:
-    """Agent 0 strolls about; each of the others walks the same path later, with steps of its own.
+    """Agent 0 strolls; each of the others walks the same path later, with its own steps.
 
     truth: delay (P - 1,) seconds behind agent 0.
     """

@@ -1,4 +1,4 @@
-"""How far a motion is from its coupling's closed form, to test models that were trained on it."""
+"""Distance of a motion from its coupling's closed form, to test models trained on it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from magnet.synthesis.planning import Truth
 from magnet.synthesis.ring import BOTH, LEFT, RIGHT
 
 LATEST = 150
-"""Longest delay looked for, frames."""
+"""Longest delay that is searched, in frames."""
 LIMBS = (*KNEES, *ANKLES, *ELBOWS, *WRISTS)
-"""Knees, ankles, elbows and wrists tell what a person does."""
+"""Knees, ankles, elbows and wrists, by which delays are found."""
 
 
 def coupling_error(coupling: str, joints: Tensor, truth: Truth, start: float = 0.0) -> dict[str, float]:
-    """Deviation of a motion from its coupling; NaN where these frames do not show it.
+    """Deviation of a motion from its coupling; NaN if the frames do not show it.
 
     Args:
         coupling: name in `COUPLINGS`.

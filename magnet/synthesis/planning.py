@@ -1,4 +1,4 @@
-"""What the builders of couplings share: clocks, keyed curves, directions on the ground.
+"""Shared by the builders of couplings: clocks, keyed curves, directions on the ground.
 
 A builder plans `frames + 2 * PAD` frames, of which the middle ones are kept, so that all motion is under way at the
 first of them. Times in its `truth` are seconds from the first kept frame.

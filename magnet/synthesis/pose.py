@@ -1,4 +1,4 @@
-"""From a plan (paths, footsteps, what the hands and the eyes do) to a scene of whole bodies."""
+"""From a plan of paths, footsteps, hands and gazes to whole bodies."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STRETCH = 0.995
 
 @dataclass(frozen=True)
 class Plan:
-    """What P people do during T frames, float64; hands are (left, right). World metres and radians."""
+    """Plan of P people over T frames, float64, in world metres and radians; hands are (left, right)."""
 
     ground: Tensor  # (T, P, 2) path of the pelvis as (x, z)
     yaw: Tensor  # (T, P) where the body faces
@@ -42,7 +42,7 @@ class Plan:
 
 
 def still(ground: Tensor, yaw: Tensor, feet: Feet, people: People) -> Plan:
-    """A plan of people who only walk: arms swing, eyes look ahead."""
+    """A plan of people who only walk: arms swing, gazes point ahead."""
     T, P = yaw.shape
     zero = ground.new_zeros
     ahead = ground + 6 * torch.stack([yaw.sin(), yaw.cos()], dim=-1)
@@ -81,7 +81,7 @@ class _Bodies:
 
 
 def embody(plan: Plan, people: People, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Whole bodies that do what the plan says.
+    """Bodies that follow the plan.
 
     Returns:
         body_rot (T, P, 21, 3, 3) and T_world_root (T, P, 4, 4), float64.

@@ -1,4 +1,4 @@
-"""What both viewers share: a scene in the browser with people, a timeline and cameras."""
+"""Base of both viewers: a scene in the browser with people, a timeline and cameras."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from magnet.viewer.server import start
 from magnet.viewer.timeline import Timeline, Tracks
 
 TOLD = 15.0
-"""Seconds that a refusal stays in sight."""
+"""Seconds that an error message stays visible."""
 RATE = FPS
-"""Frames a second that are sent at most."""
+"""Largest number of frames sent per second."""
 SETTLES = 0.3
-"""Seconds after which a slider that was moved is taken to be let go."""
+"""Seconds without a move after which a slider counts as released."""
 CAMERAS = {"three quarters": (0.65, 0.30), "front": (0.0, 0.12), "side": (1.571, 0.12), "above": (0.0, 1.45)}
 """Presets: azimuth about the vertical from +z and elevation, radians."""
 AIM = 0.85
 FIELD = 0.70
 TRACKS = 8
-"""People who have tracks; a crowd's would fill the window."""
+"""Largest number of people with tracks; those of a crowd would fill the window."""
 NOBODY_LOOKS = 1.0
-"""Seconds between two looks whether somebody has come."""
+"""Seconds between checks whether a browser has connected."""
 ROOM = 0.75
-"""Metres around people's pelvises that the camera keeps in sight."""
+"""Metres around pelvises that the camera keeps visible."""
 
 
 class ViewerBase:
@@ -42,7 +42,7 @@ class ViewerBase:
 
     Args:
         body: of all takes.
-        host, port: where the browser finds it; port 0 takes any that is free.
+        host, port: address of the page; port 0 takes a free one.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class ViewerBase:
         loop.on_update(lambda _: self.set_loop(bool(loop.value)))
 
     def set_loop(self, on: bool) -> None:
-        """Play what there is round and round, or stop at its end."""
+        """Play in a loop, or stop at the end."""
         self.clock.loop = on
 
     def _update_play(self) -> None:
@@ -125,7 +125,7 @@ class ViewerBase:
         self.play.icon = "player-pause" if self.clock.playing else "player-play"
 
     def add_render_controls(self, ghosts: bool | None) -> None:
-        """What is shown, and from where. ghosts: None where there can be no ground truth at all."""
+        """Controls of looks and camera. ghosts: whether there is a ground truth; None: no such control."""
         gui = self.server.gui
         with gui.add_folder("Look"):
             style = gui.add_dropdown("people", VIEWS, initial_value=self.render.style)
@@ -218,7 +218,7 @@ class ViewerBase:
         return min(self.timeline.height / max(camera.image_height, 1), 0.4)
 
     def frame_all(self) -> None:
-        """Put the camera as far away as everybody needs, at the start, in the middle and at the end."""
+        """Put the camera far enough away to see everybody at the start, in the middle and at the end."""
         wide = []
         for share in (0.0, 0.5, 1.0):
             moment = [
@@ -232,7 +232,7 @@ class ViewerBase:
     # -- showing -------------------------------------------------------------------------------
 
     def draw(self) -> None:
-        """Show the clock's frame, if it is not shown already."""
+        """Show the clock's frame, unless it is shown already."""
         with self.lock:
             frame = self.clock.frame
             if frame == self.shown or not self.views:
@@ -259,17 +259,17 @@ class ViewerBase:
         self.root.position = tuple(float(-x) for x in self.centre)
 
     def tracks(self) -> Tracks:
-        """What the timeline shows: the people of all takes, one after the other."""
+        """Content of the timeline: the people of all takes, in order."""
         known = [np.resize(view.take.known, (self.clock.frames, len(view.take.slots))) for view in self.views]
         own = np.concatenate([view.own for view in self.views])
         return Tracks(np.concatenate(known, axis=1)[:, :TRACKS], own[:TRACKS])
 
     def places_in_sight(self, frame: int) -> Array:
-        """What must be seen: everybody's pelvis on the stage. -> (M, 3)"""
+        """Points to keep visible: everybody's pelvis on the stage. -> (M, 3)"""
         return np.concatenate([view.places(frame) for view in self.views])
 
     def _keep_in_sight(self, frame: int) -> None:
-        """Move cameras away, on the line that they look along, where not everybody would be in the picture."""
+        """Move cameras back along their line of sight if somebody would be out of the picture."""
         if not self.follow:
             return
         away = self.places_in_sight(frame) - self.centre
@@ -291,7 +291,7 @@ class ViewerBase:
                     camera.look_at = self._aim(camera, max(far, needed))
 
     def caption(self, frame: int) -> str:
-        """What the panel says about a frame."""
+        """Text of the panel for a frame."""
         lines = [f"{frame / self.clock.fps:.2f} s of {self.clock.frames / self.clock.fps:.1f} s"]
         for view in self.views:
             state = view.take.said(frame)
@@ -305,7 +305,7 @@ class ViewerBase:
         return "  \n".join(lines)
 
     def settle(self, now: float) -> None:
-        """Set a slider again after a person released it: frames in transit may have moved it."""
+        """Set the slider again after the user released it: frames in transit may have moved it."""
         if self.unsettled is None or now < self.unsettled + SETTLES:
             return
         self.unsettled = None
@@ -315,14 +315,14 @@ class ViewerBase:
             self.slider.value = frame
 
     def before_draw(self) -> None:
-        """What happens between two frames."""
+        """Hook that runs between two frames."""
 
     def watched(self) -> bool:
-        """Whether anybody looks; if not, time stands still and nothing is done."""
+        """Whether a browser is connected; if not, the clock stands still."""
         return bool(self.server.get_clients())
 
     def run(self, seconds: float | None = None) -> None:
-        """Play until stopped, or for so many seconds."""
+        """Play until stopped, or for `seconds`."""
         begin = last = time.perf_counter()
         while not self._stop.is_set() and (seconds is None or last - begin < seconds):
             now = time.perf_counter()
@@ -348,7 +348,7 @@ class ViewerBase:
         return thread
 
     def stop(self) -> None:
-        """End, and give the port back."""
+        """Stop, and free the port."""
         self._stop.set()
         with self.lock:
             self.server.stop()

@@ -1,4 +1,4 @@
-"""Which frame is shown now."""
+"""The clock of playback."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
 
 @dataclass
 class Clock:
-    """Playback time of a motion of so many frames; frames are left out where showing them would take too long."""
+    """Playback time of a motion; frames are skipped if showing them takes too long."""
 
     frames: int
     fps: float
@@ -37,11 +37,11 @@ class Clock:
         return self.frame
 
     def seek(self, frame: int) -> None:
-        """Go to a frame; beyond the ends to the last or the first."""
+        """Go to a frame, clamped to the first and the last."""
         self.at = float(min(max(frame, 0), max(self.frames - 1, 0)))
 
     def step(self, frames: int) -> None:
-        """Stop, and go so many frames on or back; round the ends where it loops."""
+        """Stop, and go some frames forwards or backwards, wrapping at the ends if it loops."""
         self.playing = False
         goal = self.frame + frames
         self.seek(goal % self.frames if self.loop and self.frames else goal)

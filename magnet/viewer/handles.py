@@ -1,4 +1,4 @@
-"""Handles on the floor that people drag, and the panels that go with them: a goal to steer to, and keyframes."""
+"""Handles on the floor to drag, with their panels: a goal to steer to, and keyframes."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from magnet.body.base import Body
+from magnet.body.reach import LIMBS
 from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
-from magnet.generation.keyframes import Goal, Keyframe, keyframe, speeds, with_keyframes
+from magnet.generation.keyframes import Goal, Keyframe, keyframe, limb_places, speeds, with_keyframes, with_limb
 from magnet.generation.live import Live
 from magnet.motion.frames import canonical_frame
 from magnet.viewer.clock import Clock
-from magnet.viewer.limb_handle import LimbHandle
 from magnet.viewer.people import PeopleView, add_people
 from magnet.viewer.worker import Worker
 
 
 class App(Protocol):
-    """What handles need of the app that they belong to."""
+    """What handles need from their app."""
 
     live: Live
     server: Any
@@ -39,13 +40,13 @@ class App(Protocol):
 NOBODY = "nobody"
 NO_KEYS = "no keyframe"
 HURRIED = 3.0
-"""Metres a second from which a keyframe is called out as too far away to be walked to."""
+"""Metres a second above which a keyframe is reported as too far away."""
 HERE = -1
-"""For the frame that is seen."""
+"""Stands for the frame that is shown."""
 
 
 def floor_handle(server: Any, name: str, goal: Goal, moved: Callable[[Goal], None], scale: float = 0.7) -> Any:
-    """Arrows on the floor and a ring that turns; dragging them calls `moved`."""
+    """Arrows and a ring on the floor; dragging them calls `moved`."""
     handle = server.scene.add_transform_controls(
         name,
         scale=scale,
@@ -68,7 +69,7 @@ def people_names(slots: int) -> tuple[str, ...]:
 
 
 class Steering:
-    """Whom to steer, and the handle of that person's goal."""
+    """The choice of a person to steer, and the handle of their goal."""
 
     def __init__(self, app: App) -> None:
         self.app, self.live = app, app.live
@@ -92,7 +93,7 @@ class Steering:
         self.app.steered(agent)
 
     def steer(self, agent: int) -> None:
-        """Put a handle where somebody stands and heads, and let it be that person's goal."""
+        """Put a handle at a person's place and heading, and make it their goal."""
 
         def moved(goal: Goal) -> None:
             with self.live.lock:
@@ -121,7 +122,7 @@ class KeyframeEntry:
 
 
 class KeyframePanel:
-    """Keyframes: added where the clock stands, dragged, moved in time, removed, and gone through by in-betweening."""
+    """Keyframes to add at the clock's frame, drag, move in time and remove, and in-betweening through them."""
 
     def __init__(self, app: App) -> None:
         self.app, self.live = app, app.live
@@ -248,7 +249,7 @@ class KeyframePanel:
             entry.preview.pose(turns[0], places[0])
 
     def _listed(self, chosen: KeyframeEntry | None = None) -> None:
-        """Bring lists up to date, and choose a keyframe in them."""
+        """Update the lists, and choose a keyframe in them."""
         self.entries.sort(key=lambda entry: (entry.key.frame, entry.key.agent))
         chosen = chosen or (self.entries[-1] if self.entries else None)
         self.which.options = tuple(entry.label for entry in self.entries) or (NO_KEYS,)
@@ -262,7 +263,7 @@ class KeyframePanel:
         self.limb.show()
 
     def _tell(self) -> None:
-        """Hand the keyframes to the engine, and say how fast people must go to reach them."""
+        """Pass the keyframes to the engine, and show the speeds needed to reach them."""
         with self.live.lock:
             self.live.keys = [entry.key for entry in self.entries]
             self.app.shown = -1  # the timeline has them too, also while the clock stands
@@ -282,6 +283,57 @@ class KeyframePanel:
 
 def key_slot(key: Keyframe) -> Any:
     """The keyframe's person alone, for `Scene.permute_agents`."""
-    import torch
-
     return torch.tensor([key.agent])
+
+
+BODY = "whole body"
+
+
+class LimbHandle:
+    """Choice of what to drag of a keyframe: the whole body, or a hand or foot, which then has its own arrows.
+
+    Args:
+        server: viser's; the drop-down list goes to its current place.
+        body: the people's body.
+        key: returns the chosen keyframe and its person's shape (10,), or None.
+        changed: called with the keyframe after a limb was dragged.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        body: Body,
+        key: Callable[[], tuple[Keyframe, torch.Tensor] | None],
+        changed: Callable[[Keyframe], None],
+    ) -> None:
+        self.server, self.body, self.key, self.changed = server, body, key, changed
+        self.handle: Any = None
+        self.limb = server.gui.add_dropdown("drag its", (BODY, *LIMBS), hint="a hand or a foot gets arrows of its own")
+        self.limb.on_update(lambda _: self.show())
+
+    def show(self) -> None:
+        """Put the arrows at the limb, or remove them."""
+        found = self.key()
+        if found is None or self.limb.value == BODY:
+            if self.handle is not None:
+                self.handle.remove()
+                self.handle = None
+            return
+        key, betas = found
+        place = tuple(limb_places(key, self.limb.value, self.body, betas)[0].tolist())
+        if self.handle is not None:
+            self.handle.position = place
+            return
+        self.handle = self.server.scene.add_transform_controls(
+            "/stage/limb", scale=0.3, disable_rotations=True, depth_test=False, position=place
+        )
+        self.handle.on_update(self.dragged)
+
+    def dragged(self, event: Any) -> None:
+        """Move the limb to the arrows; when they are released, move them to the limb."""
+        found = self.key()
+        if found is not None and self.limb.value != BODY:
+            place = torch.tensor(self.handle.position, dtype=torch.float32)
+            self.changed(with_limb(found[0], self.limb.value, place, self.body, found[1]))
+        if event.phase == "end":
+            self.show()  # as far as the limb came

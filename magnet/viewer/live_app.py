@@ -18,11 +18,45 @@ from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
-from magnet.viewer.guide import add_guide
 from magnet.viewer.handles import KeyframePanel, Steering
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.timeline import Tracks
 from magnet.viewer.worker import Worker
+
+GUIDE = """\
+**Watch.** The model generates about a second ahead of what you see, as long as this page is open. Drag the mouse to
+turn the camera, drag with the right button to shift it, use the wheel to zoom; it moves back by itself when somebody
+would leave the picture.
+
+**The timeline** along the bottom has a track for each person: full colour is generated, pale was given, diamonds are
+keyframes. Drag its slider to go back and forth; *Restart from this frame* drops everything after it.
+
+**Begin.** *example* opens scenes shipped with the model, or an empty one; *Start anew* begins again with *how many
+people*.
+
+**Steer.** Choose *whom*, then drag the arrows on the floor, or the ring to turn. With `motion_control` that person
+goes there and the others answer; with `inbetweening` the arrows are that person's next keyframe, a second ahead.
+
+**Keyframes.** Go to a moment, choose a person, *Add keyframe here*. Drag its arrows and ring; take the *pose of*
+another frame; *drag its* hand or foot by their own arrows; give it a time, which may lie after the last frame.
+*Generate between* regenerates everything from a second before the first keyframe to the last.
+
+**Keep.** *Save* downloads the scene: npz, glb for Blender, bvh, or a self-contained page.
+"""
+
+
+def add_guide(server: Any) -> None:
+    """A button that opens the page."""
+    button = server.gui.add_button("How to", icon="help")
+
+    def show(event: Any) -> None:
+        with event.client.gui.add_modal("How to play with it") as page:
+            event.client.gui.add_markdown(GUIDE)
+            close = event.client.gui.add_button("Close")
+        close.on_click(lambda _: page.close())
+
+    button.on_click(show)
+
 
 NOTHING = "from nothing"
 KINDS = ("none", "history", "self", "partner")
@@ -36,10 +70,10 @@ class LiveApp(ViewerBase):
     """Watch a model that generates endlessly, and steer it.
 
     Args:
-        live: the engine; its model's people stand on `body`.
-        ahead: frames generated ahead of what is seen.
+        live: the engine, whose model belongs to `body`.
+        ahead: frames generated ahead of the shown one.
         examples: scenes to begin from, by name.
-        example: the one that `live` began from.
+        example: the one that `live` started from.
     """
 
     def __init__(
@@ -84,7 +118,7 @@ class LiveApp(ViewerBase):
         return take("", self.live.scene)
 
     def _cast(self) -> None:
-        """Show the people of the scene; meshes of people shown before are used again."""
+        """Show the people of the scene, reusing meshes of people shown before."""
         scene = self.live.scene
         key = tuple(scene.betas.flatten().tolist())
         for view in self.views:
@@ -98,7 +132,7 @@ class LiveApp(ViewerBase):
         self.views[0].set_visible(True)
 
     def before_draw(self) -> None:
-        """Add what has been generated meanwhile."""
+        """Add what was generated in the meantime."""
         with self.lock:
             scene = self.live.scene
             if self.version != self.live.version:
@@ -115,7 +149,7 @@ class LiveApp(ViewerBase):
             self.worker.watch(self.clock.frame)
 
     def tracks(self) -> Tracks:
-        """Those of everybody, with the keyframes."""
+        """Everybody's tracks, with the keyframes."""
         keys = tuple((key.agent, key.frame) for key in self.live.keys)
         return dataclasses.replace(super().tracks(), keys=keys)
 
@@ -126,7 +160,7 @@ class LiveApp(ViewerBase):
         return np.concatenate([super().places_in_sight(frame), handles])
 
     def caption(self, frame: int) -> str:
-        """What the panel says about a frame."""
+        """Text of the panel for a frame."""
         live, rate = self.live, self.live.scene.fps
         speed = f"{live.fps:.0f} frames/s, {live.fps / rate:.1f}x real time" if live.made else "not generated yet"
         ended = frame >= live.scene.frames - 1
@@ -230,7 +264,7 @@ class LiveApp(ViewerBase):
         self.worker.wake()
 
     def steered(self, agent: int) -> None:
-        """Somebody is steered from now on (nobody: -1), which needs a task that listens."""
+        """Steer a person from now on (-1: nobody), with a task that can be steered."""
         if agent >= 0 and self.task.value not in WHAT:
             self.task.value = "motion_control"
         self.apply()

@@ -1,4 +1,4 @@
-"""People in viser's scene: skinned by the browser, or as light capsules and sticks that are only moved."""
+"""People in viser's scene: meshes skinned by the browser, or rigid capsules and sticks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from magnet.export.page.rig import Array, Rig, Style, capsule, rigs
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MANY = 8
-"""People above whom a limb has a quarter of the triangles."""
+"""Number of people above which a limb has a quarter of the triangles."""
 FINE, COARSE = (14, 6), (8, 3)
 """Sectors and rings of a limb."""
 
@@ -27,7 +27,7 @@ Poser = Callable[[Array, Array], None]
 
 
 class PeopleView(Protocol):
-    """The P people of a take as they stand in the browser."""
+    """The P people of a take in the browser."""
 
     def pose(self, turns: Array, places: Array) -> None:
         """Bones of everybody: (P, 22, 4) wxyz, (P, 22, 3) metres."""
@@ -36,7 +36,7 @@ class PeopleView(Protocol):
         """(P, 3)"""
 
     def show(self, on: bool) -> None:
-        """Hide or show everybody; who is hidden needs no poses."""
+        """Hide or show everybody; hidden people need no poses."""
 
 
 def add_people(
@@ -50,7 +50,7 @@ def add_people(
 
 
 class SkinnedPeople:
-    """One skinned mesh a person; of each frame only the poses of the bones are sent."""
+    """One skinned mesh per person; each frame only sends the poses of the bones."""
 
     def __init__(self, server: Any, name: str, people: list[Rig], colours: Colours, opacity: float | None) -> None:
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (BODY_JOINTS, 1))
@@ -99,7 +99,7 @@ def poser(mesh: Any) -> Poser:
 
 
 def quick_poser(mesh: Any) -> Poser | None:
-    """The same in an eighth of the time, or None where viser is not built as it was (1.1).
+    """The same in an eighth of the time; None if viser is not built like version 1.1.
 
     Before it sends a bone's pose, viser compares it with the last one by `numpy.allclose`: for 16 people that takes
     20 ms a frame. In motion all bones differ, so here they are sent as they are.

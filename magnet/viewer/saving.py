@@ -13,11 +13,11 @@ from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
 
 FORMATS = tuple(s.removeprefix(".") for s in formats.WRITTEN if s not in (".fbx", *formats.USD))
-"""What a take can be saved as; what needs Blender, or a package that few have, is written by `magnet export`."""
+"""Formats of downloads; those that need Blender or a rare package are left to `magnet export`."""
 
 
 def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) -> tuple[str, bytes]:
-    """A take as a file: its suffix without the dot and its content. Several files, as one BVH a person, come as a zip.
+    """A take as a file: its suffix without the dot, and its content. Several files, such as BVH, become a zip.
 
     Raises:
         ImportError: the format needs an optional package; says which.

@@ -1,4 +1,4 @@
-"""One take in the browser's scene: its people, their ghosts, trails and marks, at any frame."""
+"""One take in the browser's scene: people, ghosts, trails and marks at any frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from magnet.viewer.scenery import Marks, Shades, Trails
 
 HEAD_HIGH = 2.1
 EVEN = 1.2
-"""Strength of the light that stands in for surroundings."""
+"""Strength of the ambient light that replaces an environment map."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class SceneView:
 
     Args:
         server: viser's.
-        parent: scene node that the take hangs on.
+        parent: parent node of the take.
         truth: a scene (B = 1) of the same frames, shown as ghosts.
         label: write the take's label above it.
     """
@@ -104,7 +104,7 @@ class SceneView:
         return self.mesh_cache[style, ghosts]
 
     def show(self, frame: int) -> None:
-        """Put everybody where they are in a frame; after the last one they stay as they were."""
+        """Show a frame; after the last one people stay as they are."""
         scene = self.estimate or self.take.scene
         now = min(frame, scene.frames - 1)
         start = max(now - 1, 0)
@@ -146,5 +146,5 @@ class SceneView:
         return self.places(frame).mean(axis=0)
 
     def set_visible(self, on: bool) -> None:
-        """Leave the stage, or come back."""
+        """Hide or show the take."""
         self.root.visible = on

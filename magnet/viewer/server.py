@@ -1,4 +1,4 @@
-"""The web server behind the viewer."""
+"""The viewer's web server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
 def start(host: str, port: int, title: str) -> Any:
-    """A viser server on exactly this port; port 0 takes one that is free.
+    """Start a viser server on exactly this port; port 0 takes a free one.
 
     Raises:
         ImportError: viser is not installed.
@@ -72,12 +72,12 @@ def free_port(host: str, port: int) -> int:
 
 
 def taken(host: str, port: int) -> str:
-    """What to do when a port cannot be had."""
+    """Message for a port that cannot be used."""
     return f"port {port} of {host} is in use or not allowed; choose another: --port {port + 1}, or --port 0 for any"
 
 
 def open_browser(url: str) -> bool:
-    """Show a page in the user's browser; False where there is none, as over ssh."""
+    """Show a page in the user's browser; False if there is none, as over ssh."""
     import webbrowser
 
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -1,4 +1,4 @@
-"""Files that can be watched, as takes."""
+"""Reads files as takes for the viewer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from magnet.motion.scene import Scene
 def read_takes(
     paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
 ) -> tuple[list[ShownTake], Body]:
-    """All that several files hold, and the body it is shown on.
+    """The takes in several files, and their body.
 
     body: the user's; by default the open one.
 

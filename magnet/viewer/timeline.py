@@ -1,4 +1,4 @@
-"""The timeline along the bottom of the window: a track for each person, and a slider to scrub."""
+"""The timeline along the bottom of the window: a track for each person, and a slider."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOW = "#e23e8a"
 
 @dataclass(frozen=True)
 class Tracks:
-    """What the timeline shows.
+    """Content of the timeline.
 
     Attributes:
         known: (T, P) bool, frames that were given.
@@ -40,7 +40,7 @@ class Tracks:
 
 
 def drawn(tracks: Tracks, now: int, fps: float) -> str:
-    """The tracks as SVG that fills its width: full colour generated, pale given, diamonds keyframes, a line now."""
+    """The tracks as SVG: full colour is generated, pale is given, diamonds are keyframes, a line is now."""
     frames, people = max(tracks.frames, 1), tracks.known.shape[1]
     height = people * (TRACK + GAP)
     parts = []
@@ -78,8 +78,8 @@ class Timeline:
 
     Args:
         server: viser's.
-        frames: of the slider.
-        people: whose tracks it has room for.
+        frames: length of the slider.
+        people: number of tracks it has room for.
     """
 
     def __init__(self, server: Any, frames: int, people: int) -> None:
@@ -93,13 +93,13 @@ class Timeline:
         server.on_client_connect(lambda client: client.camera.on_update(lambda camera: self.fit(camera.image_width)))
 
     def fit(self, pixels: int) -> None:
-        """Be as wide as a picture of so many pixels."""
+        """Fit the width to a picture of so many pixels."""
         if pixels != self.width and pixels > 4 * EDGE:
             self.width = pixels
             self.panel.set_width(pixels - 2 * EDGE)
 
     def show(self, tracks: Tracks, now: int, fps: float) -> None:
-        """Draw the tracks, and where the clock stands."""
+        """Draw the tracks and the current frame."""
         content = drawn(tracks, now, fps)
         if content != self.picture.content:
             self.picture.content = content

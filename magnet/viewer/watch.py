@@ -4,21 +4,43 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from magnet.body.base import Body
+from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import CROWD, Style, first_style
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length
+from magnet.export.trace import DenoisingTrace
+from magnet.sampling.noise import LEVELS
 from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
-from magnet.viewer.levels import level_image
 from magnet.viewer.scene_view import RenderOptions, SceneView
+
+CELL = 14
+
+
+def level_image(recording: DenoisingTrace, step: int) -> NDArray[np.uint8]:
+    """Noise levels after a step: full colour is clean, white is pure noise; the window is framed. -> (H, W, 3)"""
+    levels = recording.levels[step].numpy().astype(float) / LEVELS  # (N, P)
+    N, P = levels.shape
+    noise = levels.T[..., None]  # (P, N, 1)
+    cells = (1 - noise) * agent_colours(tuple(range(P)))[:, None] + noise * 255.0
+    image = np.kron(cells, np.ones((CELL, CELL, 1)))
+    image[::CELL], image[:, ::CELL] = 214, 214
+    first = int(recording.start[step]) // 4
+    last = min(first + recording.estimates.frames // 4, N)
+    image[:2, first * CELL : last * CELL] = image[-2:, first * CELL : last * CELL] = 60
+    image[:, first * CELL : first * CELL + 2] = image[:, last * CELL - 2 : last * CELL] = 60
+    return image.round().astype(np.uint8)
 
 
 class Viewer(ViewerBase):
     """Watch takes side by side.
 
     Args:
-        takes: of one frame rate.
-        truth: shown as ghosts in every take.
+        takes: all of one frame rate.
+        truth: ground truth, shown as ghosts in every take.
     """
 
     def __init__(
@@ -71,7 +93,7 @@ class Viewer(ViewerBase):
 
 
 def default_render_options(takes: list[ShownTake], style: Style | None = None, shadows: bool = True) -> RenderOptions:
-    """Default options: a crowd is shown with few triangles and no extras, unless a style is asked for."""
+    """Default options: a crowd has few triangles and no extras, unless a style is given."""
     crowd = sum(len(each.slots) for each in takes) > CROWD
     style = style or first_style(sum(len(each.slots) for each in takes))
     rich = not crowd

@@ -1,4 +1,4 @@
-"""A thread that generates a live scene a little ahead of the frame that is shown."""
+"""A thread that generates a live scene slightly ahead of the shown frame."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from magnet.generation.live import Live, LiveChunk
 
 
 class Worker:
-    """Runs `Live.advance` in a thread, never more than `ahead` frames in front of what is watched.
+    """Runs `Live.advance` in a thread, at most `ahead` frames ahead of the shown frame.
 
-    What has been asked for (`Live.asked`) is done at once, also while `paused`.
+    Requests (`Live.asked`) are served at once, also while `paused`.
 
     Args:
         live: the engine.
         ahead: frames; fewer react sooner to steering, more bridge slow moments.
-        failed: told a message when the task refuses; the worker then waits for `wake`.
-        done: told each chunk.
+        failed: called with a message when the task refuses; the worker then waits for `wake`.
+        done: called with each chunk.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Worker:
         return self
 
     def watch(self, frame: int) -> None:
-        """Say which frame is shown now."""
+        """Set the frame that is shown."""
         self.watched = frame
         self._wake.set()
 

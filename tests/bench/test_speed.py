@@ -10,7 +10,7 @@ import torch
 
 from magnet import cli
 from magnet.bench import speed
-from magnet.bench.arithmetic import products_of
+from magnet.bench.speed import products_of
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry

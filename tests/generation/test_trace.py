@@ -14,7 +14,7 @@ from magnet.tasks.agentic import AgenticAsync
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import PartnerPrediction
 from magnet.testing import random_scene
-from magnet.viewer.levels import level_image
+from magnet.viewer.watch import level_image
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.bench.arithmetic import products_of
+from magnet.bench.speed import products_of
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_9d, to_planar
 
 T = from_planar(torch.linspace(-3, 3, 6), torch.arange(12.0).view(6, 2)).view(2, 3, 4, 4)

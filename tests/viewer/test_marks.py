@@ -10,7 +10,7 @@ from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.metrics.penetration import penetration_depth
 from magnet.metrics.skating import toe_steps
 from magnet.motion.scene import Scene
-from magnet.viewer import marks
+from magnet.viewer import scenery as marks
 from magnet.viewer.scenery import Spots, ball
 
 
