@@ -320,7 +320,7 @@ class Model:
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=target)
 
     def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> Partner:
-        """Agents who react live: call `partner(past).answer(frames)` with the others' newest frames, at least 4 at once.
+        """Agents who react live: pass the others' newest frames, at least 4, to `partner(past).answer(frames)`.
 
         Args:
             past: recent motion of everybody; a second is enough.

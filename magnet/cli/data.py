@@ -12,7 +12,6 @@ from magnet.cli import answers
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
     add_list,
-    clips_by_people,
     file_bars,
     run_list,
     show_gaps,
@@ -195,19 +194,7 @@ def run_info(given: argparse.Namespace) -> int:
     out.print(f"{rows:,} frames of one person, {size / 2**20:.1f} MiB; splits by {m['splits by']}")
     if m.get("limit"):
         out.print(f"a try-out: at most {m['limit']} takes of each split")
-    show_splits(
-        [
-            (
-                name,
-                str(split["takes"]),
-                f"{split['clips']} ({', '.join(f'{k} of {n}' for n, k in split['clips by people'].items())})",
-                f"{split['frames']:,}",
-                f"{split['frames'] / m['fps'] / 60:.1f}",
-                str(len(split["shards"])),
-            )
-            for name, split in sorted(m["splits"].items(), key=lambda item: ("train", "val", "test").index(item[0]))
-        ]
-    )
+    show_splits(m["splits"])
     show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
     show_notes([noted(entry["note"], entry["takes"]) for entry in m["notes"]])
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
@@ -215,7 +202,7 @@ def run_info(given: argparse.Namespace) -> int:
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
         out.print(f"{len(m['left out'])} takes are in no split")
-    show_gaps(clips_by_people(m))
+    show_gaps(m["splits"])
     return 0
 
 
@@ -230,10 +217,10 @@ def run_check(given: argparse.Namespace) -> int:
         raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
     else:
         found, body = checked_download(given, given.name or check.recognise(path), path)
-    show_splits(list(check.lines(found)), title=found.title)
+    show_splits(found.splits, title=found.title)
     show_notes(found.notes)
     show_skipped(found.skipped)
-    show_gaps(found.clips_by_people())
+    show_gaps(found.splits)
     picture = Path(given.picture or f"{found.name}_check.png")
     if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
@@ -301,7 +288,7 @@ def run_prepare(given: argparse.Namespace) -> int:
         print(absent_note(m["listed but not there"]))
     print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
-    show_gaps(clips_by_people(m))
+    show_gaps(m["splits"])
     takes = sum(split["takes"] for split in m["splits"].values())
     kind = registry.reader(name)
     body = "" if given.body == "open" else f" --data.body_model {given.body}"

@@ -1,19 +1,13 @@
-"""What `magnet data` shows: tables of splits, takes that were skipped, progress."""
+"""What `magnet data` shows: the list of data sets, tables of splits, takes that were skipped, progress."""
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, TextIO
-
-if TYPE_CHECKING:
-    from magnet.datamodules.clip import Split
-
-
-import argparse
-from typing import TYPE_CHECKING
 
 from magnet.cli import answers
 
@@ -101,15 +95,23 @@ PERSONS_SHOWN = 8
 NOTES_SHOWN = 8
 
 
-def show_splits(rows: list[tuple[str, ...]], title: str | None = None) -> None:
-    """The table of splits."""
+def show_splits(splits: Mapping[str, Mapping[str, Any]], title: str | None = None) -> None:
+    """The table of splits, as a store's manifest has them, with the number of shards where there are any."""
     from rich.console import Console
     from rich.table import Table
 
-    heads = ("split", "takes", "clips", "frames", "minutes", "shards")
-    table = Table(*heads[: len(rows[0])], title=title, title_justify="left", header_style="bold")
-    for row in rows:
-        table.add_row(*row)
+    from magnet.datamodules.clip import SPLITS
+    from magnet.motion.scene import FPS
+
+    shards = ["shards"] if any("shards" in split for split in splits.values()) else []
+    heads = ("split", "takes", "clips", "frames", "minutes", *shards)
+    table = Table(*heads, title=title, title_justify="left", header_style="bold")
+    for name in SPLITS:
+        split = splits.get(name, {"takes": 0, "clips": 0, "frames": 0, "clips by people": {}})
+        people = ", ".join(f"{count} of {n}" for n, count in split["clips by people"].items())
+        minutes = f"{split['frames'] / FPS / 60:.1f}"
+        row = (str(split["takes"]), f"{split['clips']} ({people})", f"{split['frames']:,}", minutes)
+        table.add_row(name, *row, *(str(len(split[key])) for key in shards))
     Console().print(table)
 
 
@@ -129,16 +131,11 @@ def show_skipped(skipped: list[tuple[str, str]]) -> None:
         show_some(lines, SKIPPED_SHOWN, ", all of them in the store's manifest.json")
 
 
-def clips_by_people(manifest: Mapping[str, Any]) -> dict[Split, dict[int, int]]:
-    """Clips of each split of a store by number of people."""
-    splits = manifest["splits"].items()
-    return {split: {int(n): count for n, count in of["clips by people"].items()} for split, of in splits}
-
-
-def show_gaps(clips: Mapping[Split, Mapping[int, int]]) -> None:
+def show_gaps(splits: Mapping[str, Mapping[str, Any]]) -> None:
     """Warn of what the splits lack, on the error stream."""
     from magnet.datamodules.preparing.check import split_gaps
 
+    clips: Any = {split: {int(n): k for n, k in of["clips by people"].items()} for split, of in splits.items()}
     for line in split_gaps(clips):
         print(f"WARNING: {line}", file=sys.stderr)
 

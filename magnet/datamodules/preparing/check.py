@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from magnet.datamodules import registry
 from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing import check_people
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all
+from magnet.datamodules.preparing.pack import split_counts
 from magnet.datamodules.preparing.prepare import absent_note, select_takes
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.recording import DataError, Reader
@@ -40,21 +41,14 @@ class CheckReport:
     name: str  # of the data set
     title: str
     problems: list[str] = field(default_factory=list)
-    counts: dict[Split, Counter[str]] = field(default_factory=dict)  # takes, clips, frames, person frames, N people
+    splits: dict[str, dict[str, Any]] = field(default_factory=dict)  # as `split_counts` says; of those with clips
     skipped: list[tuple[str, str]] = field(default_factory=list)  # take, why
     notes: list[str] = field(default_factory=list)
     scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
 
-    def clips_by_people(self) -> dict[Split, dict[int, int]]:
-        """Clips of each split that has any, by number of people."""
-        of = {
-            split: [(n.removeprefix("of "), k) for n, k in c.items() if "of " in n] for split, c in self.counts.items()
-        }
-        return {split: {int(n): count for n, count in counts} for split, counts in of.items()}
-
     def count_skipped(self, takes: int) -> None:
         """Skipped ones of so many takes are a problem."""
-        if not self.counts:
+        if not self.splits:
             self.problems.append(f"none of {takes} takes can be used")
         elif self.skipped:
             self.problems.append(f"{len(self.skipped)} of {takes} takes broke an assertion; they are listed above")
@@ -63,17 +57,6 @@ class CheckReport:
 def noted(note: str, takes: list[str]) -> str:
     """What was found, and of which take or how many."""
     return f"{note} ({takes[0] if len(takes) == 1 else f'{len(takes)} takes'})"
-
-
-def tally(counts: dict[Split, Counter[str]], split: Split, frames: list[int], people: list[int]) -> None:
-    """Add one take's clips."""
-    count = counts.setdefault(split, Counter())
-    count["takes"] += 1
-    count["clips"] += len(frames)
-    count["frames"] += sum(frames)
-    count["person frames"] += sum(f * p for f, p in zip(frames, people, strict=True))
-    for number in people:
-        count[f"of {number}"] += 1
 
 
 # -- a store -----------------------------------------------------------------------------------
@@ -117,14 +100,9 @@ def check_store(folder: StoreReader, body: Body | None = None, progress: Progres
 
 def _check_split(folder: StoreReader, split: Split, found: CheckReport) -> None:
     part, said = folder.split(split), folder.manifest["splits"][split]
-    take_of: dict[str, tuple[list[int], list[int]]] = {}
-    for c, take in enumerate(part.take):
-        frames, people = take_of.setdefault(take, ([], []))
-        frames.append(int(part.frames[c]))
-        people.append(int(part.people[c]))
-    for frames, people in take_of.values():
-        tally(found.counts, split, frames, people)
-    counted = found.counts.get(split, Counter())
+    counted = split_counts(len(set(part.take)), part.frames.tolist(), part.people.tolist())
+    if counted["clips"]:
+        found.splits[split] = counted
     for name in ("takes", "clips", "frames", "person frames"):
         if counted[name] != said[name]:
             found.problems.append(f"split {split}: the index has {counted[name]} {name}, the manifest {said[name]}")
@@ -257,6 +235,7 @@ def check_download(
         found.notes.append(absent_note(use.absent))
     notes: dict[str, list[str]] = {}
     parts: dict[str, ConvertedTake] = {}
+    clips: dict[str, tuple[list[str], list[int], list[int]]] = {}
     for take, part in convert_all(job, takes, lambda take: None, workers, progress):
         if part.error is None and len(found.scenes) < SHOWN:
             P, T = part.people[0], part.frames[0]
@@ -270,7 +249,11 @@ def check_download(
             continue
         for note in part.notes:
             notes.setdefault(note, []).append(take.name)
-        tally(found.counts, take.split or "train", list(part.frames), list(part.people))
+        takes_of, frames, people = clips.setdefault(take.split or "train", ([], [], []))
+        takes_of.append(take.name)
+        frames += part.frames
+        people += part.people
+    found.splits = {split: split_counts(len(names), *each) for split, (names, *each) in clips.items()}
     found.notes += [noted(note, takes) for note, takes in notes.items()]
     found.count_skipped(len(takes))
     return found
@@ -294,15 +277,6 @@ def draw(found: CheckReport, path: Path, body: Body | None) -> Path | None:
         scenes = [(n, s.replace(body=body.id, betas=torch.zeros_like(s.betas))) for n, s in scenes]
         title += " (drawn with the open body's mean shape)"
     return contact_sheet(scenes, path, context_frames=0, body=body, style="capsules", title=title)
-
-
-def lines(found: CheckReport) -> Iterator[tuple[str, ...]]:
-    """Rows of the table of counts: split, takes, clips by people, frames, minutes."""
-    for split in SPLITS:
-        count = found.counts.get(split, Counter())
-        people = ", ".join(f"{n} {what}" for what, n in sorted(count.items()) if what.startswith("of "))
-        minutes = count["frames"] / FPS / 60
-        yield split, f"{count['takes']}", f"{count['clips']} ({people})", f"{count['frames']:,}", f"{minutes:.1f}"
 
 
 WITHOUT: dict[Split, str] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,8 @@ def pack(
             write_shard(out, split, number, rows, [source for source, _ in group], old)
             for number, (rows, group) in enumerate(groups(mine, shard_rows))
         ]
-        shown[split] = summary(mine, shards)
+        frames, people = ([n for _, head in mine for n in getattr(head, key)] for key in ("frames", "people"))
+        shown[split] = split_counts(len(mine), frames, people) | {"shards": shards}
     failed = {s.take.name: (s.take.split, h.error) for s, h in zip(sources, heads, strict=True) if h.error is not None}
     notes = [(note, s.take.name) for s, h in zip(sources, heads, strict=True) for note in h.notes]
     persons = [(h.persons, s.take.name) for s, h in zip(sources, heads, strict=True) if h.error is None]
@@ -154,14 +155,12 @@ def _written(out: Path, name: str, suffix: str, content: bytes | Callable[[Any],
     return {"file": file, "sha256": digest}
 
 
-def summary(mine: list[tuple[PackSource, ConvertedTake]], shards: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the manifest says of a split."""
-    clips = [(f, p) for _, head in mine for f, p in zip(head.frames, head.people, strict=True)]
+def split_counts(takes: int, frames: Sequence[int], people: Sequence[int]) -> dict[str, Any]:
+    """What the manifest says of a split, from the frames and people of each of its clips."""
     return {
-        "takes": len(mine),
-        "clips": len(clips),
-        "frames": sum(f for f, _ in clips),
-        "person frames": sum(f * p for f, p in clips),
-        "clips by people": {str(n): count for n, count in sorted(Counter(p for _, p in clips).items())},
-        "shards": shards,
+        "takes": takes,
+        "clips": len(frames),
+        "frames": sum(frames),
+        "person frames": sum(f * p for f, p in zip(frames, people, strict=True)),
+        "clips by people": {str(n): count for n, count in sorted(Counter(people).items())},
     }
