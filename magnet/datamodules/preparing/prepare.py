@@ -100,8 +100,7 @@ def prepare(
             )
         folder = StoreReader(out)
         done = {keys[name]: place for name, place in packed.items()}
-        record = {"manifest": file_hash(out / MANIFEST), "takes": done}
-        write_whole(state, "state.json", as_json(record))
+        write_whole(state, "state.json", as_json({"manifest": file_hash(out / MANIFEST), "takes": done}))
         clean(folder, state, set(done))
     return PrepareReport(folder, len(todo), len(takes) - len(todo))
 
