@@ -33,13 +33,21 @@ def parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="folder for cells and page (default: %(default)s)",
     )
-    add("--budget", choices=("tiny", "small", "paper"), default="small", help="of every cell (default: %(default)s)")
+    budgets = ("tiny", "evening", "small", "paper")
+    add("--budget", choices=budgets, default="small", help="of every cell (default: %(default)s)")
     add("--ckpt_path", default="duet", metavar="MODEL", help="weights of our row (default: %(default)s)")
     add("--data", default="salsa", help="scenes of two people: salsa, synthetic2, or a file (default: %(default)s)")
     add("--configs", type=Path, default=Path("configs/report"), help="of trainings (default: %(default)s)")
     add("--shipped", action="store_true", help="leave out rows that would have to be trained")
     add("--dry_run", action="store_true", help="list the cells and what they may take, and stop")
-    add("--only", default="", metavar="TEXT", help="run only cells whose name holds this, and what these need")
+    add(
+        "--only",
+        nargs="+",
+        default=[""],
+        metavar="TEXT",
+        help="run only cells whose name holds one of these, and what these need",
+    )
+    add("--skip", nargs="+", default=[], metavar="TEXT", help="leave cells for later whose name holds one of these")
     add("--page_only", action="store_true", help="write the page from what is done")
     return options
 
@@ -70,7 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         plan.budget.speed_rounds,
         own_data,
     )
-    wanted = [cell for cell in cells if given.only in cell.name]
+    wanted = [cell for cell in cells if held(cell.name, given.only) and not held(cell.name, given.skip)]
     wanted = [cell for cell in cells if cell in wanted or cell in {each.needs for each in wanted}]
     todo = runner.missing(wanted)
     if given.dry_run:
@@ -81,7 +89,14 @@ def main(arguments: Sequence[str] = ()) -> int:
         return 0
     if not given.page_only:
         runner.run(wanted)
-    facts = {"tables": ", ".join(names), "budget": f"{given.budget}: {plan.budget}", "data": given.data}
+    facts = {"tables": ", ".join(names), "budget": f"{given.budget}: {plan.budget.told}", "data": given.data}
     facts |= {"checkpoint": given.ckpt_path, **run_folder.provenance(), "machine": machine()}
-    print(f"written: {page(blocks, store, runner.failed, facts)} and report.json")
+    written = page(blocks, store, runner.failed, facts)
+    store.pack()
+    print(f"written: {written}, report.json and cells.json")
     return int(bool(runner.failed))
+
+
+def held(name: str, texts: Sequence[str]) -> bool:
+    """Whether a name holds one of some texts."""
+    return any(text in name for text in texts)

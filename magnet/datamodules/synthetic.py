@@ -11,6 +11,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.clip import SPLITS
 from magnet.datamodules.options import Augmentation
 from magnet.datamodules.registry import register_data
+from magnet.shared import once
 from magnet.synthesis import COUPLINGS, CoupledScene, synthesize
 
 NOT_COMPOSED = Augmentation(compose=0.0)
@@ -79,6 +80,10 @@ class Synthetic(MotionDataModule):
 
     def clips(self, split: Split) -> list[Clip]:
         """All clips of a split; the same every time."""
+        key = (tuple(self.kinds), self.counts[split], self.clip_frames, self.scene_seed, split, self.body_model)
+        return once(("synthetic", *key), lambda: self._made(split))
+
+    def _made(self, split: Split) -> list[Clip]:
         clips = []
         for i in range(self.counts[split]):
             one = self.scene(split, i)

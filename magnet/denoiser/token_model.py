@@ -20,6 +20,7 @@ from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
 from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
+from magnet.shared import digest, is_sharing, once
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
 from magnet.tokenizer.module import RawPose, Tokenizer
@@ -41,6 +42,7 @@ class TokenModel(L.LightningModule):
 
     def __init__(self) -> None:
         super().__init__()
+        self._tokenizer_digest: str | None = None
         self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
 
     # -- parts ---------------------------------------------------------------------------------
@@ -52,6 +54,7 @@ class TokenModel(L.LightningModule):
     def hold(self, tokenizer: PoseTokenizer, layout: TokenLayout) -> None:
         """Freeze the tokenizer, and make room for the statistics of its tokens."""
         self.tokenizer = tokenizer.requires_grad_(False).eval()
+        self._tokenizer_digest = None
         self.layout = layout
         self.normalizer = Normalizer(layout.width, floor=0.0)
 
@@ -153,7 +156,7 @@ class TokenModel(L.LightningModule):
     def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
         scene = scene.pad_agents(self.layout.agents)
-        latent = self.encode(scene)
+        latent = self._encoded(scene)
         with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
@@ -161,6 +164,16 @@ class TokenModel(L.LightningModule):
             whole = scene.valid.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
             there = there & whole[:, :, None, None]
         return tokens, there
+
+    def _encoded(self, scene: Scene) -> Tensor:
+        """As `encode`; runs that share their work encode a batch once that all of them see."""
+        trained = isinstance(self.tokenizer, Tokenizer)  # else latents are as wide as poses, and cost nothing
+        if not trained or not is_sharing() or self.device.type != "cpu":
+            return self.encode(scene)
+        if self._tokenizer_digest is None:  # it is frozen
+            self._tokenizer_digest = digest(*self.tokenizer.state_dict().values())
+        seen = digest(scene.body_rot, scene.T_world_root, scene.betas, scene.present, scene.valid)
+        return once(("latents", self._tokenizer_digest, self.quantized, seen), lambda: self.encode(scene))
 
     # -- before training ------------------------------------------------------------------------
 

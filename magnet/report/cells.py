@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -14,6 +15,7 @@ from magnet.files import write_whole
 
 Kind = Literal["train", "measure", "speed", "long"]
 FORMAT = 1
+PACKED = "cells.json"
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Budget:
         seeds: of sampling, or of training where something is trained.
         steps: of each training; None: as its configuration says.
         frames: of a long generation.
-        speed_rounds: how often a speed is taken; the median counts.
+        speed_rounds: how often a speed is taken.
+        batch: windows of a training step; None: as the configuration says.
     """
 
     scenes: int
@@ -35,14 +38,25 @@ class Budget:
     steps: int | None
     frames: int
     speed_rounds: int
+    batch: int | None = None
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        steps = "as configurations say" if self.steps is None else f"of {self.steps} steps"
+        steps += "" if self.batch is None else f" of {self.batch} windows"
+        words = [f"at most {self.scenes} test scenes", f"{self.samples} samples of each", f"{self.seeds} seeds"]
+        return ", ".join([*words, f"trainings {steps}", f"{self.frames} frames in a long generation"])
 
 
 BUDGETS = {
     "tiny": Budget(2, 2, 2, 2, 40, 1),
+    "evening": Budget(8, 2, 3, 200, 300, 4, batch=8),
     "small": Budget(8, 5, 3, None, 300, 3),
     "paper": Budget(1_000_000, 10, 3, None, 1800, 5),
 }
-"""`tiny` is for tests, `small` for two cores and a day, `paper` for a GPU and the paper's own data."""
+"""`tiny` is for tests, `evening` for a core and two hours, `small` for two cores and a day, `paper` for a GPU and the
+paper's own data."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +67,14 @@ class Weights:
         checkpoint: shipped name or path; None: `config` is trained.
         config: name of a configuration to train, without .yaml.
         steps: of its training; None: as the configuration says.
+        batch: windows of each step; None: as the configuration says.
         digest: of the weights' file, or of the configuration with all that it extends.
     """
 
     checkpoint: str | None = None
     config: str | None = None
     steps: int | None = None
+    batch: int | None = None
     digest: str = ""
 
 
@@ -115,7 +131,7 @@ class Cell:
 
 @dataclass
 class Store:
-    """Results of cells in a folder, one JSON file each, whole or not there.
+    """Results of cells in a folder, one JSON file each, whole or not there; those in its `cells.json` count, too.
 
     Args:
         folder: of the report.
@@ -124,8 +140,18 @@ class Store:
     folder: Path
     kept: dict[str, dict[str, Any]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        packed = self.folder / PACKED
+        if packed.is_file():
+            self.kept |= json.loads(packed.read_text(encoding="utf-8"))
+
     def path(self, cell: Cell) -> Path:
         return self.folder / "cells" / f"{cell.name}.json"
+
+    def film(self, cell: Cell) -> Path | None:
+        """Where a scene of a measurement is kept for films: of the first seed alone."""
+        shown = cell.kind == "measure" and cell.seed == 0
+        return self.folder / "films" / f"{cell.name}.npz" if shown else None
 
     def get(self, cell: Cell) -> dict[str, Any] | None:
         """What a cell gave; None where it is not done, or was done by other settings."""
@@ -137,7 +163,16 @@ class Store:
                 return None  # not ours: what is ours is whole
             if content.get("settings") == cell.settings:
                 self.kept[cell.name] = content
-        return self.kept.get(cell.name)
+        found = self.kept.get(cell.name)
+        return found if found and found.get("settings") == cell.settings else None
+
+    def pack(self) -> None:
+        """Write all that was asked for into one file, a line a cell, to seven digits: small enough to be passed on."""
+        found = self.kept
+        lines = [
+            f"{json.dumps(name)}: {json.dumps(short(found[name]), separators=(',', ':'))}" for name in sorted(found)
+        ]
+        write_whole(self.folder, PACKED, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
     def put(self, cell: Cell, result: Mapping[str, Any]) -> dict[str, Any]:
         """Keep what a cell gave: written aside, then renamed, so that a kill leaves all of it or nothing."""
@@ -151,10 +186,18 @@ class Store:
 
     def of_kind(self, kind: Kind) -> list[float]:
         """Seconds that finished cells of a kind took."""
-        seconds = []
-        for path in sorted((self.folder / "cells").glob(f"{kind}-*.json")):
-            try:
-                seconds.append(float(json.loads(path.read_text(encoding="utf-8"))["seconds"]))
-            except (ValueError, KeyError):
-                continue
-        return seconds
+        mine = {path.stem: path for path in sorted((self.folder / "cells").glob(f"{kind}-*.json"))}
+        found = [content for name, content in self.kept.items() if name.startswith(kind) and name not in mine]
+        for path in mine.values():
+            with contextlib.suppress(ValueError):
+                found.append(json.loads(path.read_text(encoding="utf-8")))
+        return [float(content["seconds"]) for content in found if "seconds" in content]
+
+
+def short(content: Any) -> Any:
+    """The same with numbers of seven digits. content: JSON-ready"""
+    if isinstance(content, dict):
+        return {name: short(value) for name, value in content.items()}
+    if isinstance(content, list):
+        return [short(value) for value in content]
+    return float(f"{content:.7g}") if isinstance(content, float) else content

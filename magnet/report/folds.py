@@ -7,7 +7,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import MetricCollection
 
@@ -97,7 +99,13 @@ class FoldScoring(Scoring):
         self.folds = {TRUTH: Folds(fps, False), **{name: Folds(fps, name != TRAINING) for name in measured}}
         alone = bool((~self.sees(self.slots).generated).all(dim=0).any())
         self.copied = {name: Folds(fps, everybody=True) for name in self.given_methods if alone}
-        return {name: _Both(folds, self.copied.get(name)) for name, folds in self.folds.items()}
+        self.fed = {name: _Both(folds, self.copied.get(name)) for name, folds in self.folds.items()}
+        return self.fed
+
+    def shown(self) -> dict[str, NDArray[np.float32]]:
+        """By method: the first sample of the first scene, in the world that scenes share. -> each (T, P, 22, 3)"""
+        first = {name: fed.first for name, fed in self.fed.items() if name != TRAINING}
+        return {name: joints.cpu().float().numpy() for name, joints in first.items() if joints is not None}
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """By method: `value`, and `without` each unit."""
@@ -111,14 +119,17 @@ class FoldScoring(Scoring):
 
 
 class _Both:
-    """One batch to both rows of a method."""
+    """One batch to both rows of a method; remembers the first sample of the first scene."""
 
     def __init__(self, folds: Folds, copied: Folds | None) -> None:
         self.all = [folds] if copied is None else [folds, copied]
+        self.first: Tensor | None = None
 
-    def update(self, *args: Tensor, **kwargs: Tensor) -> None:
+    def update(self, joints: Tensor, future: Tensor, present: Tensor, **kwargs: Tensor) -> None:
+        if self.first is None:
+            self.first = joints[0, 0][:, present[0]]
         for folds in self.all:
-            folds.update(*args, **kwargs)
+            folds.update(joints, future, present, **kwargs)
 
 
 def _of_motion(row: Mapping[str, float]) -> Row:

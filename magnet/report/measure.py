@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import importlib
-import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from magnet.metrics.frechet import moments
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.tokens import TokenLayout
 from magnet.report.cells import Cell
+from magnet.report.film import keep
 from magnet.report.folds import FoldScoring
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry as tasks
@@ -101,8 +101,11 @@ def predictor(cell: Cell, data: MotionDataModule, checkpoint: str, horizon: int 
     return evaluator.predict_joints
 
 
-def measure(cell: Cell, checkpoint: str | None) -> dict[str, Any]:
-    """Numbers of all rows of a cell, with those of all scenes but one; without a model, of baselines and floors."""
+def measure(cell: Cell, checkpoint: str | None, films: Path | None = None) -> dict[str, Any]:
+    """Numbers of all rows of a cell, with those of all scenes but one; without a model, of baselines and floors.
+
+    `films`: where the first scene is kept for a film.
+    """
     data = data_of(cell)
     data.prepare_data()
     task = task_of(cell)
@@ -120,11 +123,16 @@ def measure(cell: Cell, checkpoint: str | None) -> dict[str, Any]:
     for batch in data.test_dataloader():
         scoring.step(batch, list(range(done, done + batch.scenes)))
         done += batch.scenes
+    if films is not None:
+        keep(films, scoring.shown())
     return {"rows": scoring.rows(), "scenes": done}
 
 
 def speed(cell: Cell, checkpoint: str, shipped: str, rounds: int) -> dict[str, Any]:
-    """Frames a second of one scene, and the shipped model's in turn with it, so that a busy machine slows both."""
+    """Frames a second of one scene, and the shipped model's in turn with it, so that a busy machine slows both.
+
+    Rounds stand in for scenes: an interval comes from leaving out each.
+    """
     data = data_of(cell)
     data.prepare_data()
     scene = next(iter(data.test_dataloader())).select([0])
@@ -139,9 +147,16 @@ def speed(cell: Cell, checkpoint: str, shipped: str, rounds: int) -> dict[str, A
             began = time.perf_counter()
             method(short, 1, generators_of(cell.seed, [round_number], 1))
             seconds[name].append(time.perf_counter() - began)
-    took = {name: statistics.median(each[1:]) for name, each in seconds.items()}
-    value = {"fps": SPEED_FRAMES / took[OURS], "times_shipped": took["shipped"] / took[OURS]}
-    return {"rows": {OURS: {"value": value, "without": {}}}}
+    counted = {name: each[1:] for name, each in seconds.items()}
+    without = {str(k): _rates(counted, k) for k in range(rounds)} if rounds > 1 else {}
+    return {"rows": {OURS: {"value": _rates(counted), "without": without}}}
+
+
+def _rates(seconds: Mapping[str, Sequence[float]], left_out: int | None = None) -> dict[str, float]:
+    """Frames a second over all rounds but one, and how many times the shipped model's that is."""
+    took = {name: [each for k, each in enumerate(of) if k != left_out] for name, of in seconds.items()}
+    ours, shipped = (sum(took[name]) / len(took[name]) for name in (OURS, "shipped"))
+    return {"fps": SPEED_FRAMES / ours, "times_shipped": shipped / ours}
 
 
 def long(cell: Cell, checkpoint: str) -> dict[str, Any]:
@@ -194,9 +209,9 @@ def _distance(made: Tensor, real: Tensor) -> float:
     return float(frechet_distance(*there[0], *there[1]))
 
 
-def run(cell: Cell, checkpoint: str | None, shipped: str, rounds: int) -> Mapping[str, Any]:
+def run(cell: Cell, checkpoint: str | None, shipped: str, rounds: int, films: Path | None = None) -> Mapping[str, Any]:
     """What a cell other than a training gives."""
     if cell.kind == "measure":
-        return measure(cell, checkpoint)
+        return measure(cell, checkpoint, films)
     assert checkpoint is not None
     return speed(cell, checkpoint, shipped, rounds) if cell.kind == "speed" else long(cell, checkpoint)

@@ -11,11 +11,14 @@ from pathlib import Path
 
 from magnet.report import measure
 from magnet.report.cells import Cell, Store
+from magnet.shared import sharing
 
 GUESSED = {"train": 600.0, "measure": 45.0, "speed": 60.0, "long": 60.0}
 """Seconds of a cell where none of its kind is done: two cores, small budget."""
 
 BAR = 24
+CHECKPOINTED = 100
+"""Training steps after which a training that is stopped can go on, where the budget says how large a batch is."""
 
 Fit = Callable[[list[str]], int]
 """`magnet fit` with these arguments. -> its exit code"""
@@ -45,8 +48,15 @@ class Runner:
     failed: dict[Cell, str] = field(default_factory=dict)
 
     def missing(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Those that are not done."""
-        return [cell for cell in cells if self.store.get(cell) is None]
+        """Those that are not done, and trainings that are, where their weights are wanted and lie elsewhere."""
+        wanted = {cell for cell in cells if self.store.get(cell) is None}
+        trainings = {cell.needs for cell in wanted if cell.needs is not None}
+        wanted |= {training for training in trainings if not self._checkpoint(training).is_file()}
+        return [cell for cell in cells if cell in wanted]
+
+    def _checkpoint(self, training: Cell) -> Path:
+        """Where the weights of a training lie once it is done."""
+        return self.store.folder / "trainings" / training.name / "checkpoints" / "last.ckpt"
 
     def seconds(self, cell: Cell) -> float:
         """How long a cell may take: as long as others of its kind did, here."""
@@ -55,7 +65,10 @@ class Runner:
 
     def run(self, cells: Sequence[Cell]) -> None:
         """Run what is missing, in order. What cannot be done is in `failed` then, with the reason."""
-        todo = self.missing(cells)
+        with sharing():  # trainings of a seed see the same batches
+            self._run_all(self.missing(cells))
+
+    def _run_all(self, todo: Sequence[Cell]) -> None:
         for number, cell in enumerate(todo):
             left = sum(self.seconds(each) for each in todo[number:])
             full = BAR * number // max(len(todo), 1)
@@ -75,7 +88,8 @@ class Runner:
         if cell.kind == "train":
             result = {"rows": {}, "checkpoint": str(self._train(cell).relative_to(self.store.folder))}
         else:
-            result = dict(measure.run(cell, self._weights(cell), self.shipped, self.rounds))
+            where = (self._weights(cell), self.shipped, self.rounds, self.store.film(cell))
+            result = dict(measure.run(cell, *where))
         self.store.put(cell, {**result, "seconds": round(time.perf_counter() - began, 1)})
 
     def _weights(self, cell: Cell) -> str | None:
@@ -94,13 +108,15 @@ class Runner:
         config = self.configs / f"{cell.model.config}.yaml"
         if not config.is_file():
             raise FileNotFoundError(f"{config}: no such configuration to train")
-        folder = self.store.folder / "trainings" / cell.name
-        last = folder / "checkpoints" / "last.ckpt"
+        last = self._checkpoint(cell)
+        folder = last.parents[1]
         words = ["--config", str(config)]
         words += ["--config", str(self.data)] if self.data is not None else []
         words += ["--out", str(folder), "--seed_everything", str(cell.seed)]
         words += ["--model.seed", str(cell.seed), "--data.seed", str(cell.seed)]
         words += ["--trainer.max_steps", str(cell.model.steps)] if cell.model.steps is not None else []
+        if (batch := cell.model.batch) is not None:
+            words += ["--data.batch_size", str(batch), "--data.epoch_size", str(batch * CHECKPOINTED)]
         if last.is_file():
             words += ["--ckpt_path", str(last)]
         elif folder.exists():

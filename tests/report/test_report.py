@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageSequence
 
 from magnet import cli
 from magnet.body import load_body
+from magnet.cli.train import run_trainer
+from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import Evaluator
 from magnet.metrics import FootSkating, FrechetDistance, MotionInteraction, PositionError
 from magnet.motion.tokens import TokenLayout
-from magnet.report import measure
+from magnet.report import measure, run
 from magnet.report.cells import BUDGETS, Cell, Store, Weights
+from magnet.report.film import film, keep, kept
 from magnet.report.folds import Folds
 from magnet.report.page import page
 from magnet.report.run import Runner
@@ -26,6 +32,16 @@ from magnet.report.tables import PAPER, TABLES, ReportOptions, cells_of, named
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 from tests.evaluation.test_evaluator import FAST, data
+
+TINY_TRAINING = """
+data:
+  class_path: Synthetic
+  init_args: {people: [2], max_agents: 2, train_clips: 2, val_clips: 1, clip_frames: 120, window_frames: 32}
+model:
+  class_path: Denoiser
+  init_args: {tokenizer: duet, network: {width: 24, layers: 1, heads: 2, level_width: 16, agent_width: 16}}
+trainer: {accelerator: cpu, max_steps: 4, logger: false, enable_progress_bar: false}
+"""
 
 PLAN = ReportOptions(BUDGETS["tiny"], configs=Path(__file__).parents[2] / "configs" / "report")
 
@@ -87,12 +103,12 @@ def test_numbers_without_a_scene_are_those_of_the_other_scenes() -> None:
     folds.update(joints[:, :2], future[:2], present[:2], agents=agents, units=torch.tensor([0, 1]))
     folds.update(joints[:, 2:], future[2:], present[2:], agents=agents, units=torch.tensor([0]))
     value, without = folds.rows()
-    for kept, row in (([0, 1, 2], value), ([1], without[0]), ([0, 2], without[1])):
+    for left, row in (([0, 1, 2], value), ([1], without[0]), ([0, 2], without[1])):
         for metric in (FrechetDistance(), MotionInteraction(), FootSkating(), PositionError()):
-            metric.update(joints[:, kept], future[kept], present[kept], agents=agents)
+            metric.update(joints[:, left], future[left], present[left], agents=agents)
             for name, number in metric.compute().items():
                 if name in row:
-                    assert row[name] == pytest.approx(float(number), rel=1e-9), (kept, name)
+                    assert row[name] == pytest.approx(float(number), rel=1e-9), (left, name)
     assert {"fd", "mi", "fs", "mpjpe", "div", "ip_ratio", "fd_pair"} <= value.keys()
 
 
@@ -304,3 +320,93 @@ def test_a_small_report_is_made_from_nothing(tmp_path: Path, capsys: pytest.Capt
     capsys.readouterr()
     assert cli.main(words) == 0
     assert "/" not in capsys.readouterr().out.partition("written")[0]
+
+
+class Gone(BaseException):
+    """Stands for a kill: nothing that is to be done at an ordinary end is done."""
+
+
+@pytest.mark.slow
+def test_a_training_and_a_measurement_that_were_killed_give_what_they_give_undisturbed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill in step 3 of 4, with a checkpoint of step 2, and one after a measurement, before its file is there."""
+    (tmp_path / "base.yaml").write_text(TINY_TRAINING, encoding="utf-8")
+    monkeypatch.setattr(run, "CHECKPOINTED", 2)
+    weights = Weights(config="base", steps=4, batch=2)
+    measured = Cell("measure", 0, "synthetic2", weights, "joint_future", scenes=2, samples=2)
+    assert measured.needs is not None
+    step, measuring, kills = Denoiser.training_step, measure.run, []
+
+    def killed_step(self: Denoiser, batch: Any, batch_idx: int) -> torch.Tensor:
+        if self.global_step == 2 and not kills:
+            kills.append("training")
+            raise Gone
+        return step(self, batch, batch_idx)
+
+    def killed_measurement(*words: Any) -> Any:
+        result = measuring(*words)
+        if len(kills) < 2:
+            kills.append("measurement")
+            raise Gone
+        return result
+
+    found = []
+    for name, disturbed in (("calm", False), ("killed", True)):
+        store = Store(tmp_path / name)
+        if disturbed:
+            monkeypatch.setattr(Denoiser, "training_step", killed_step)
+            monkeypatch.setattr(measure, "run", killed_measurement)
+        for _ in range(3 if disturbed else 1):
+            runner = Runner(store, lambda words: run_trainer("fit", words), tmp_path, "duet", say=lambda _: None)
+            with contextlib.suppress(Gone):
+                runner.run([measured.needs, measured])
+        assert not runner.failed
+        content, trained = store.get(measured), store.get(measured.needs)
+        assert content is not None and trained is not None
+        found.append((content["rows"], Denoiser.load(store.folder / trained["checkpoint"]).state_dict()))
+    assert kills == ["training", "measurement"]
+    (rows, calm), (again, killed) = found
+    assert rows == again
+    assert all(torch.equal(value, killed[name]) for name, value in calm.items())
+
+
+def test_a_report_goes_on_from_packed_cells_and_trains_again_only_what_is_wanted(tmp_path: Path) -> None:
+    weights = Weights(config="base", steps=2)
+    first, second = (Cell("measure", 0, "salsa", weights, "joint_future", scenes=n, samples=2) for n in (2, 3))
+    assert first.needs is not None
+    store = Store(tmp_path / "there")
+    store.put(first.needs, {"rows": {}, "checkpoint": "trainings/some", "seconds": 1.0})
+    rows = {"ours": {"value": {"fd": 1 / 3}, "without": {}}}
+    store.put(first, {"rows": rows, "seconds": 2.0})
+    store.pack()
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "cells.json").write_text(
+        (tmp_path / "there" / "cells.json").read_text(encoding="utf-8"), encoding="utf-8"
+    )
+    runner = Runner(Store(folder), lambda _: 0, PLAN.configs, "duet")
+    content = runner.store.get(first)
+    assert content is not None and content["rows"]["ours"]["value"]["fd"] == pytest.approx(1 / 3, rel=1e-6)
+    assert runner.store.of_kind("measure") == [2.0]
+    assert not runner.missing([first.needs, first])
+    assert runner.missing([first.needs, first, second]) == [first.needs, second]
+
+
+# -- films -----------------------------------------------------------------------------------------
+
+
+def test_a_film_has_a_frame_for_every_third_of_the_motion_and_people_in_every_panel(tmp_path: Path) -> None:
+    joints = load_body().joints(random_scene(2, 30, 2, torch.Generator().manual_seed(0))).numpy()
+    keep(tmp_path / "scene.npz", {"ground truth": joints[0], "ours": joints[1]})
+    again = kept(tmp_path / "scene.npz")
+    assert list(again) == ["ground truth", "ours"]
+    assert abs(again["ours"] - joints[1]).max() <= 0.0006  # millimetres
+    assert kept(tmp_path / "nothing.npz") == {}
+    (tmp_path / "film.webp").write_bytes(film(again))
+    with Image.open(tmp_path / "film.webp") as moving:
+        assert moving.n_frames == 10  # type: ignore[attr-defined]
+        frames = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(moving)]
+    for panel in np.split(frames[0], 2, axis=1):
+        assert (np.ptp(panel, axis=-1) > 60).sum() > 50  # coloured strokes
+    assert abs(frames[0] - frames[-1]).max() > 60
