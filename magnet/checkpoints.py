@@ -1,4 +1,4 @@
-"""Trained models that come with the package, and the format they are kept in.
+"""Reads and writes checkpoints, and knows the trained models in the package.
 
 A released model is a folder: `config.json` (how to build it, what it was trained on, a hash of every
 part) and tensors in safetensors files of at most 16 MB. Nothing in it can run code.
@@ -24,25 +24,25 @@ from magnet.files import file_hash, inside, write_whole
 from magnet.old_names import renamed_checkpoint
 
 FOLDER = Path(__file__).parent / "weights"
-"""Where the models lie that come with the package."""
+"""Folder of the models in the package."""
 DEFAULT = "duet"
 PART_BYTES = 16_000_000
 FORMAT = 1
 
 HUB = "hub:"
-"""What a name begins with that means a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
+"""Prefix of the name of a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
 HUB_FILES = ["config.json", "*.safetensors", "README.md"]
 
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config")
 
 
 def names() -> list[str]:
-    """Models that come with the package."""
+    """Names of the models in the package."""
     return sorted(path.parent.name for path in FOLDER.glob("*/config.json"))
 
 
 def named(name_or_path: str | Path) -> Path:
-    """The folder of a shipped model where there is one of that name, one fetched from a hub, else the path as it is.
+    """The folder of a shipped model of that name, or of a hub's model after fetching it; otherwise the path itself.
 
     Raises:
         ValueError, ImportError: as `from_hub`.
@@ -54,7 +54,7 @@ def named(name_or_path: str | Path) -> Path:
 
 
 def from_hub(name: str) -> Path:
-    """The folder of a released model that is fetched from Hugging Face's hub once and then kept in its cache.
+    """The folder of a model of Hugging Face's hub, fetched once and then kept in the hub's cache.
 
     Only weights, the configuration and the card are fetched: no code, and nothing pickled.
 
@@ -86,7 +86,7 @@ def from_hub(name: str) -> Path:
 
 
 def resolve(name_or_path: str | Path | None = None) -> Path:
-    """The checkpoint that a name or path means; None is the model that comes with the package.
+    """The path of a checkpoint, by name or path; None is the default model of the package.
 
     Raises:
         ValueError: neither a model of the package nor a file, or as `from_hub`.
@@ -99,10 +99,10 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
 
 
 def read(path: str | Path, halves: bool = False) -> dict[str, Any]:
-    """A checkpoint as Lightning wants it, from a released folder or a file of Lightning's own, of any version.
+    """A checkpoint in Lightning's form, from a released folder or one of Lightning's files, of any version.
 
-    `halves`: weights that were released in float16 stay so, for a caller who copies them into a model at once; else
-    as much memory as the model takes would be held beside it, and not all of it comes back.
+    With `halves`, weights that were released in float16 stay so, for a caller who copies them into a model at once.
+    Converting them here would take as much memory again as the model, and not all of it would be freed.
 
     Raises:
         ValueError: not a checkpoint, damaged, or of a later format.
@@ -113,7 +113,7 @@ def read(path: str | Path, halves: bool = False) -> dict[str, Any]:
 
 
 def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]:
-    """As `read`, of a file that is known to be whole; with `mmap` only what is looked at is read from the disk.
+    """As `read`, of a file whose hash was checked. With `mmap` only the tensors that are used are read from the disk.
 
     Raises:
         ValueError: not a checkpoint, or of a later format.
@@ -133,18 +133,18 @@ def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]
 
 
 def checksum_file(path: Path) -> Path:
-    """Where the SHA-256 of a checkpoint lies, in a line that `sha256sum -c` reads."""
+    """The file with a checkpoint's SHA-256, in a line that `sha256sum -c` reads."""
     return path.with_name(path.name + ".sha256")
 
 
 def verify(path: Path) -> None:
-    """A checkpoint's bytes are those that were written, as far as can be known.
+    """Check that a checkpoint's bytes are those that were written.
 
-    By the checksum beside it; a checkpoint without one, as older versions and others wrote it, by the CRC-32 that its
-    archive keeps of each record.
+    The checksum beside it decides. A checkpoint without one, of an older version or another program, is checked by the
+    CRC-32 of each record in its archive.
 
     Raises:
-        ValueError: they are not; says what to do.
+        ValueError: they differ; says what to do.
     """
     beside = checksum_file(path)
     if path.is_file() and beside.is_file():
@@ -218,7 +218,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
 
 
 def _config_hash(config: dict[str, Any]) -> str:
-    """Of all that a config.json says but this hash itself."""
+    """SHA-256 of a config.json without this hash itself."""
     said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
 
@@ -229,7 +229,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     Args:
         checkpoint: as Lightning saved it.
         folder: made if missing; older parts in it are removed.
-        about: for config.json: what the model was trained on, and how.
+        about: what the model was trained on, and how, for config.json.
         half: keep two-dimensional and larger weights in float16; statistics stay as they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -269,10 +269,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
 
 
 class CheckpointIO(TorchCheckpointIO):
-    """Lets Lightning load released folders as it loads its own checkpoints; never unpickles anything else.
-
-    What it writes has a checksum beside it.
-    """
+    """Lets Lightning load released folders like its own checkpoints, and writes a checksum beside each checkpoint."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         if storage_options is not None or "://" in str(path):  # elsewhere than on a disk

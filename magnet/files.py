@@ -1,4 +1,4 @@
-"""Files that come from outside or must last: whole or not there, hashed, and bounded before memory is taken."""
+"""Writes files whole or not at all, hashes them, and bounds what is read from untrusted ones."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ import numpy as np
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 ANYHOW, RATIO = 64 * 2**20, 100
-"""Bytes that any array of an npz may unpack to, and how many times its packed size a larger one may."""
+"""Any array of an npz may unpack to so many bytes, and a larger one to so many times its packed size."""
 
 
 class CannotWrite(OSError):
-    """A disk is full, or a place may not be written to; names the path and says what to do next."""
+    """A disk is full, or a path may not be written; names the path and says what to do next."""
 
 
 class Refused(ValueError):
-    """A file that is not read for what it is, before anything of it is; names it and says what to do."""
+    """A file that is refused before it is read; names it and says what to do."""
 
 
 # -- writing -----------------------------------------------------------------------------------
@@ -34,7 +34,7 @@ class Refused(ValueError):
 
 @contextmanager
 def writing(path: str | Path, advice: str) -> Iterator[None]:
-    """Say which path it was, and what to do next, when the disk is full or does not take a file.
+    """Name the path, and say what to do next, if the disk is full or refuses a file.
 
     Args:
         path: file or folder that the block writes.
@@ -60,7 +60,7 @@ def writing(path: str | Path, advice: str) -> Iterator[None]:
 
 
 def _about(error: OSError, path: Path) -> bool:
-    """Whether an error is about a path, its folders or what is in it, and not about something else that was read."""
+    """Whether an error is about a path, its folders or its content, and not about another file."""
     if not isinstance(error.filename, str | bytes | os.PathLike):
         return True
     named = Path(os.fsdecode(error.filename))
@@ -68,7 +68,7 @@ def _about(error: OSError, path: Path) -> bool:
 
 
 def _space(path: Path) -> str:
-    """How much is left where a path is or would be; nothing where that is not known."""
+    """The free space where a path is or would be, in words; empty if unknown."""
     there = next((place for place in (path, *path.absolute().parents) if place.exists()), None)
     try:
         return "" if there is None else f" ({shutil.disk_usage(there).free / 2**20:,.1f} MiB are free)"
@@ -77,7 +77,7 @@ def _space(path: Path) -> str:
 
 
 class HashedFile:
-    """A file that is hashed while it is written, and remembers an error that a library may hide behind its own."""
+    """Hashes a file while it is written, and keeps an error that a library may replace by its own."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file, self.digest = file, hashlib.sha256()
@@ -105,11 +105,11 @@ def write_whole(
     """All of a file or none: written aside, synced, renamed. Returns its name and sha256.
 
     Args:
-        folder: where; it exists.
-        name: the file's, or what makes it of the sha256.
-        content: all bytes, or what is given something to call `write(bytes)` of.
-        ready: is called with the sha256 once the file is whole, before it takes its place.
-        advice: what to do where the disk is full.
+        folder: an existing folder.
+        name: the file's name, or a function of its sha256.
+        content: all bytes, or a function of an object with `write(bytes)`.
+        ready: called with the sha256 when the file is whole, before it is renamed.
+        advice: what to do if the disk is full.
 
     Raises:
         CannotWrite: the disk is full, or the folder does not take files; nothing is left behind.
@@ -140,7 +140,7 @@ def write_whole(
 
 
 def sync(folder: Path) -> None:
-    """Make renames in a folder last."""
+    """Write renames in a folder to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -158,11 +158,11 @@ def file_hash(path: Path) -> str:
 
 
 def regular(path: Path) -> Path:
-    """The path, when a plain file or a link to one is there: a pipe or a device would never end.
+    """The path, if a plain file or a link to one is there; reading a pipe or a device would never end.
 
     Raises:
         FileNotFoundError: nothing is there, or a link leads nowhere.
-        Refused: something else is.
+        Refused: it is something else.
     """
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
@@ -173,7 +173,7 @@ def regular(path: Path) -> Path:
 
 
 def inside(folder: Path, name: Any) -> Path:
-    """The file of a folder that an index names, which is a plain name: no index leads out of its folder.
+    """The file of a folder that an index names. The name must be plain, so that no index leads out of its folder.
 
     Raises:
         Refused: it is a path, or no name at all.
@@ -184,7 +184,7 @@ def inside(folder: Path, name: Any) -> Path:
 
 
 def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:
-    """An npz without pickles, opened, when what it unpacks to is in proportion to what it holds.
+    """Open an npz without pickles, unless it unpacks to far more than its size.
 
     Args:
         path: the file.

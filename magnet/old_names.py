@@ -1,7 +1,7 @@
-"""What checkpoints and configurations of earlier versions call things, and what they are called now.
+"""The names of earlier versions' options, classes and weights, and their new names.
 
-The one map of names. Whoever renames an option, a class or a weight adds a line here; the reader of checkpoints
-(`magnet.checkpoints.read`) and that of configuration files apply it. Everything is idempotent: new names stay.
+Whoever renames an option, a class or a weight adds a line here. The readers of checkpoints (`magnet.checkpoints.read`),
+of configuration files and of the command line apply the map. Everything is idempotent: new names stay.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 Options = dict[str, Any]
 
 CLASSES: dict[str, str] = {"magnet.denoiser.averaging.WeightEMA": "magnet.training.ema.WeightEMA"}
-"""Dotted paths of classes that have moved or changed their name."""
+"""Dotted paths of classes that were moved or renamed."""
 
 OPTIMIZER: dict[str, str | None] = {
     "learning_rate": "optimizer.learning_rate",
@@ -116,17 +116,17 @@ OPTIONS: dict[str, dict[str, str | None]] = {
     "data": DATA,
     "sampler": SAMPLER,
 }
-"""Old options by where they stand, with their new names; a dotted one lies in a group. None: the option is gone.
+"""New names of old options, by class or key; a dotted name is in a group. None: the option is gone.
 
-`Denoiser` and `Tokenizer` are classes under `model`; `model` is for what a file says of no class in particular. `data`
-is for all data sets.
+`Denoiser` and `Tokenizer` are classes under `model`; `model` is for options of a file that names no class. `data` is
+for all data sets.
 """
 
 VALUES: dict[tuple[str, str], dict[Any, Any]] = {
     ("Denoiser", "target"): {"quantised": "quantized"},
     ("model", "target"): {"quantised": "quantized"},
 }
-"""Old values of options, by where they stand and by the option's new name."""
+"""New values for old ones, by class or key and the option's new name."""
 
 STATE = [
     (r"(^|\.)statistics\.count$", r"\1normalizer.ready"),
@@ -143,11 +143,11 @@ STATE = [
 """Old names of weights as regular expressions, applied in order."""
 
 STATES = ("state_dict", "current_model_state")
-"""Where a checkpoint holds weights; the second is that of a run with averaged weights."""
+"""Keys of a checkpoint that hold weights; the second is that of a run with averaged weights."""
 
 
 def renamed_checkpoint(checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint of any version as this version would have written it. The given one is not changed."""
+    """A checkpoint of any version in the names of this one; the given one is not changed."""
     new = dict(checkpoint)
     for key in STATES:
         if isinstance(new.get(key), dict):
@@ -168,13 +168,13 @@ def renamed_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
         now = name
         for pattern, replacement in STATE:
             now = re.sub(pattern, replacement, now)
-        # What was a count of tokens is now only whether there were any.
+        # Once a count of tokens, now a bool.
         new[now] = value > 0 if now.endswith(".ready") and value.dtype != torch.bool else value
     return new
 
 
 def renamed_config(config: Options) -> tuple[Options, dict[str, str | None]]:
-    """The options of a file or of a checkpoint under their new names, and which ones changed: old to new."""
+    """The options of a file or a checkpoint under their new names, and those that changed, old to new."""
     new = copy.deepcopy(config)
     changed: dict[str, str | None] = {}
     for key in ("model", "data", "sampler"):
@@ -187,11 +187,11 @@ def renamed_config(config: Options) -> tuple[Options, dict[str, str | None]]:
 
 
 def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str | None]]:
-    """Options of one class under their new names, and which ones changed: old to new.
+    """Options of one class under their new names, and those that changed, old to new.
 
     Args:
         kind: a key of `OPTIONS`.
-        options: by name, groups as dictionaries. What is said under a new name beats what is said under its old one.
+        options: by name, groups as dictionaries. A value under a new name beats one under the old name.
     """
     new, changed = copy.deepcopy(options), {}
     for old, now in OPTIONS.get(kind, {}).items():
@@ -217,7 +217,7 @@ def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str
 
 
 def renamed_flags(flags: Sequence[str]) -> tuple[list[str], dict[str, str | None]]:
-    """A command line whose flags have their new names, and which ones changed; a flag that is gone is left out."""
+    """A command line with flags of the new names, and those that changed; a flag that is gone is left out."""
     new: list[str] = []
     changed: dict[str, str | None] = {}
     rest = iter(flags)
@@ -238,7 +238,7 @@ def renamed_flags(flags: Sequence[str]) -> tuple[list[str], dict[str, str | None
 
 
 def _group(options: Options, path: list[str], make: bool = False) -> Options | None:
-    """The group of options that some names lead to; None where there is none and none is to be made."""
+    """The group of options at a path of names; None if there is none and `make` is False."""
     for name in path:
         if make:
             options.setdefault(name, {})
@@ -288,5 +288,5 @@ def _renamed_classes(value: Any, changed: dict[str, str | None]) -> Any:
 
 
 def told(changed: dict[str, str | None]) -> str:
-    """Renamed options in a line, for whoever still writes the old ones."""
+    """Renamed options in a line, for a user who writes the old ones."""
     return "; ".join(f"{old} is gone" if now is None else f"{old} is now {now}" for old, now in changed.items())

@@ -1,6 +1,6 @@
-"""Pickles that strangers made: nothing in them is run, and all damage is a `DataError`.
+"""Reads untrusted pickles without running code in them; any damage is a `DataError`.
 
-A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; whatever else it
+A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; anything else that it
 names is refused. Arrays are rebuilt here, from bytes whose number must fit, so that a damaged header neither reserves
 memory nor reaches numpy's own unpickling.
 """
@@ -116,7 +116,7 @@ def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
     Args:
         data: the pickle.
         where: what an error begins with.
-        also: gives what stands in for a further class that it may name, by module and name; None: refused.
+        also: returns a stand-in for a further class, by module and name, or None to refuse it.
 
     Raises:
         DataError: damaged or refused; begins with `where`.
@@ -137,21 +137,21 @@ def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
 
 
 class StandIn:
-    """Stands for a class that is not loaded: keeps what its pickle says, until the pickle is whole."""
+    """Stands for a class that is not loaded, and keeps its state until the whole pickle is read."""
 
     state: Mapping[str, Any] = {}
 
     def __init__(self, *_: object) -> None:
-        """Whatever it is made with is not needed."""
+        """Arguments are not needed."""
 
     def __setstate__(self, state: Any) -> None:
         self.state = state if isinstance(state, Mapping) else {}
 
     def real(self, inner: Callable[[Any], Any]) -> Any:
-        """What it is, in plain data.
+        """The object in plain data.
 
         Args:
-            inner: gives plain data of something in `state`.
+            inner: returns plain data for something in `state`.
 
         Raises:
             DataError: its state makes no sense.
@@ -160,7 +160,7 @@ class StandIn:
 
 
 class _Dtype:
-    """Stands for numpy.dtype while a pickle is read, because dtype itself trusts its state."""
+    """Stands for numpy.dtype while a pickle is read, because numpy.dtype trusts its state."""
 
     def __init__(self, code: str | bytes, align: object = False, copy: object = False) -> None:
         self.code = code.decode("latin-1") if isinstance(code, bytes) else str(code)
@@ -182,7 +182,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stands for numpy.ndarray until the pickle is whole."""
+    """Stands for numpy.ndarray until the whole pickle is read."""
 
     def __init__(self, *_: object) -> None:
         self.state: tuple[tuple[int, ...], _Dtype, bool, Any] | None = None
@@ -273,7 +273,7 @@ def _plain(found: Any, where: str, done: dict[int, Any], depth: int) -> Any:
         plain = found.real(inner)
     elif not isinstance(found, str | bytes | bool | int | float | complex | np.generic | None):
         raise DataError(f"{where}: the pickle holds a bare {type(found).__name__}; {AGAIN}")
-    done[id(found)] = (found, plain)  # the original is kept too, so that its id stays its own
+    done[id(found)] = (found, plain)  # the original is kept too, so that no other object gets its id
     return plain
 
 

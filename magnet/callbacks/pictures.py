@@ -29,9 +29,9 @@ TAG = "val/samples"
 class SamplePictures(Callback):
     """Draws the first validation scenes beside what the model makes of them, and sends the picture to the loggers.
 
-    A denoiser samples a task on them, a tokenizer decodes its codes of them. With averaged weights it is these that
-    are looked at. Training is not changed: noise comes from a generator of its own. TensorBoard and Weights & Biases
-    take pictures; where no logger does, a PNG is written into `pictures` in the run's folder.
+    A denoiser samples a task on the scenes, a tokenizer encodes and decodes them, with averaged weights if there are
+    any. Training does not change, because the noise has its own generator. TensorBoard and Weights & Biases take
+    pictures; if no logger does, a PNG is written into `pictures` in the run's folder.
 
     Args:
         scenes: how many of the first validation batch's scenes are drawn.
@@ -39,7 +39,7 @@ class SamplePictures(Callback):
         task: what a denoiser samples; the first half of each scene is given as context.
         steps: denoising steps.
         columns: moments drawn of each scene.
-        seed: the sample's noise follows from it, the same at every validation.
+        seed: seed of the sample's noise, the same at every validation.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class SamplePictures(Callback):
             self.send(trainer, Image.open(path).convert("RGB"))
 
     def made(self, model: LightningModule, scene: Scene, context: int) -> list[tuple[str, Scene]]:
-        """What a model makes of scenes, with a label; nothing of a model that is none of ours."""
+        """What a model makes of scenes, with a label; nothing if the model is not ours."""
         if isinstance(model, Tokenizer):
             return [("decoded", model.reconstruct(scene))]
         if not isinstance(model, Denoiser):

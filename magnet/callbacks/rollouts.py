@@ -1,4 +1,4 @@
-"""Pasts that the model has really made, with recorded continuations behind them, for training to go on from."""
+"""Trains on pasts that the model has generated, followed by recorded continuations."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from magnet.seeding import derive
 from magnet.tasks import registry
 
 COMPARED = 16
-"""Frames at the end of a made past that the recorded continuation is chosen by."""
+"""Frames at the end of a generated past by which the recorded continuation is chosen."""
 
 BLEND = 8
-"""Frames over which poses go over from the made past to the recorded continuation."""
+"""Frames over which poses change from the generated past to the recorded continuation."""
 
 
 class RollOuts(Callback):
-    """Rolls the model out now and then, and lets training go on from what it made (ours).
+    """Rolls the model out from time to time and trains on what it made (ours).
 
-    A model that has only seen recorded pasts does not know what to do where it has led people itself. So some scenes of
-    the batch are continued by the sampler over several windows; behind the last of it comes the training stretch whose
-    beginning is nearest, moved there, with what still differs eased out. Such scenes replace a share of the batch. The
-    made past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.)
+    A model that has seen only recorded pasts does not know how to continue its own. So the sampler continues some
+    scenes of the batch over several windows. The training clip whose beginning is nearest to the end of this past is
+    moved there and appended, and the remaining difference fades out. Such scenes replace a share of the batch. The
+    generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.)
 
     Args:
-        share: of the batch's scenes.
+        share: share of the batch's scenes that are replaced.
         every: training steps from one roll-out to the next.
-        start: training steps before the first: what an untrained model makes is no past to learn from.
-        scenes: how many are rolled out at a time.
+        start: training steps before the first roll-out; an untrained model makes no useful past.
+        scenes: scenes rolled out at a time.
         frames: fewest and most frames that are rolled out.
         steps: denoising steps of the sampler.
-        return_frames: over so many frames people come back to where the recorded continuation has them.
-        stretches: how many training stretches are kept to choose from.
+        return_frames: frames over which people return to their recorded places.
+        stretches: training clips that are kept to choose from.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class RollOuts(Callback):
             pl_module.made_pasts = None
 
     def keep(self, batch: Scene) -> None:
-        """Remember a batch's stretches, and forget the oldest."""
+        """Keep a batch's clips, and drop the oldest."""
         self.kept.append(batch.to("cpu"))
         while sum(each.scenes for each in self.kept[1:]) >= self.stretches:
             self.kept.pop(0)
@@ -106,9 +106,9 @@ class RollOuts(Callback):
         generator: torch.Generator,
         precision: AbstractContextManager[None] | None = None,
     ) -> MadePasts | None:
-        """Scenes as long as the batch's, whose first half the model has made; None: nobody here can be continued.
+        """Scenes as long as the batch's whose first half the model has generated; None if none can be continued.
 
-        `precision` is the context in which the model runs; None: as it is.
+        `precision` is the context in which the model runs; None: the current one.
         """
         frames = batch.frames
         past = frames // 2 // TOKEN_FRAMES * TOKEN_FRAMES
@@ -133,14 +133,14 @@ class RollOuts(Callback):
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:
-    """A recorded continuation that begins where and as a made past ends, and comes back to itself.
+    """A recorded continuation changed so that it begins with the places and poses in which a generated past ends.
 
-    Places come back over some frames, poses over `BLEND`.
+    The change of places fades out over `frames`, that of poses over `BLEND` frames.
 
     Args:
         made: (B, T, P) the past.
         behind: (B, T', P) the continuation, at about the right place.
-        frames: over so many frames people come back.
+        frames: frames over which people return to their recorded places.
     """
     T_world_last = canonical_frame(made.T_world_root[:, -1:])
     T_world_can = canonical_frame(behind.T_world_root)

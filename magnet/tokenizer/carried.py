@@ -1,4 +1,4 @@
-"""A tokenizer's networks over a sequence that grows: what its new steps do not change is not computed again."""
+"""Runs a tokenizer's networks over a growing sequence, without computing again what new steps do not change."""
 
 from __future__ import annotations
 
@@ -56,15 +56,14 @@ class Steps:
 
 
 class Carried:
-    """What a network keeps from one call to the next, which is shown the same sequence, some steps longer.
+    """Keeps what a network computed for a sequence, for the next call with the same sequence and some more steps.
 
-    After each layer those steps are kept that later ones read and that follow from final input alone. So a network
-    that sees no later steps computes each step once, and one that does computes again only what was not final.
-    The output is that of the whole sequence, bit for bit: input is compared with that of the call before, and where it
-    has changed nothing is kept.
+    Of each layer's output it keeps the steps that depend on final input alone and that later steps read. So a causal
+    network computes each step once, and another computes again only what was not final. The output is that of the whole
+    sequence, bit for bit: the input is compared with that of the call before, and if it changed nothing is kept.
 
     Args:
-        keep: last final steps of the output that may be asked for again.
+        keep: number of last final steps of the output that a later call may ask for again.
     """
 
     def __init__(self, keep: int = 0) -> None:
@@ -74,15 +73,15 @@ class Carried:
         self.held: list[Steps | None] = []  # of the output of each layer
 
     def __call__(self, network: SpanNetwork, x: Tensor, first: int, final: int, span: Span, edge: int = 0) -> Tensor:
-        """Some steps of what a network makes of the sequence; all are counted from the sequence's beginning.
+        """Some steps of a network's output for the sequence. All steps are counted from the sequence's beginning.
 
         Args:
-            network: for another one than before nothing is kept.
+            network: if it is another than before, nothing is kept.
             x: (B, n, C) the sequence from `first` on, with all steps that the wanted ones depend on.
-            first: 0, or a whole number of the network's strides.
-            final: earlier steps of the sequence will be the same in later calls.
+            first: 0, or a multiple of the network's stride.
+            final: steps before this one will be the same in later calls.
             span: wanted steps of the output.
-            edge: so many first steps of x stand in for others where `first` is not 0; nothing wanted depends on them.
+            edge: if `first` is not 0, so many first steps of x are placeholders, on which nothing wanted depends.
 
         Returns:
             (B, stop - start, outputs)
@@ -101,7 +100,7 @@ class Carried:
         return last.between(*span)
 
     def _goes_on(self, x: Tensor, first: int, own: int) -> bool:
-        """Whether x (B, n, C), a sequence from `first` on, goes on with that of the call before."""
+        """Whether x (B, n, C), a sequence from `first` on, continues that of the call before."""
         before = self.seen
         if before is None or (len(before.steps), before.steps.shape[2]) != (len(x), x.shape[2]):
             return False

@@ -1,4 +1,4 @@
-"""Reading a tokenizer's checkpoint without running anything in it."""
+"""Reads a tokenizer's checkpoint without running code in it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def shaping(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Fields and weights of the tokenizer in a tokenizer's checkpoint, or in that of a denoiser, a shipped one by name.
+    """Fields and weights of a tokenizer, from its checkpoint, from that of a denoiser, or by a shipped model's name.
 
     Raises:
         FileNotFoundError: there is no such file.

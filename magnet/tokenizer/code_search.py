@@ -1,7 +1,8 @@
-"""The nearest codes to a few vectors without reading whole codebooks, which takes longer than everything else.
+"""Finds the nearest codes to a few vectors without reading whole codebooks, which would take most of the time.
 
-Codes lie near a space of few dimensions. There distances of all codes are found first, with bounds on what the other
-dimensions may add, and only codes that can still be the nearest are looked at whole: mostly one to five of a thousand.
+Codes lie near a space of few dimensions. First the distances to all codes are computed in that space, with bounds on
+what the other dimensions can add. Then only the codes that can still be nearest are read whole: mostly one to five of a
+thousand.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from torch import Tensor
 Array = NDArray[Any]
 
 FEW = 16
-"""Vectors up to which this is quicker than a product with all codes."""
+"""Up to this many vectors the search is faster than a product with all codes."""
 
 DIMENSIONS = 64
-"""Of the space in which all codes are looked at."""
+"""Dimensions of that space."""
 
 SLACK = 1e-5
-"""Part of squared lengths that bounds may be off by, for rounding."""
+"""Rounding error of the bounds, as a share of squared lengths."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Book:
         alike, off = self.lengths - 2 * (inside @ self.near), 2 * outside[:, None] * self.beyond
         most = (alike + off).min(axis=1) + SLACK * (squares + self.lengths.max())
         left = (alike - off <= most[:, None]).any(axis=0).nonzero()[0]
-        if not len(left):  # numbers that are none have no nearest code
+        if not len(left):  # NaN has no nearest code
             left = np.zeros(1, dtype=np.int64)
         exact = self.lengths[left] - 2 * (vectors @ self.codes[left].T)
         return left[exact.argmin(axis=1)]

@@ -1,8 +1,8 @@
-"""The tokenizer's networks as they are sampled with: only what is asked for, with weights packed once.
+"""The tokenizer's networks for sampling: they compute only the steps asked for, with weights packed once.
 
 A convolution over time is the product of its taps, side by side, with one packed matrix. To decode the frames of one
-token, each layer computes the steps alone that these frames depend on. No step depends on what else is computed, so
-frames decoded one by one are those of the whole clip.
+token, each layer computes only the steps on which these frames depend. A step does not depend on which others are
+computed, so frames decoded one by one are bit-identical to those of the whole clip.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Each:
 
 
 class Twice:
-    """`Upsample`: each step said twice."""
+    """`Upsample`: each step repeated."""
 
     def needs(self, span: Span, length: int) -> Span:
         return span[0] // 2, (span[1] + 1) // 2

@@ -64,12 +64,12 @@ class Tokenizer(L.LightningModule):
         loss: weights of the terms.
         augment: what is changed in training batches.
         optimizer: AdamW.
-        start_from: checkpoint of a tokenizer, or of a denoiser with one, or the name of a shipped model such as `duet`,
-            whose encoder and decoder training starts from; codes start anew where there is another number of them.
-        decoder_only: train the decoder alone, after `start_from`: codes keep their meaning, so a denoiser that was
-            trained on them can take it.
-        compile: compile encoder and decoder for training; worth it on a GPU, not on a CPU.
-        seed: the start and the revival of codes follow from it.
+        start_from: checkpoint of a tokenizer, or of a denoiser with one, or the name of a shipped model such as `duet`:
+            training starts from its encoder and decoder, and from its codes if their number is the same.
+        decoder_only: train only the decoder, after `start_from`. Codes keep their meaning, so a denoiser that was
+            trained on them can use the new decoder.
+        compile: compile encoder and decoder for training; faster on a GPU, not on a CPU.
+        seed: seed of the start and the revival of codes.
     """
 
     def __init__(
@@ -260,7 +260,7 @@ class Tokenizer(L.LightningModule):
             self.init_codebook([batch] if batches is None else batches())
 
     def take_weights(self, path: str | Path) -> None:
-        """Take over another tokenizer's networks and statistics, and its codes where there are as many."""
+        """Copy another tokenizer's networks and statistics, and its codes if their number is the same."""
         _, state = read_checkpoint(path)
         mine = self.state_dict()
         kept = {name: value for name, value in state.items() if name in mine and mine[name].shape == value.shape}
@@ -379,7 +379,7 @@ class Tokenizer(L.LightningModule):
 
     @classmethod
     def load(cls, path: str | Path) -> Tokenizer:
-        """A trained tokenizer from its checkpoint, or from that of a denoiser that holds one, a shipped one by name.
+        """A trained tokenizer, from its checkpoint, from that of a denoiser, or by a shipped model's name.
 
         Raises:
             FileNotFoundError: there is no such file.

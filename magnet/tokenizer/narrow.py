@@ -1,7 +1,7 @@
-"""The same tokenizer with codes of few numbers: the few that its codes differ in.
+"""Makes a tokenizer whose codes have few numbers: the few directions in which its codes differ.
 
-A latent of 512 numbers that differs in 16 says the same thing 32 times. Noise that is drawn for each number alone then
-averages out, and hides what a token says at the highest levels only; so a denoiser decides everything there.
+If latents of 512 numbers differ in 16 directions, each direction is repeated in about 32 numbers. Noise is independent
+for each number, so it averages out: only the highest levels hide a token, and a denoiser decides everything there.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from magnet.tokenizer.vqvae import Conv
 
 @torch.no_grad()
 def narrowed(tokenizer: Tokenizer, scenes: Iterable[Scene], size: int) -> tuple[Tokenizer, float]:
-    """A tokenizer whose latents are those of another one in the coordinates in which they vary most.
+    """A tokenizer whose latents are another's, in the coordinates in which they vary most.
 
-    The coordinates are orthonormal and hold the latents' mean, so distances between codes stay; they are sorted by the
-    variance of the scenes' codes. Encoder, codes and decoder are what they were up to the variance that is left out.
+    The coordinates are orthonormal and include the direction of the mean, so distances between codes stay. They are
+    sorted by the variance of the scenes' codes. Encoder, codes and decoder stay the same up to the variance that is
+    left out.
 
     Args:
         tokenizer: trained, with learned codebooks.
@@ -33,7 +34,7 @@ def narrowed(tokenizer: Tokenizer, scenes: Iterable[Scene], size: int) -> tuple[
         The tokenizer, and the share of the latents' variance that it leaves out.
 
     Raises:
-        ValueError: codes that cannot be narrowed, or to so many numbers.
+        ValueError: the codes have few numbers already, or `size` is out of range.
     """
     before = tokenizer.hparams
     if before["quantizer"]["kind"] != "residual_vq" or before["network"].get("embed_dim"):

@@ -13,13 +13,13 @@ from magnet.tokenizer.code_search import FEW, Book, nearest_codes
 
 KMEANS_ROUNDS = 10
 KMEANS_VECTORS = 8
-"""Vectors a code, over all processes, that the k-means start looks at; more only cost time."""
+"""Vectors for each code, over all processes, from which k-means starts; more only cost time."""
 
 OFTEN = 8
-"""So many times few vectors are looked up before codebooks are prepared for it (0.1 s at the shipped sizes)."""
+"""After so many lookups of few vectors the codebooks are prepared for them (0.1 s at the shipped sizes)."""
 
 CROWD = 4.0
-"""With at least this many vectors a code in a batch, `dead_code_threshold` means what it says."""
+"""With fewer vectors for each code in a batch, `dead_code_threshold` is lowered in proportion."""
 
 
 class ResidualVQ(Float32):
