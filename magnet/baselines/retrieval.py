@@ -1,4 +1,4 @@
-"""What baselines share that answer with recorded motion: who may answer, who plays whom, and where it is put."""
+"""What baselines that answer with recorded motion share: which clips fit, who plays whom, and where it is placed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Retrieval:
     Args:
         train: (M, context + horizon, P) stretches; may be padded with absent agents.
         aligned: the stretch is moved by one turn about the vertical and one shift over the ground, so that
-            its people at the last context frame stand as nearly as can be where the context's do; false:
+            its people at the last context frame are as near as possible to the context's; false:
             it stays where it was recorded.
     """
 

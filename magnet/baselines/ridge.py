@@ -1,4 +1,4 @@
-"""Ridge regression: what a linear function of the last half second of everybody already predicts."""
+"""Ridge regression: the future as a linear function of everybody's last half second."""
 
 from __future__ import annotations
 
@@ -45,13 +45,14 @@ class RidgeFit(NamedTuple):
 class RidgeRegression:
     """Future joints of each person as a linear function of everybody's last 16 context frames, in closed form.
 
-    Everything is told in the person's own canonical frame at the last context frame, so a move of the world moves the
-    answer along; each person of a training window is an example, partners come in the order of their distance, so
-    slots play no role. What is predicted is the offset from the last pose: with an endless penalty, everybody's mean
-    offset. There is one regression for each number of people, fitted when it is first asked for. The penalty of each
-    future frame is the one with the least error on training recordings left out of the fit, in five folds.
+    Features and targets are in the person's own canonical frame at the last context frame, so the answer moves with the
+    world. Each person of a training window is an example, with partners in the order of their distance, so slots make
+    no difference. The target is the offset from the last pose; an infinite penalty predicts the mean offset. There is
+    one regression for each number of people, fitted at first use. The penalty of each future frame is the one with the
+    least error on training recordings left out of the fit, in five folds.
 
-    Joints are independent of each other, so bones may change their length: a bar for position errors, not a motion.
+    Joints are independent of each other, so bones may change their length: this is a bar for position errors, not
+    motion.
 
     Args:
         train: windows to fit, with at least one frame on either side of their context's end.

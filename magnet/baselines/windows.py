@@ -1,4 +1,4 @@
-"""Joints of training windows: what baselines and measures that read positions alone need of them."""
+"""Joints of training windows, for baselines and measures that read positions alone."""
 
 from __future__ import annotations
 
@@ -113,9 +113,9 @@ class Windows:
 
 
 def recording(label: str) -> str:
-    """Name of the recording that a window was cut from, read off the window's label: "60_05+61_05 x1.1 [120:302]".
+    """Name of the recording that a window was cut from, by the window's label, such as "60_05+61_05 x1.1 [120:302]".
 
-    A recording that is played at several speeds (`CMU.speeds`) has one name.
+    A recording has one name at all its speeds (`CMU.speeds`).
     """
     return re.sub(r" x[\d.]+$", "", label.partition(" [")[0])
 

@@ -1,4 +1,4 @@
-"""Who is near whom in a crowd: each person's nearest partners, and the small groups that a model looks at."""
+"""Each person's nearest partners in a crowd, and the small groups that a model sees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From predicted deltas and pairwise transforms back into the world: one function a placement (paper 3.1).
+"""Places agents in the world by predicted deltas and pairwise transforms: one function for each way (paper 3.1).
 
 To add a placement, write its function, name it in `Placement`, and list it in `PLACEMENTS`.
 """
@@ -69,15 +69,15 @@ def place(
         T_self_partner: (B, T, P, P - 1, 4, 4). None, or one agent alone: every agent integrates its own deltas.
         T_world_start: (B, P, 4, 4) canonical frames at the last known frame.
         placement: `integrate`: every agent integrates its own deltas (the reference's way; agents may
-            drift apart slowly). `anchor`: one agent integrates, the others are placed by its pairwise
-            transforms (no drift apart, but their own deltas are ignored). `fuse` (ours): at each frame
-            the least-squares compromise of all deltas and all pairwise transforms, equal for all agents.
+            drift apart slowly). `anchor`: one agent integrates, its pairwise transforms place the others
+            (no drift apart, but their own deltas are ignored). `fuse` (ours): a least-squares compromise of
+            all deltas and all pairwise transforms at each frame, equal for all agents.
         pairwise_weight: `fuse` only: weight of one pairwise transform against one delta. 0 is `integrate`.
-        present: (B, P) bool; pairs with absent agents are not read. None: all are there.
-        fixed: (P,) bool, `fuse` only: agents whose deltas are known and must not be compromised. None: nobody.
-        anchor: (B,) int, `anchor` only: the agent of each scene that the others are placed by. None: agent 0.
-        partner: (P, K) int, whom the K partner slots of each agent point at (its own number: at nobody), where that is
-            not everybody else: then `T_self_partner` has K slots, and `anchor` is no choice.
+        present: (B, P) bool; pairs with absent agents are not read. None: all are present.
+        fixed: (P,) bool, `fuse` only: agents whose deltas are known and stay exact. None: nobody.
+        anchor: (B,) int, `anchor` only: the agent of each scene that places the others. None: agent 0.
+        partner: (P, K) int, whom the K partner slots of each agent point at (its own number: at nobody). None: at
+            everybody else. With it `T_self_partner` has K slots, and `anchor` cannot be used.
 
     Returns:
         T_world_can (B, T, P, 4, 4), in the dtype of `deltas`; computed in float64 so that thousands of

@@ -2,8 +2,8 @@
 
 The unknowns are the headings and ground positions of all agents over consecutive frames. Deltas relate an agent's
 frames to each other, pairwise transforms relate agents to each other, and each has a precision (one over its variance).
-Errors of predicted deltas are alike in neighbouring frames (somebody walks a little too fast for a while), so a
-correction may be asked to be smooth: then high frequencies come from the deltas, and low ones from the pairs.
+Errors of predicted deltas are alike in neighbouring frames (somebody walks a little too fast for a while), so the
+correction can be smooth: then high frequencies come from the deltas and low ones from the pairs.
 Headings are solved first, then positions with those headings: two linear systems in closed form, without iterations.
 Frames are tied to the two before them only, so runs of frames are eliminated at once, in few and batched operations.
 """

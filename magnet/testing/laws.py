@@ -31,33 +31,33 @@ TASK_GRIDS = (
 """Long and short scenes of one to four agents, with a past and without, in strides, rolling and in pyramids."""
 
 POSED = 2
-"""How many of these poses are checked on, too, which takes a second each: enough to let the window move on."""
+"""On so many of these grids poses are checked too, which takes a second each; in these the window moves."""
 
 
 def task_laws(task: Task, grids: Sequence[Grid] | None = None, nameless: bool = False) -> list[Grid]:
     """Check a task against the laws that every task obeys; for the tests of those who write tasks.
 
-    The laws: a task is a frozen dataclass with a docstring and a formula; it plans the same twice; levels never
-    rise; what is known stays clean and comes back bit-identical; something is generated; what is not known ends
-    clean or stays at pure noise; no window is longer than the grid's; what is neither known nor generated yet
-    cannot influence the sample, nor can pairs to it; what a stage hides from an agent cannot influence what the
-    stage makes of that agent, not by way of the others either; no pose depends on what is not known yet when it is
-    shown (`magnet.testing.poses.pose_law`); the same seed gives the same sample; and several scenes in a batch are
-    sampled as each would be alone.
+    - The task is a frozen dataclass with a docstring and a formula. Two plans are equal.
+    - Levels never rise. What is known stays clean and comes back bit-identical. Something is generated; it ends clean
+      or stays at pure noise. No window is longer than the grid's.
+    - What is neither known nor generated yet does not influence the sample, nor do pairs with it.
+    - What a stage hides from an agent does not influence what the stage makes of that agent, not through others either.
+    - No pose depends on what is not known when it is shown (`magnet.testing.poses.pose_law`).
+    - The same seed gives the same sample, and a batch gives what each of its scenes gives alone.
 
     Args:
         task: the task with its options.
-        grids: what to plan on; each must be accepted. None: `TASK_GRIDS`, of which a task may refuse with a
-            ValueError those that make no sense to it, but not all.
-        nameless: check too that agents who know the same are treated alike, whichever slots they are in: in the
-            plan, and in the samples of a model that does not know their slots either.
+        grids: what to plan on; the task must accept each. None: `TASK_GRIDS`, of which the task may refuse some, but
+            not all, with a ValueError.
+        nameless: check too that the slots of agents who know the same make no difference: in the plan, and in the
+            samples of a model that does not know slots.
 
     Returns:
         The grids that were checked.
 
     Raises:
         AssertionError: a law is broken; says which, on which grid, and where.
-        ValueError: the task refuses one of the grids it was to be checked on, or all of `TASK_GRIDS`.
+        ValueError: the task refuses one of `grids`, or all of `TASK_GRIDS`.
     """
     from magnet.testing.poses import pose_law
 
@@ -98,7 +98,7 @@ def _require(holds: object, message: str) -> None:
 
 
 def _raised_by_schedule(error: BaseException) -> bool:
-    """Whether a plan was built and broke a law, rather than the task having refused the grid."""
+    """Whether a plan broke a law, and not the task refused the grid."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -179,7 +179,7 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 
 def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
-    """Change what a stage hides from an agent, in the tokens, in all that the model says of it, and in what it said."""
+    """Check hiding: change what a stage hides from an agent, in the tokens and in all that the model predicts of it."""
     layout = TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
@@ -218,16 +218,16 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
 
 
 def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
-    """Check that a task does the same to the same people in other slots, by its plan and in its samples.
+    """Check that a task treats the same people alike in other slots, in its plan and in its samples.
 
     Args:
-        task: as it names the agents by their slots.
-        renamed: the same task as it names them where agent p is who was agent order[p].
+        task: the task with agents in their slots.
+        renamed: the same task where agent p is the former agent order[p].
         grid: what to plan on.
         order: (P,) int, a permutation.
 
     Raises:
-        AssertionError: agents are treated differently for the slots they are in.
+        AssertionError: a slot makes a difference.
     """
     place, layout = _place(renamed, grid), TokenLayout(latent=4, agents=grid.agents)
     first, second = task.schedule(grid), renamed.schedule(grid)
@@ -247,7 +247,7 @@ def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:
 
 
 def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, drawn: Sequence[Tensor]) -> Tensor:
-    """A sample of a model that knows no slots, of people in the first ones.
+    """A sample of a model that does not know slots, of people in the first ones.
 
     drawn: what is given, noise and mask_noise (B, N, P, D) -> (B, N, P, D)
     """

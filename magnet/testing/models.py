@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def random_scene(
     scenes: int, frames: int, agents: int, generator: torch.Generator, present: Tensor | None = None
 ) -> Scene:
-    """Smooth random motion that is nobody's: upright bodies that wander and turn, all joints moving a little."""
+    """Smooth random motion: upright bodies that wander and turn, with all joints moving a little."""
 
     def smooth(*shape: int, scale: float) -> Tensor:
         """A few slow sine waves along the second axis."""

@@ -1,4 +1,4 @@
-"""The law of poses over time: nothing that a task does not know yet changes a pose that has been shown."""
+"""The law of poses over time: a pose that was shown does not depend on what the task does not know yet."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ STEPS = 2
 def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> list[int]:
     """Check that no pose of a causal plan depends on what is not known when it is shown.
 
-    After the first block, and after one that no longer sees the beginning of the scene, what the task is given later
-    is replaced, and the noise of all tokens that an agent has not been shown by then. Its poses up to the end of the
-    block must stay as they are, bit for bit.
+    The check is made after the first block, and after a block that no longer sees the beginning of the scene. It
+    replaces what the task is given later, and the noise of all tokens that an agent has not seen by then. The agent's
+    poses up to the end of the block must stay bit-identical.
 
     Args:
         task: the task with its options.
         grid: what to plan on; sampled with an untrained model, in few steps.
-        options: how to sample, beside the grid's sizes.
+        options: options of sampling beside the grid's sizes.
 
     Returns:
-        The token steps up to which poses were compared; none where the plan is not causal: then everything that is
-        ever given is known from the start.
+        The token steps up to which poses were compared; none if the plan is not causal, because then everything given
+        is known from the start.
 
     Raises:
-        AssertionError: a pose depends on what is not known yet; says of whom and before which frame.
+        AssertionError: a pose depends on what is not known yet; names the agent and the frame.
     """
     grid = dataclasses.replace(grid, steps=min(grid.steps, STEPS))
     schedule = task.schedule(grid)
@@ -79,7 +79,7 @@ def pose_law(task: Task, grid: Grid, options: SamplerOptions | None = None) -> l
 
 @functools.cache
 def small_model(agents: int, window: int) -> Denoiser:
-    """An untrained model, kept: it takes longer to make than to sample with."""
+    """An untrained model, cached because making it takes longer than sampling."""
     return tiny_denoiser(max_agents=agents, window=window)
 
 

@@ -168,7 +168,9 @@ def check_left_out(part: ConvertedTake, said: str) -> None:
     assert all(stop - 1 < begin + 1.1 or start > end - 1.1 for begin, end in spans for start, stop in clips)
 
 
-@pytest.mark.parametrize("form", some_slow(FORMS, "chi3d", "remocap, ready fits"))
+@pytest.mark.parametrize(
+    "form", some_slow(FORMS, "aioz", "chi3d", "embody3d", "interhuman", "interx", "remocap, ready fits")
+)
 def test_what_is_wrong_with_one_person_is_said_with_frames_and_cut_out_or_refused(form: str, tmp_path: Path) -> None:
     check_spoiled(form, tmp_path, slow=False)
 
