@@ -60,8 +60,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.evaluation.results import machine
     from magnet.report.cells import BUDGETS, Store
     from magnet.report.page import page
+    from magnet.report.plan import ReportOptions
     from magnet.report.run import Runner, clock
-    from magnet.report.tables import TABLES, ReportOptions, cells_of, named
+    from magnet.report.tables import TABLES, cells_of, named
 
     quiet()
     names = list(TABLES) if "all" in given.tables else [named(table) for table in given.tables]

@@ -17,7 +17,7 @@ from magnet.motion.scene import FPS
 
 Joints = NDArray[np.float32]
 
-PANEL, HEAD, ACROSS = 190, 22, 4
+PANEL, HEAD, ACROSS = 160, 22, 4
 """Pixels of a panel's side and of its title; panels in a line."""
 EVERY = 3
 """Frames of the motion for one of the film: ten a second."""
@@ -58,7 +58,7 @@ def film(rows: Mapping[str, Joints], fps: float = FPS) -> bytes:
         pages.append(page)
     buffer = io.BytesIO()
     tick = round(1000 * EVERY / fps)
-    pages[0].save(buffer, "WEBP", save_all=True, append_images=pages[1:], duration=tick, loop=0, quality=55, method=4)
+    pages[0].save(buffer, "WEBP", save_all=True, append_images=pages[1:], duration=tick, loop=0, quality=45, method=4)
     return buffer.getvalue()
 
 
@@ -74,7 +74,7 @@ def _panel(page: Image.Image, place: tuple[int, int], title: str, flat: Joints, 
     """One row's people at frame t, in the middle of the panel where they stand on average."""
     part = Image.new("RGB", (PANEL, PANEL + HEAD), BACKGROUND)
     draw = ImageDraw.Draw(part)
-    draw.text((6, HEAD / 2), title[:30], fill=INK, font=font(12), anchor="lm")
+    draw.text((6, HEAD / 2), title[:26], fill=INK, font=font(12), anchor="lm")
     draw.rectangle((0, HEAD, PANEL - 1, PANEL + HEAD - 1), outline=TILES[1])
     scale = PANEL / METRES
     middle = flat[max(0, t - 15) : t + 16, :, 0].mean(axis=(0, 1))  # pelvises, over a second, so that it is calm

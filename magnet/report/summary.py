@@ -23,10 +23,18 @@ def summary(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
         lines += [f"What {verdict} here, by the interval of the difference:", ""]
         lines += _listed(tables, verdict) or ["- nothing"]
         lines += [""]
-    missing = {text: None for blocks in tables.values() for block in blocks for text in block["incomplete"]}
-    if missing:
-        lines += ["Not done, or not with every seed:", "", *(f"- {text}" for text in missing), ""]
     return lines
+
+
+def missing(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Lines of the page's end: rows that were not measured with every seed."""
+    found = [
+        f"- {name}, {block['title']}: {', '.join(block['incomplete'])}"
+        for name, blocks in tables.items()
+        for block in blocks
+        if block["incomplete"]
+    ]
+    return ["## What is missing", "", "Seeds that are there, of how many:", "", *found, ""] if found else []
 
 
 def _listed(tables: Mapping[str, Sequence[Mapping[str, Any]]], verdict: str) -> list[str]:

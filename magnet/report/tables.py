@@ -2,146 +2,18 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
-import yaml
-
-from magnet import checkpoints
-from magnet.files import file_hash
-from magnet.report.cells import Budget, Cell, Kind, Weights
+from magnet.report.cells import Cell
 from magnet.report.folds import COPIED
+from magnet.report.plan import OURS, Block, Claim, ReportOptions, Row
 
-PAPER: dict[str, Any] = json.loads((Path(__file__).parent / "paper.json").read_text(encoding="utf-8"))
-COLUMNS: tuple[str, ...] = tuple(PAPER["columns"])
-FLOORS = ("RS", "NN", "zero velocity", "ridge", "training set", "ground truth")
-"""Rows of the cell without a model."""
-SHIPPED = "duet"
 OWN_PLACE = "not in the paper"
 """Of orderings that are asked here alone."""
+SAME = "Ours, trained as the peers"
+"""base.yaml: as many steps on as many windows of the same data."""
 TRAINED_SO = ("trained and sampled so: pairs as clean as their token", "trained and sampled so: base.yaml")
-OURS = "ours"
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of a table.
-
-    Args:
-        title: as the page names it.
-        cells: one a seed.
-        inside: name of the row in these cells.
-    """
-
-    title: str
-    cells: tuple[Cell, ...]
-    inside: str = OURS
-
-
-@dataclass(frozen=True)
-class Claim:
-    """An ordering that the paper states.
-
-    Args:
-        metric: of which.
-        better: title of the row that is said to have the lower number; of DIV and frames a second the higher.
-        worse: title of the other.
-        place: where the paper says so.
-    """
-
-    metric: str
-    better: str
-    worse: str
-    place: str
-
-    @property
-    def lower(self) -> bool:
-        """Whether the better one is the lower."""
-        return self.metric not in ("div", "fps", "times_shipped")
-
-
-@dataclass(frozen=True)
-class Block:
-    """A table's part on one task and data set.
-
-    Args:
-        title: what is measured.
-        rows: its lines.
-        claims: what the paper says of them.
-        columns: what is shown.
-    """
-
-    title: str
-    rows: tuple[Row, ...]
-    claims: tuple[Claim, ...] = ()
-    columns: tuple[str, ...] = COLUMNS
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """What cells are made for.
-
-    Args:
-        budget: how much each costs.
-        data: name or file of test scenes of two people.
-        checkpoint: of our model.
-        only_shipped: leave out what has to be trained.
-    """
-
-    budget: Budget
-    data: str = "salsa"
-    checkpoint: str = SHIPPED
-    only_shipped: bool = False
-    configs: Path = Path("configs/report")
-
-    def row(self, title: str, task: str, config: str = "", kind: Kind = "measure", **options: Any) -> Row | None:
-        """A row of our checkpoint, or of a configuration that is trained; None where no training is wanted."""
-        if config and self.only_shipped:
-            return None
-        if config:
-            digest = digest_of_config(self.configs / f"{config}.yaml")
-            model = Weights(config=config, steps=self.budget.steps, batch=self.budget.batch, digest=digest)
-        else:
-            model = Weights(self.checkpoint, digest=digest_of_weights(self.checkpoint))
-        seeds = 1 if kind == "speed" else self.budget.seeds  # a speed has rounds, and does not depend on the draw
-        return Row(title, tuple(self._cell(kind, seed, model, task, **options) for seed in range(seeds)))
-
-    def floors(self, task: str, among: Iterable[str] = FLOORS, **options: Any) -> list[Row]:
-        """Rows without a model; all but RS are the same for every seed, so one is enough."""
-        cell = self._cell("measure", 0, None, task, **options)
-        return [Row(name, (cell,), name) for name in among]
-
-    def _cell(self, kind: Kind, seed: int, model: Weights | None, task: str, **options: Any) -> Cell:
-        task_options = tuple(sorted(options.pop("task_options", {}).items()))
-        sampler = tuple(sorted(options.pop("sampler", {}).items()))
-        cell = Cell(kind, seed, self.data, model, task, task_options, sampler)
-        if kind == "measure":
-            return replace(cell, scenes=self.budget.scenes, samples=self.budget.samples, **options)
-        if kind == "long":
-            return replace(cell, scenes=self.budget.scenes, samples=1, frames=self.budget.frames, **options)
-        return replace(cell, scenes=1, samples=1, **options)
-
-
-def digest_of_config(path: Path) -> str:
-    """Of a configuration and all that it extends; empty where there is none."""
-    if not path.is_file():
-        return ""
-    text = path.read_text(encoding="utf-8")
-    below = (yaml.safe_load(text) or {}).get("extends", [])
-    parts = [text, *(digest_of_config(path.parent / name) for name in ([below] if isinstance(below, str) else below))]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
-
-
-@functools.cache
-def digest_of_weights(name: str) -> str:
-    """Of a checkpoint's file, or of the index of a shipped model's parts."""
-    path = checkpoints.resolve(name)
-    return file_hash(path / "config.json" if path.is_dir() else path)[:12]
 
 
 def _rows(*rows: Row | list[Row] | None) -> tuple[Row, ...]:
@@ -163,17 +35,20 @@ def table2(plan: ReportOptions) -> list[Block]:
         Claim("div", "Ours", "ReMoS", "Table 2, ReMoCap"),
         *(claim for floor in ("RS", "NN") for claim in _claims("Table 2", "Ours", floor, "fd mi ip_ratio mpjpe mpjve")),
         *(Claim("fs", floor, "Ours", "section 4.2, on foot sliding") for floor in ("RS", "NN")),
+        *(claim for peer in ("ReMoS", "Duolando") for claim in _claims(OWN_PLACE, SAME, peer, "fd mi fs mpjpe mpjve")),
     ]
     rows = [
         plan.floors(task, task_options=past),
         plan.row("ReMoS", task, "peer_remos", task_options=past),
         plan.row("Duolando", task, "peer_duolando", task_options=past),
+        plan.row(SAME, task, "base", task_options=past),
         plan.row("Ours", task, task_options=past),
     ]
     nothing = [
         plan.floors(task, ("training set", "ground truth")),
         plan.row("ReMoS", task, "peer_remos"),
         plan.row("Duolando", task, "peer_duolando"),
+        plan.row(SAME, task, "base"),
         plan.row("Ours", task),
     ]
     mine = tuple(
@@ -189,6 +64,7 @@ def table3(plan: ReportOptions) -> list[Block]:
     partner = [
         plan.floors("partner_prediction"),
         plan.row("R2R", "partner_prediction", "peer_ready_to_react"),
+        plan.row(SAME, "partner_prediction", "base"),
         plan.row("Ours", "partner_prediction"),
     ]
     turns = [
@@ -198,6 +74,7 @@ def table3(plan: ReportOptions) -> list[Block]:
     dyadic = [
         plan.floors("joint_future"),
         plan.row("R2R", "joint_future", "peer_ready_to_react"),
+        plan.row(SAME, "joint_future", "base"),
         *turns,
         plan.row("Ours", "joint_future"),
     ]
@@ -215,6 +92,7 @@ def table3(plan: ReportOptions) -> list[Block]:
             (
                 *_claims("section 4.2, partner prediction", "Ours", "R2R", "fd mi ip_ratio mpjpe mpjve"),
                 *_claims("Table 3, left", "Ours", "NN", "fd mi ip_ratio mpjpe mpjve"),
+                *_claims(OWN_PLACE, SAME, "R2R", "fd mi fs mpjpe mpjve"),
             ),
         ),
         Block(
@@ -225,6 +103,7 @@ def table3(plan: ReportOptions) -> list[Block]:
                 *_claims("section 4.2 says so, Table 3 prints the contrary", "Ours", "R2R", "fs"),
                 *_claims("Table 3, right", "Ours", "NN", "fd mi ip_ratio"),
                 *_claims("Table 3, right", "R2R", "Ours", "mpjpe mpjve"),
+                *_claims(OWN_PLACE, SAME, "R2R", "fd mi fs mpjpe mpjve"),
                 *offsets,
             ),
         ),

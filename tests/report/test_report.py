@@ -26,9 +26,11 @@ from magnet.report.cells import BUDGETS, Cell, Store, Weights
 from magnet.report.film import film, keep, kept
 from magnet.report.folds import Folds
 from magnet.report.page import page
+from magnet.report.plan import PAPER, ReportOptions
 from magnet.report.run import Runner
 from magnet.report.statistics import difference, estimate, verdict
-from magnet.report.tables import PAPER, TABLES, ReportOptions, cells_of, named
+from magnet.report.summary import missing, summary
+from magnet.report.tables import TABLES, cells_of, named
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 from tests.evaluation.test_evaluator import FAST, data
@@ -391,6 +393,23 @@ def test_a_report_goes_on_from_packed_cells_and_trains_again_only_what_is_wanted
     assert runner.store.of_kind("measure") == [2.0]
     assert not runner.missing([first.needs, first])
     assert runner.missing([first.needs, first, second]) == [first.needs, second]
+
+
+def test_the_first_screen_counts_what_holds_and_names_what_is_missing() -> None:
+    claims = [
+        {"claim": f"FD: Ours < {worse}", "verdict": said, "difference": "-1"}
+        for worse, said in (("RS", "holds"), ("R2R", "does not hold"), ("NN", "holds"), ("ReMoS", "cannot be told"))
+    ]
+    tables = {
+        "3": [{"title": "dyadic", "claims": claims, "incomplete": ["R2R 2 of 3", "Ours 0 of 3"]}],
+        "A.4": [{"title": "people", "claims": [], "incomplete": []}],
+    }
+    lines = summary(tables)
+    assert "| 3 | 2 | 1 | 1 |  |" in lines and "| all | 2 | 1 | 1 | 0 |" in lines
+    assert "- 3, dyadic: FD: Ours < RS (-1); FD: Ours < NN (-1)" in lines
+    assert "- 3, dyadic: FD: Ours < R2R (-1)" in lines
+    assert "- 3, dyadic: R2R 2 of 3, Ours 0 of 3" in missing(tables)
+    assert missing({"A.4": tables["A.4"]}) == []
 
 
 # -- films -----------------------------------------------------------------------------------------
