@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import roma
 import torch
 from torch import Tensor
 
-from magnet.motion.frames import canonical_frame, from_planar, inverse, rigid, to_planar
+from magnet.motion.frames import from_planar, inverse, rigid, to_planar
 from magnet.motion.planar import rotate_ground
 from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene, cat_time
 
-SPRING = 2.5
+SPRING = 5.0
 """Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
-put elsewhere slide for longer. With `blend` 10 a difference is halved in 7 frames."""
+put elsewhere slide for longer. With `blend` 20 a difference is halved in 7 frames."""
+
+QUICK = 0.03
+"""Radians or metres a frame beyond which a difference that grows is no speed but an outlier."""
 
 
 def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:
@@ -62,27 +67,30 @@ def next_known(keep: Tensor) -> Tensor:
     return keep.shape[0] - 1 - last_known(keep.flip(0)).flip(0)
 
 
-def seam_weights(keep: Tensor, blend: int) -> Tensor:
-    """Weight of the difference at a seam, in the frames after it: 1 at the last known frame, 0 after `blend` frames.
+def seam_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
+    """Weights of a seam's difference, and of its change by frame, in the frames after it.
 
-    In a shorter gap it is 0 at the next known frame. (T, P) bool -> (T, P)
+    A cubic that starts with the difference and its change at the last known frame and is at rest at 0 after `blend`
+    frames, or at the next known frame if that comes sooner. The change is known where the last two known frames are
+    consecutive. (T, P) bool -> (T, P) twice
     """
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
     after = keep.int().cummax(dim=0).values.bool()
     closed = keep.flip(0).int().cummax(dim=0).values.bool().flip(0)
-    gap = torch.where(closed, next_known(keep) - last_known(keep), blend)
-    since = (frame - last_known(keep)).float() / gap.clamp(1, max(blend, 1))
-    return torch.where(after, smoothstep((1 - since).clamp(0, 1)), 0.0)
+    gap = torch.where(closed, next_known(keep) - last_known(keep), blend).clamp(1, max(blend, 1))
+    since = (frame - last_known(keep)).float()
+    left = (1 - since / gap).clamp(0, 1)
+    return torch.where(after, smoothstep(left), 0.0), torch.where(moving(keep), since * left**2, 0.0)
 
 
-def fade_rotation(rotation: Tensor, given: Tensor, decoded: Tensor, weight: Tensor) -> Tensor:
-    """Apply the rotation from `decoded` to `given`, scaled by a weight. (..., 3, 3), weight (...)"""
-    difference = roma.rotmat_to_rotvec(given @ decoded.transpose(-1, -2))
-    return roma.rotvec_to_rotmat(difference * weight[..., None]) @ rotation
+def moving(keep: Tensor) -> Tensor:
+    """Frames after two consecutive known ones, so that a speed is known there. (T, P) bool -> (T, P) bool"""
+    last = last_known(keep)
+    return keep.int().cummax(dim=0).values.bool() & (last > 0) & keep.gather(0, (last - 1).clamp_min(0))
 
 
 def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
-    """Restore given frames; the difference at each seam fades out over the generated frames beside it.
+    """Restore given frames; generated frames go on from them, and lead to them, without a jump in pose or speed.
 
     Args:
         decoded: (B, T, P) the lossy reconstruction.
@@ -91,23 +99,15 @@ def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Ten
         keep: (T, P) bool, known frames.
         blend: frames over which a seam fades out.
     """
-    body_rot, T_world_root = decoded.body_rot, decoded.T_world_root
-    decoded_can_root = inverse(T_world_can) @ T_world_root
-    given_can_root = inverse(canonical_frame(given.T_world_root)) @ given.T_world_root
-    tilt, lift = decoded_can_root[..., :3, :3], decoded_can_root[..., :3, 3]
-    agents = torch.arange(keep.shape[1], device=keep.device)
-    behind = (last_known(keep), seam_weights(keep, blend))
-    ahead = (next_known(keep), seam_weights(keep.flip(0), blend).flip(0))
-    for seam, fade in (behind, ahead):  # (T, P) each
-        given_at, decoded_at = given_can_root[:, seam, agents], decoded_can_root[:, seam, agents]
-        body_given, body_decoded = given.body_rot[:, seam, agents], decoded.body_rot[:, seam, agents]
-        body_rot = fade_rotation(body_rot, body_given, body_decoded, fade[..., None])
-        tilt = fade_rotation(tilt, given_at[..., :3, :3], decoded_at[..., :3, :3], fade)
-        lift = lift + fade[..., None] * (given_at - decoded_at)[..., :3, 3]
-    there = decoded.present[:, None, :, None, None]
-    T_world_root = torch.where(there, T_world_can @ rigid(tilt, lift), T_world_root)
-    blended = decoded.replace(body_rot=body_rot, T_world_root=T_world_root)
-    return blended.with_poses(keep, given.body_rot, given.T_world_root)
+
+    weights, ahead = seam_weights(keep, blend), seam_weights(keep.flip(0), blend)[0]
+    last, next_one = last_known(keep), last_known(keep.flip(0))
+
+    def left(difference: Tensor) -> Tensor:
+        to_come = remainder(difference.flip(1), next_one, ahead, None).flip(1)
+        return remainder(difference, last, *weights, QUICK) + to_come
+
+    return joined(decoded, given, T_world_can, keep, left)
 
 
 def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
@@ -119,27 +119,41 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
     """
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
     after = keep.int().cummax(dim=0).values.bool()
-    last = last_known(keep)
-    grows = after & (last > 0) & keep.gather(0, (last - 1).clamp_min(0))
-    since = (frame - last).float()
+    since = (frame - last_known(keep)).float()
     rate = SPRING / blend if blend else torch.inf
     left = torch.where(since > 0, torch.exp(-rate * since.clamp_min(1)), 1.0)
     stays = torch.where(since > 0, (1 + min(rate, 1e9) * since) * left, 1.0)
-    return torch.where(after, stays, 0.0), torch.where(grows, since * left, 0.0)
+    return torch.where(after, stays, 0.0), torch.where(moving(keep), since * left, 0.0)
 
 
 def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
     """Restore given frames and continue from them with their velocity; frames before a seam do not change.
 
-    `crossfade_given` keeps no velocity, which would show at the seams of a causal plan: each block has one.
-
-    Args:
-        decoded: (B, T, P) bodies.
-        given: (B, T, P) what is known or has been shown.
-        T_world_can: (B, T, P, 4, 4) where everybody stands.
-        keep: (T, P) bool, known frames.
-        blend: frames over which a seam fades out.
+    As `crossfade_given`, for causal plans: each block has a seam, and nobody knows what is given next.
     """
+    weights, last = spring_weights(keep, blend), last_known(keep)
+    return joined(decoded, given, T_world_can, keep, lambda difference: remainder(difference, last, *weights))
+
+
+def remainder(
+    difference: Tensor, last: Tensor, stays: Tensor, grows: Tensor | None, most: float | None = None
+) -> Tensor:
+    """What is left of a difference at the last known frame, and of its change into it. (B, T, P, ...) -> same
+
+    last (T, P) int, of `last_known`; the weights (T, P). No change is larger than `most`.
+    """
+    agents = torch.arange(last.shape[1], device=last.device)
+    shape = (*last.shape, *[1] * (difference.dim() - 3))
+    at = difference[:, last, agents]
+    left = stays.view(shape) * at
+    if grows is None:
+        return left
+    change = at - difference[:, (last - 1).clamp_min(0), agents]
+    return left + grows.view(shape) * (change if most is None else change.clamp(-most, most))
+
+
+def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left: Callable[[Tensor], Tensor]) -> Scene:
+    """Given frames, and decoded ones turned and moved by what is `left` of their difference from the given."""
     T_can_world = inverse(T_world_can)
     decoded_can_root, given_can_root = T_can_world @ decoded.T_world_root, T_can_world @ given.T_world_root
     lift = decoded_can_root[..., :3, 3]
@@ -149,22 +163,37 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
         for root, scene in ((decoded_can_root, decoded), (given_can_root, given))
     )
     bends = roma.rotmat_to_rotvec(goals @ turns.transpose(-1, -2))
-    moves = given_can_root[..., :3, 3] - lift
-    last, agents = last_known(keep), torch.arange(keep.shape[1], device=keep.device)
-    before, (stays, grows) = (last - 1).clamp_min(0), spring_weights(keep, blend)
-
-    def left(difference: Tensor) -> Tensor:
-        """The remainder of a difference (B, T, P, ...) at the last known frame."""
-        at = difference[:, last, agents]
-        shape = (*keep.shape, *[1] * (difference.dim() - 3))
-        return stays.view(shape) * at + grows.view(shape) * (at - difference[:, before, agents])
-
     turned = roma.rotvec_to_rotmat(left(bends)) @ turns
-    body_rot, can_root = turned[..., 1:, :, :], rigid(turned[..., 0, :, :], lift + left(moves))
+    moved = lift + left(given_can_root[..., :3, 3] - lift)
+    body_rot, can_root = turned[..., 1:, :, :], rigid(turned[..., 0, :, :], moved)
     there = decoded.present[:, None, :, None, None]
     T_world_root = torch.where(there, T_world_can @ can_root, decoded.T_world_root)
     blended = decoded.replace(body_rot=body_rot, T_world_root=T_world_root)
     return blended.with_poses(keep, given.body_rot, given.T_world_root)
+
+
+def gone_on(before: Tensor, path: Tensor, blend: int) -> Tensor:
+    """A path that begins as fast as the one before it went; the difference in speed fades within `blend` frames.
+
+    Networks predict the first deltas after what is given too coarsely: how fast people go and turn would jump.
+
+    Args:
+        before: (B, 2, P, 4, 4) canonical frames of the last known frames.
+        path: (B, T, P, 4, 4) those after them, T at least 2.
+        blend: frames.
+
+    Returns:
+        (B, T, P, 4, 4).
+    """
+    near = torch.cat([before, path[:, :2]], dim=1).double()
+    yaw, ground = to_planar(near)
+    turns = yaw.diff(dim=1)
+    steps = torch.cat([torch.atan2(turns.sin(), turns.cos())[..., None], ground.diff(dim=1)], dim=-1)  # (B, 3, P, 3)
+    change = steps[:, :1] - steps[:, 1:].mean(dim=1, keepdim=True)
+    since = torch.arange(1, path.shape[1] + 1, device=path.device, dtype=change.dtype)
+    off = (since * (1 - since / blend).clamp(0, 1) ** 2)[:, None, None] * change
+    yaw, ground = to_planar(path.double())
+    return from_planar(yaw + off[..., 0], ground + off[..., 1:]).to(path)
 
 
 def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:

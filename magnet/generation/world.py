@@ -8,14 +8,21 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.blending import crossfade_given, delta_between, freeze_after, smoothed_path, warp_to_keyframe
+from magnet.generation.blending import (
+    crossfade_given,
+    delta_between,
+    freeze_after,
+    gone_on,
+    smoothed_path,
+    warp_to_keyframe,
+)
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
 from magnet.generation.conditioning import first_of, lookahead_limit, receptive_field, spans
+from magnet.generation.entering import starts
 from magnet.generation.separation import Decode, separated
 from magnet.generation.settling import LEAD, Corrected, settled_block, settled_chunk
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import (
-    align_planar,
     canonical_deltas,
     canonical_frame,
     from_9d,
@@ -31,6 +38,9 @@ from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_f
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
+
+GOES_ON = 20
+"""Frames in which people who were given come from the speed they had to the one predicted (docs/training.md)."""
 
 
 class WorldState:
@@ -264,41 +274,27 @@ class WorldState:
             anchor=first_of(there),
             partner=self.model.layout.partners(deltas.device),
         )
+        placed = self._gone_on(placed, first, stop)
         frames = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
-    def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
-        """Canonical frames just before token `first`, such that the first delta leads to the right place.
+    def _gone_on(self, placed: Tensor, first: int, stop: int) -> Tensor:
+        """Paths of rows [first, stop), of which those that follow known rows go on as fast. (B, T, P, 4, 4) -> same
 
-        Agents that were placed before continue from there. A new agent is placed so that its pairwise transforms to an
-        anchor fit best over the window. The anchor is somebody who is known at the first frame, else somebody who was
-        placed before, else the first new agent, who starts at the origin; in each scene somebody who is present.
+        Whoever is on the way to a keyframe is left alone: that bends the path as well.
         """
-        starts = self.T_world_can[:, max(first * TOKEN_FRAMES - 1, 0)].clone()
-        there = (self.placed[first - 1] if first else torch.zeros_like(self.placed[0])).to(new.device)
-        present = self.given.present
-        if bool((there | ~present).all()):
-            return starts
-        now = self.placed[first].to(new.device)
-        anchor = (present * (4 * now.int() + 2 * there.int() + new.int())).argmax(dim=1)
-        scene = torch.arange(len(starts), device=starts.device)
-        onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
-        onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
-        T_world_anchor = torch.where(
-            now[anchor, None, None], self.T_world_can[scene, first * TOKEN_FRAMES, anchor], onward
-        )
-        for agent in (~there).nonzero()[:, 0].tolist():
-            T_world_first = self.T_world_can[:, first * TOKEN_FRAMES, agent] if bool(now[agent]) else T_world_anchor
-            starts[:, agent] = T_world_first @ inverse(T_prev_can[:, 0, agent])
-        if T_self_partner is None:
-            return starts
-        ways = place(T_prev_can, None, starts)
-        for agent in (~there & ~now).nonzero()[:, 0].tolist():
-            slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
-            hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
-            shift = align_planar(ways[:, :, agent], hung)
-            starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
-        return starts
+        if not first or not self.options.smooth_path or not bool(self.known[first - 1].any()):
+            return placed
+        onward = self.known[first - 1] & ~self.known[stop] if stop < len(self.known) else self.known[first - 1]
+        before = self.T_world_can[:, first * TOKEN_FRAMES - 2 : first * TOKEN_FRAMES]
+        return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed, GOES_ON), placed)
+
+    def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
+        """Canonical frames just before token `first`; see `magnet.generation.entering.starts`."""
+        before, at = self.T_world_can[:, max(first * TOKEN_FRAMES - 1, 0)], self.T_world_can[:, first * TOKEN_FRAMES]
+        there = self.placed[first - 1] if first else torch.zeros_like(self.placed[0])
+        who = there.to(new.device), self.placed[first].to(new.device), new, self.given.present
+        return starts(before, at, *who, T_prev_can, T_self_partner)
 
     def _warp_to_keyframe(self, row: int, new: Tensor) -> Tensor:
         """Warp the paths of agents that have been placed up to a known token. new (P,) -> (N, P) bool, who moved
@@ -385,11 +381,12 @@ class WorldState:
     def _shown_path(self, first: int, stop: int) -> Tensor:
         """Canonical frames of rows [first, stop) as they are shown. -> (B, 4 n, P, 4, 4)"""
         until = stop * TOKEN_FRAMES + 1
-        T_world_can = self.T_world_can[:, :until]
+        T_world_can, frames = self.T_world_can[:, :until], slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         if self.options.smooth_path:
-            placed, known = (self.by_frame(each)[:until] for each in (self.placed, self.known))
-            T_world_can = smoothed_path(T_world_can, placed, known)
-        return T_world_can[:, first * TOKEN_FRAMES : stop * TOKEN_FRAMES]
+            T_world_can = smoothed_path(
+                T_world_can, *(self.by_frame(each)[:until] for each in (self.placed, self.known))
+            )
+        return T_world_can[:, frames]
 
     def by_frame(self, rows: Tensor) -> Tensor:
         """A mask of rows as one of frames, where the bodies are. (n, P) -> (4 n, P)"""

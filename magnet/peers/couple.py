@@ -14,7 +14,7 @@ from magnet.motion.placement import place
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, transforms
 
-BLEND = 10
+BLEND = 20
 """Frames over which a decoded pose takes over from the last given one."""
 
 PAIRWISE_WEIGHT = 0.02

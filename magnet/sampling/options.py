@@ -60,12 +60,13 @@ class SamplerOptions:
             is best sampled, or `off`, as in crowds, live runs and streams.
         smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
-            the one after the last is as it is expected. None: as the model is best sampled, or not.
+            the one after the last is as it is expected. And people go on from what is given as fast as they went.
+            None: as the model is best sampled, or not.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
-        blend: frames over which a seam is blended, after given frames and before them.
+        blend: frames over which a seam is blended, after given frames and before them; 20 were chosen on take 3.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
@@ -94,7 +95,7 @@ class SamplerOptions:
     smooth_path: bool | None = None
     requantize: bool | None = None
     keep_given: bool = True
-    blend: int = 10
+    blend: int = 20
     eta: float = 1.0
     shift: float = 1.0
     any_floor: bool = False

@@ -4,8 +4,16 @@ import pytest
 import roma
 import torch
 
-from magnet.generation.blending import SPRING, smoothed_path, spring_from_given, spring_weights
-from magnet.motion.frames import canonical_frame
+from magnet.generation.blending import (
+    SPRING,
+    crossfade_given,
+    gone_on,
+    seam_weights,
+    smoothed_path,
+    spring_from_given,
+    spring_weights,
+)
+from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -67,6 +75,63 @@ def test_poses_go_on_where_and_as_fast_as_they_were(pair):
     assert torch.allclose(step[:, :9], torch.tensor(0.03), atol=1e-5)
     assert (step[:, 9] - step[:, 8]).abs().max() < 0.008  # decoded poses alone would jump by 0.49 there
     assert (step.diff(dim=1)).abs().max() < 0.008
+
+
+@pytest.mark.parametrize("blend", [1, 4, 20])
+def test_a_seam_between_two_plans_fades_as_the_cubic_with_its_value_and_speed(blend):
+    """p(0) = 2, p'(0) = 0.3, p(blend) = p'(blend) = 0, by solving for the coefficients."""
+    keep = torch.zeros(30, 1, dtype=torch.bool)
+    keep[:3] = True
+    b = float(blend)
+    rows = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [1, b, b**2, b**3], [0, 1, 2 * b, 3 * b**2]])
+    cubic = torch.linalg.solve(rows, torch.tensor([2.0, 0.3, 0.0, 0.0]))
+    since = torch.arange(1, 28).clamp(max=blend).float()
+    expected = sum(cubic[k] * since**k for k in range(4))
+    stays, grows = seam_weights(keep, blend)
+    assert torch.allclose((stays * 2.0 + grows * 0.3)[3:, 0], expected, atol=1e-4)
+
+
+def test_of_a_single_known_frame_no_speed_is_known():
+    keep = torch.zeros(8, 2, dtype=torch.bool)
+    keep[2], keep[1, 0] = True, True
+    stays, grows = seam_weights(keep, 4)
+    assert torch.equal(stays[2:, 0], stays[2:, 1]) and bool((grows[3:6, 0] > 0).all()) and not bool(grows[:, 1].any())
+
+
+def test_generated_poses_leave_given_ones_as_fast_as_these_turn(pair):
+    given, _, T_world_can = pair
+    time = torch.arange(24)[None, :, None, None, None] / 30
+    axis = torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3, 21, 3)
+    first = roma.rotvec_to_rotmat(axis * (0.2 + 0.6 * time))
+    second = roma.rotvec_to_rotmat(axis * (0.7 - 0.3 * time))
+    keep = torch.zeros(24, 3, dtype=torch.bool)
+    keep[:10] = True
+    given, decoded = given.replace(body_rot=first), given.replace(body_rot=second)
+    made = crossfade_given(decoded, given, T_world_can, keep, 12)
+    step = roma.rotmat_to_rotvec(made.body_rot)[..., 2].diff(dim=1)
+    assert torch.allclose(step[:, :9], torch.tensor(0.02), atol=1e-5)
+    assert (step[:, 9] - step[:, 8]).abs().max() < 0.015  # decoded poses alone would jump by 0.5 there
+    assert torch.allclose(step[:, 21:], torch.tensor(-0.01), atol=1e-5)  # twelve frames on nothing is left
+
+
+def test_people_go_on_as_fast_as_they_went_and_end_where_they_would_have():
+    """Known: 5 cm and 0.03 rad a frame, the yaw through a half turn; predicted: standing."""
+    before = from_planar(torch.tensor([3.12, 3.15]), torch.tensor([[0.0, 0.0], [0.03, 0.04]]))[None, :, None]
+    path = from_planar(torch.full((30,), 3.15), torch.tensor([0.03, 0.04]).expand(30, 2))[None, :, None]
+    made = gone_on(before, path, 10)
+    yaw, ground = to_planar(torch.cat([before, made], dim=1)[0, :, 0])
+    pace, turn = ground.diff(dim=0).norm(dim=-1), torch.atan2(yaw.diff().sin(), yaw.diff().cos())
+    assert pace[0] == pytest.approx(0.05) and turn[0] == pytest.approx(0.03, abs=1e-5)
+    assert 0.035 < pace[1] < 0.05 and 0.021 < turn[1] < 0.03
+    assert (turn[1:4].diff() < 0).all()  # ever slower, then back
+    assert torch.allclose(made[:, 9:], path[:, 9:], atol=1e-5)
+    steady = gone_on(before, gone_on(before, path, 10), 10)
+    assert (steady - made).abs().max() < (made - path).abs().max()
+
+
+def test_a_path_that_goes_on_evenly_stays():
+    walk = path(*(0.04 * k for k in range(12)))
+    assert torch.allclose(gone_on(walk[:, :2], walk[:, 2:], 20), walk[:, 2:], atol=1e-6)
 
 
 def test_without_blending_only_given_frames_are_put_back(pair):

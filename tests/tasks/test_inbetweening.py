@@ -252,7 +252,7 @@ def test_a_path_that_misses_is_bent_and_adds_no_speed_at_its_ends(generator):
 
 def test_seams_fade_on_both_sides_and_share_a_short_gap():
     keep = torch.tensor([1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 1], dtype=torch.bool)[:, None]
-    behind, ahead = seam_weights(keep, 4)[:, 0], seam_weights(keep.flip(0), 4).flip(0)[:, 0]
+    behind, ahead = seam_weights(keep, 4)[0][:, 0], seam_weights(keep.flip(0), 4)[0].flip(0)[:, 0]
     assert torch.allclose(behind[1:4] + ahead[1:4], torch.ones(3))
     assert (behind[1:4].diff() < 0).all() and (ahead[1:4].diff() > 0).all()
     assert behind[9] == 0 and ahead[8] == 0 and ahead[11] > ahead[10] > 0
