@@ -1,4 +1,4 @@
-"""The open benchmark: which takes are for what, which scenes are scored, and how submissions to it are measured."""
+"""The open benchmark: its takes and their use, the scenes that are scored, and what a method may read."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ SPLIT_FILE = Path(__file__).parent / "cmu_salsa_duets.json"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What everybody is measured on, alike.
+    """What every method is measured on.
 
     Args:
         name: of the benchmark.
-        version: raised whenever a number could come out otherwise.
+        version: raised whenever a score could change.
         fps: frames a second.
         context_frames: recorded frames at the start of each scene.
         horizon_frames: frames after them, which are scored.
@@ -63,7 +63,7 @@ class Benchmark:
 
     @property
     def label(self) -> str:
-        """Name and version, as a submission says them."""
+        """Name and version, as in a submission."""
         return f"{self.name}-{self.version}"
 
     @property
@@ -94,10 +94,10 @@ class Benchmark:
         return known.repeat_interleave(TOKEN_FRAMES, dim=0)[:frames]
 
     def check(self, datamodule: MotionDataModule) -> None:
-        """Whether the test scenes are those of the benchmark.
+        """Check that the test scenes are those of the benchmark.
 
         Raises:
-            ValueError: some are missing or are others.
+            ValueError: scenes are missing or differ.
         """
         there = datamodule.store("test").labels(datamodule.test_windows(), datamodule.test.frames)
         if there != self.scenes:
@@ -110,7 +110,7 @@ class Benchmark:
 
 
 class BenchmarkTakes(CMU):
-    """CMU's recordings, of which only those are read that a benchmark names, in its split.
+    """The recordings of CMU that a benchmark names, in its split.
 
     Args:
         benchmark: which.

@@ -38,7 +38,7 @@ ARROWS: dict[Better, str] = {"low": " ↓", "high": " ↑", "real": " →", "": 
 
 @cache
 def own_columns() -> dict[str, Column]:
-    """What the metrics of this package say of themselves, for results that do not say it."""
+    """Columns of this package's metrics, for results that do not describe theirs."""
     return columns_of(all_metrics())
 
 
@@ -48,8 +48,8 @@ class Results:
 
     Args:
         rows: method -> metric -> value; `<metric>_low` and `<metric>_high` beside it are its interval.
-        meta: how it came about, JSON-ready: command, commit, machine, date, seed, data, task, sampler, runtime.
-        columns: how metrics are shown, as `columns_of` the metrics says; those of this package need not be given.
+        meta: facts about the run, JSON-ready: command, commit, machine, date, seed, data, task, sampler, runtime.
+        columns: how metrics are shown, by `columns_of`; those of this package's metrics need not be given.
     """
 
     rows: dict[str, dict[str, float]]
@@ -64,7 +64,7 @@ class Results:
         return [name for name in names if name not in ends]
 
     def column(self, metric: str) -> Column:
-        """How a metric is shown; one that nobody describes by its own name."""
+        """How a metric is shown; one without a description by its own name."""
         return column(metric, own_columns() | self.columns)
 
     def value(self, method: str, metric: str) -> float:

@@ -89,7 +89,7 @@ def planned(
 
 @dataclass(frozen=True)
 class Sight:
-    """What a method may read of a scene, and what it is asked for."""
+    """What a method may read of a scene, and what it must predict."""
 
     generated: Tensor  # (horizon, P) bool: which future frames of whom are generated, and so scored
     past_is_given: bool  # everybody's
@@ -106,9 +106,9 @@ class Sight:
 
 
 class Scoring:
-    """Measures methods on test scenes, all by the same numbers; knows nothing of how they answer.
+    """Measures methods on test scenes, all by the same metrics, without knowing how they predict.
 
-    Baselines continue what everybody did before: they are left out where the task does not give that.
+    Baselines continue everybody's past: they are left out if the task does not give it.
 
     Args:
         datamodule: its test scenes; its training windows for baselines.
@@ -220,8 +220,8 @@ class Scoring:
     def step(self, batch: Scene, numbers: list[int]) -> None:
         """Measure every method on one batch of test scenes, which have these numbers in the whole test set.
 
-        Methods see scenes as they were recorded; only what they answer is moved into the world that all test
-        scenes share, so that nothing of an unknown agent can come in through the choice of that world.
+        Methods see scenes as recorded. Only their predictions are moved into the world that all test scenes
+        share, so that the choice of that world cannot tell anything about an unknown agent.
         """
         answers = {}
         for name, method in self.methods.items():

@@ -1,4 +1,4 @@
-"""`Submission`: joints that a method answers the benchmark's scenes with, as an npz that needs none of our models."""
+"""`Submission`: the joints that a method predicts for the benchmark's scenes, in an npz of any program."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KEYS = ("benchmark", "task", "method", "fps", "scenes", "joints")
 
 @dataclass(frozen=True)
 class Submission:
-    """What a method makes of the test scenes.
+    """A method's predictions for the test scenes.
 
     Args:
         benchmark: name and version, such as "cmu-salsa-duets-1".
@@ -50,7 +50,7 @@ class Submission:
         return self.joints.shape[1]
 
     def answer(self, scene: Scene, samples: int, generators: Generators) -> Tensor:
-        """As a `Predictor`: what was handed in for these scenes, however many samples are asked for."""
+        """As a `Predictor`: the joints submitted for these scenes, whatever number of samples is asked for."""
         place = {name: number for number, name in enumerate(self.scenes)}
         chosen = torch.tensor([place[name] for name in scene.names or ()], device=self.joints.device)
         return self.joints[chosen].transpose(0, 1).to(scene.device)
@@ -148,7 +148,7 @@ def _joints(path: Path, joints: Any, benchmark: Benchmark, task: str) -> Tensor:
 def answered(
     datamodule: MotionDataModule, method: Predictor, samples: int, seed: int = 1111
 ) -> tuple[list[str], Tensor]:
-    """Names of all test scenes, and what a method answers to them. -> (B,), (B, S, horizon, P, 22, 3)"""
+    """Names of all test scenes, and a method's predictions for them. -> (B,), (B, S, horizon, P, 22, 3)"""
     names: list[str] = []
     joints = []
     for batch in datamodule.test_dataloader():
@@ -165,7 +165,7 @@ def score(
     baselines: bool = True,
     seed: int = 1111,
 ) -> dict[str, Results]:
-    """A table for each task that somebody handed in for, beside baselines, recordings and training windows."""
+    """A table for each task with a submission, beside baselines, recordings and training windows."""
     benchmark.check(datamodule)
     tables = {}
     for task in dict.fromkeys(each.task for each in submissions):
@@ -189,7 +189,7 @@ def score(
 
 
 def row_names(submissions: Iterable[Submission]) -> list[str]:
-    """Names of rows: the method's, with its file where another row has it already."""
+    """Names of rows: the method's, with its file if another row has the same."""
     taken = {TRUTH, TRAINING, *UNALIGNED, "NN", "RS", "zero velocity", "ridge"}
     names = []
     for each in submissions:
