@@ -1,9 +1,11 @@
 """What a crowd costs, from two people to two hundred, and how deep its people are in each other.
 
-    python benchmarks/crowd.py --people 2 4 8 16 32 64 128 200 --plot crowd.png
+    python benchmarks/crowd.py --people 2 4 8 16 32 64 128 200 --plot docs/pictures/crowd_cost.png
     python benchmarks/crowd.py --people 200 --frames 900 --out crowd.npz
+    python benchmarks/crowd.py --people 100 --frames 1800 --memory docs/pictures/crowd_memory.png
 
-Views a step are what the network looks at; time is that of the processor and of the clock, of sampling alone.
+Views a step are what the network looks at; time is that of the processor and of the clock, of sampling and of what is
+corrected after it, of whoever is more than the model has slots for. With --memory nothing of the crowd is kept.
 """
 
 from __future__ import annotations
@@ -12,18 +14,21 @@ import argparse
 import os
 import resource
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
-import magnet
+import magnet.api
 from magnet.generation.crowd import CrowdRollout
 from magnet.generation.crowd_settling import settled_moments
 from magnet.generation.crowd_start import START
+from magnet.generation.rollout import CHUNK
 from magnet.generation.stats import SamplingStats
+from magnet.metrics import Floating, FootSkating
 from magnet.metrics.body_depth import DEEP, deepest
-from magnet.motion.scene import Scene, cat_time
+from magnet.motion.scene import FPS, Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import JointFuture
 
@@ -40,14 +45,30 @@ class Cost(NamedTuple):
     peak_gb: float
 
 
-def sampled(model: magnet.Model, people: int, frames: int, spacing: float) -> tuple[Scene, Cost]:
-    """A crowd of couples that goes on for so many frames, and what that cost."""
-    start = model.start_crowd(people, spacing=spacing, seed=0).plain()
-    stats, began, used = SamplingStats(), time.perf_counter(), time.process_time()
+def held_gb() -> float:
+    """Memory that the process holds now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e9
+
+
+def rolled(model: magnet.Model, start: Scene, frames: int, stats: SamplingStats, chunk: int = CHUNK) -> Iterator[Scene]:
+    """A crowd that goes on from a start, chunk by chunk."""
     generator = torch.Generator().manual_seed(1)
-    rollout = CrowdRollout(model.denoiser, start, JointFuture(), START, frames, model.sampler, generator, stats=stats)
+    rest = model.sampler, generator, None, stats, chunk
+    return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, *rest).chunks()
+
+
+def couples(model: magnet.Model, people: int) -> list[Scene]:
+    """The couples that crowds of up to so many people begin with."""
+    made = model.start_crowd(people, seed=0).plain()
+    return [made.permute_agents(torch.arange(first, min(first + 2, people))) for first in range(0, people, 2)]
+
+
+def sampled(model: magnet.Model, groups: list[Scene], people: int, frames: int, spacing: float) -> tuple[Scene, Cost]:
+    """A crowd of couples that goes on for so many frames, and what that cost."""
+    start = model.start_crowd(people, groups, spacing, seed=0).plain()
+    stats, began, used = SamplingStats(), time.perf_counter(), time.process_time()
     pieces = []
-    for piece in rollout.chunks():
+    for piece in rolled(model, start, frames, stats):
         pieces.append(piece)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         done = sum(each.frames for each in pieces)
@@ -58,6 +79,48 @@ def sampled(model: magnet.Model, people: int, frames: int, spacing: float) -> tu
     views = stats.windows / stats.calls
     cost = Cost(people, stats.calls, views, 1000 * cpu / stats.calls, frames / took, frames / cpu, peak)
     return scene, cost
+
+
+def remembered(model: magnet.Model, people: int, frames: int, spacing: float, path: Path) -> None:
+    """Memory of a crowd that goes on, after each two seconds of it, of which nothing is kept."""
+    from matplotlib.figure import Figure
+
+    start = model.start_crowd(people, couples(model, people), spacing, seed=0).plain()
+    began, used, done, line = time.perf_counter(), time.process_time(), 0, [(0.0, held_gb())]
+    for piece in rolled(model, start, frames, SamplingStats(), chunk=16):
+        done += piece.frames
+        line.append((done / FPS, held_gb()))
+        cpu = time.process_time() - used
+        print(f"  {done / FPS:.1f} s of the crowd, {line[-1][1]:.3f} GB, {cpu:.0f} s of processor", flush=True)
+    print(f"{people} people, {done} frames in {time.perf_counter() - began:.0f} s")
+    figure = Figure(figsize=(5, 2.6), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(*zip(*line, strict=True))
+    axis.set(xlabel=f"seconds of {people} people", ylabel="memory, GB", ylim=(0, None))
+    figure.savefig(path, dpi=110)
+
+
+def company(scene: Scene) -> str:
+    """How people who began as couples stand, at the start and over the last second, and how their feet do."""
+    joints = magnet.api.Motion.of(scene).joints()[0].detach()[:, scene.present[0]]  # (T, P, 22, 3)
+    people = joints.shape[1]
+    ground = joints[:, :, 0, [0, 2]]
+    away, couple = torch.cdist(ground, ground), torch.arange(people) // 2
+    stranger = torch.where(couple[:, None] == couple, torch.inf, away).amin(dim=-1)
+    own = (ground[:, 0 : people - 1 : 2] - ground[:, 1::2]).norm(dim=-1)
+    speed, lowest = ground.diff(dim=0).norm(dim=-1) * FPS, joints[..., 1].amin(dim=-1)
+    said = []
+    for name, part in (("start", slice(START)), ("end", slice(-START, None))):
+        near, height = stranger[part], 100 * lowest[part].mean()
+        said.append(
+            f"{name}: nearest stranger {near.mean():.2f} m, {100 * float((near < 1).float().mean()):.0f} % under 1 m, "
+            f"own partner {own[part].median():.2f} m, {speed[part].mean():.2f} m/s, lowest joint {height:.1f} cm"
+        )
+    made, present = joints[START:], torch.ones(1, people, dtype=torch.bool)
+    for metric in (FootSkating(), Floating()):
+        metric.update(made[None, None], made[None], present)
+        said += [f"{name} {float(value):.3f}" for name, value in metric.compute().items()]
+    return "; ".join(said)
 
 
 def depths(scene: Scene) -> str:
@@ -83,16 +146,19 @@ def depths(scene: Scene) -> str:
 
 
 def plotted(costs: list[Cost], path: Path) -> None:
-    """Views and processor time a step against people."""
+    """Views, processor time a step and memory against people."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(10, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
     people = [cost.people for cost in costs]
-    left.plot(people, [cost.views for cost in costs], "o-")
-    left.set(xlabel="people", ylabel="views a step")
-    right.plot(people, [cost.cpu_ms for cost in costs], "o-")
-    right.set(xlabel="people", ylabel="processor time a step, ms")
+    for axis, label, line in (
+        (axes[0], "views a step", [cost.views for cost in costs]),
+        (axes[1], "processor time a step, ms", [cost.cpu_ms for cost in costs]),
+        (axes[2], "peak memory, GB", [cost.peak_gb for cost in costs]),
+    ):
+        axis.plot(people, line, "o-")
+        axis.set(xlabel="people", ylabel=label, ylim=(0, None))
     figure.savefig(path, dpi=110)
 
 
@@ -103,13 +169,18 @@ def main() -> None:
     options.add_argument("--sampler", default="default", help="a preset")
     options.add_argument("--steps", type=int, default=16)
     options.add_argument("--spacing", type=float, default=3.0)
+    options.add_argument("--settle", choices=("off", "light", "firm", "hold"), help="(default: as the model says)")
     options.add_argument("--plot", type=Path)
+    options.add_argument("--memory", type=Path, help="plot memory over time, of the first number of people")
     options.add_argument("--out", type=Path, help="where the last crowd goes")
     chosen = options.parse_args()
-    model = magnet.Model(magnet.load().denoiser, SamplerOptions.preset(chosen.sampler, steps=chosen.steps))
-    costs = []
+    settle = {} if chosen.settle is None else {"settle": chosen.settle}
+    model = magnet.Model(magnet.load().denoiser, SamplerOptions.preset(chosen.sampler, steps=chosen.steps, **settle))
+    if chosen.memory:
+        return remembered(model, chosen.people[0], chosen.frames, chosen.spacing, chosen.memory)
+    costs, groups = [], couples(model, max(chosen.people))
     for people in chosen.people:
-        scene, cost = sampled(model, people, chosen.frames, chosen.spacing)
+        scene, cost = sampled(model, groups, people, chosen.frames, chosen.spacing)
         costs.append(cost)
         print(
             f"{cost.people} people: {cost.views:.1f} views a step, {cost.cpu_ms:.0f} ms of processor a step, "
@@ -118,7 +189,7 @@ def main() -> None:
             flush=True,
         )
         if people > 1:
-            print(depths(scene), flush=True)
+            print(f"{depths(scene)}\n{company(scene)}", flush=True)
         if chosen.out:
             scene.save(chosen.out)
     if chosen.plot:

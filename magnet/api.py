@@ -18,8 +18,8 @@ from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
-from magnet.generation.crowd import MOST, generate_crowd
-from magnet.generation.crowd_start import SPACING, START, start_crowd
+from magnet.generation.crowd import generate_crowd
+from magnet.generation.crowd_start import MOST, SPACING, START, start_crowd
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene, empty_scene, require_rate

@@ -39,6 +39,7 @@ class Gate:
     Attributes:
         taken: how many were.
         refused: how many were not, by the reason.
+        passed_over: how many were right in form and for somebody else: what who comes back is told of its own past.
         now: own frame, about which frames of others are taken; None: any.
     """
 
@@ -47,13 +48,13 @@ class Gate:
     ) -> None:
         self.names, self.me, self.model, self.latent = tuple(names), me, model, latent
         self.rate, self.burst = rate, burst
-        self.taken, self.refused = 0, Counter[str]()
+        self.taken, self.passed_over, self.refused = 0, 0, Counter[str]()
         self.now: int | None = None
         self._sessions: dict[str, int] = {}
         self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
 
     def take(self, parts: Sequence[bytes], at: float, peer: str | None = None) -> Message | None:
-        """A message, if it is right; None, and a count more, if not.
+        """A message, if it is right and for this agent; None, and a count more, if not.
 
         Args:
             parts: as they came.
@@ -63,6 +64,9 @@ class Gate:
         try:
             message = unpack(parts)
             self._sent_by(message, at, peer)
+            if message.agent not in (message.sender, self.me):
+                self.passed_over += 1
+                return None
             self._numbers(message)
         except RefusedMessage as reason:
             self.refused[str(reason)] += 1
@@ -75,7 +79,7 @@ class Gate:
         sender = message.sender
         if sender not in self.names or sender == self.me or peer not in (None, sender):
             raise RefusedMessage("sender")
-        if message.agent not in (sender, self.me):
+        if message.agent not in self.names:
             raise RefusedMessage("agent")
         if message.session < self._sessions.get(sender, 0):
             raise RefusedMessage("session")
@@ -84,7 +88,7 @@ class Gate:
         self._left[sender] = (max(left - 1, 0.0), at)
         if left < 1:
             raise RefusedMessage("rate")
-        if message.kind == "frames":
+        if message.kind == "frames" and message.agent in (sender, self.me):
             first, last = message.frame, message.frame + len(message.poses) - 1
             if first < 0 or first // TOKEN != last // TOKEN:
                 raise RefusedMessage("frame")

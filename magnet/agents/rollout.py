@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import Sampling
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.motion.frames import canonical_frame, pairwise, to_9d
@@ -54,7 +55,7 @@ class OwnRollout(Rollout):
         missing: (N, P) bool, token steps of the past that are not known.
 
     Raises:
-        ValueError: another offset or block, several scenes, no such agent, or what `Rollout` refuses.
+        ValueError: another offset or block, several scenes, no such agent, `settle`, or what `Rollout` refuses.
     """
 
     def __init__(
@@ -73,7 +74,12 @@ class OwnRollout(Rollout):
             raise ValueError(
                 f"past: got {past.scenes} scenes of {past.agents} agents, expected one, agent {agent} in it"
             )
-        options = options or SamplerOptions()
+        options = (options or SamplerOptions()).filled(Sampling(settle="off"))
+        if options.settle != "off" or options.settle_blocks:
+            raise ValueError(
+                f"settle: got {options.settle}, expected off: of the others an agent knows tokens and places, and no "
+                "bodies to make way for"
+            )
         if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
             options = dataclasses.replace(options, placement="integrate")
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)

@@ -82,25 +82,28 @@ class Report:
         late: how many of them after they were due.
         joined: the first token, where others had begun before.
         jumps: how often it went on where the others were, having fallen behind.
+        speed: see `Process`; what is reported is in real time but for lateness, which is in the scene's.
     """
 
     tokens: int = 0
     late: int = 0
     joined: int = 0
     jumps: int = 0
+    speed: float = 1.0
     took: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
 
     def told(self, member: Member, gate: Gate, pace: Pace | None) -> dict[str, Any]:
         """All counts, JSON-ready."""
         took, late = sorted(self.took), sorted(self.lateness)
-        middle = 1000 * statistics.median(took) if took else None
+        middle = 1000 * statistics.median(took) / self.speed if took else None
         return {
             "tokens": self.tokens, "joined": self.joined, "next": member.next, "late": self.late, "jumps": self.jumps,
             "late_ms_p99": 1000 * late[int(0.99 * len(late))] if late else None,
             "late_ms_most": 1000 * late[-1] if late else None, "made_in_ms": middle,
             "gaps": member.gaps, "filled": member.filled,
-            "taken": gate.taken, "refused": dict(gate.refused), "resets": pace.resets if pace else 0,
+            "taken": gate.taken, "passed_over": gate.passed_over, "refused": dict(gate.refused),
+            "resets": pace.resets if pace else 0,
         }  # fmt: skip
 
 
@@ -117,6 +120,7 @@ class Process:
         meet: seconds to wait for the others to come.
         session: when this process began, in nanoseconds.
         clock: seconds of a clock that does not go back.
+        speed: seconds of the scene in a second of the clock, the same for all: less than 1 where processors are slow.
         kept: called with each own message.
     """
 
@@ -132,21 +136,23 @@ class Process:
         session: int | None = None,
         clock: Callable[[], float] = time.monotonic,
         kept: Callable[[Message], object] = lambda _: None,
+        speed: float = 1.0,
     ) -> None:
         self.member, self.link, self.gate, self.others = member, link, gate, others
-        self.real_time, self.patience, self.meet, self.clock, self.kept = real_time, patience, meet, clock, kept
+        self.real_time, self.patience, self.meet, self.kept = real_time, speed * patience, speed * meet, kept
+        self.clock: Callable[[], float] = lambda: speed * clock()
         self.session = time.time_ns() if session is None else session
         self.name = member.names[member.me]
         self.pace: Pace | None = None
-        self.report = Report()
+        self.report = Report(speed=speed)
         self._heard: set[str] = set()
         self._heard_by: set[str] = set()
         self._running: set[str] = set()
         self._answered: Counter[str] = Counter()
 
     def listen(self, seconds: float) -> None:
-        """Take in what comes within some time, and what has come."""
-        for peer, parts in self.link.receive(seconds):
+        """Take in what comes within some time of the scene, and what has come."""
+        for peer, parts in self.link.receive(seconds / self.report.speed):
             at = self.clock()
             message = self.gate.take(parts, at, peer)
             if message is None:

@@ -48,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     add("--person", type=int, default=0, help="person of that file (default: the first)")
     add("--seconds", type=float, default=None, help="how long to take part (default: until interrupted)")
     add("--pace", choices=("real", "others"), default="real", help="by the clock, or as soon as all tokens are there")
+    add("--speed", type=float, default=1.0, help="of the clock of all: 0.25 is a quarter of real time (default: 1)")
     add("--patience", type=float, default=5.0, help="seconds to wait for a token with --pace others")
     add("--meet", type=float, default=30.0, help="seconds to wait for the others to connect (default: %(default)s)")
     add("--keys", type=Path, metavar="FOLDER", help="folder of CURVE keys; without them only this machine is reached")
@@ -70,6 +71,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         return 0
     if given.scene is None or given.listen is None:
         raise CommandError("--scene START and --listen ADDRESS say what to begin with and where the others hear it")
+    if not 0 < given.speed <= 1:
+        raise CommandError(f"--speed is {given.speed:g}, expected over 0 and at most 1, real time")
     if given.threads < 1:
         raise CommandError(f"--threads is {given.threads}, expected at least 1")
     import torch
@@ -146,6 +149,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         given.patience,
         given.meet,
         kept=told.append if given.out else lambda _: None,
+        speed=given.speed,
     )
     for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
         signal.signal(number, signal.default_int_handler)

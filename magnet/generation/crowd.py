@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.options import Sampling
-from magnet.generation.crowd_settling import settled_moments
-from magnet.generation.crowd_start import START, start_from_nothing
+from magnet.generation.crowd_room import SMOOTHED, room_made
+from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settled_groups, settled_moments
+from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
@@ -40,9 +40,6 @@ BOND = 1.2
 BEHIND = 8
 """Token steps before a block that its bodies are decoded with, to keep them out of each other."""
 
-MOST = 200
-"""People of a crowd: more were not tried."""
-
 MOST_HIDING = 16
 """People up to whom a task may hide agents from each other: everybody's view of everybody is their square."""
 
@@ -65,9 +62,10 @@ def generate_crowd(
     """Sample a task for any number of people; arguments and result as of `magnet.generation.rollout.generate`.
 
     Scenes and samples are made one after the other. People are kept apart (`firm`, unless `options` say `light`),
-    and in the end moments in which two still pass through each other are settled (`settled_moments`). Of as many
-    people as the model has slots for, or fewer, a single scene is what `generate` makes, bit for bit. `Generation`
-    from nothing begins with couples on a floor plan (`start_crowd`), from which everybody goes on.
+    pairs are corrected as a scene of two is (`settle`), and in the end moments in which two still pass through each
+    other are settled (`settled_moments`). Of as many people as the model has slots for, or fewer, a single scene is
+    what `generate` makes, bit for bit. `Generation` from nothing begins with couples on a floor plan (`start_crowd`),
+    from which everybody goes on.
 
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
@@ -78,7 +76,7 @@ def generate_crowd(
         more = (options, generator, progress, stats, CHUNK, None if cond is None else cond[which])
         one = scene.select(which)
         if scene.agents > model.layout.agents and context == 0 and isinstance(task, Generation):
-            _refuse(model, one, TOKEN_FRAMES, options or SamplerOptions())
+            require_crowd(model, one, TOKEN_FRAMES, options or SamplerOptions())
             start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
             whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *more).chunks()))
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
@@ -112,9 +110,12 @@ class CrowdRollout(Rollout):
     ) -> None:
         self.crowd = scene.agents > model.layout.agents
         if self.crowd:
-            options = (options or SamplerOptions()).filled(Sampling(settle="off"))
-            _refuse(model, scene, context, options)
-            options = replace(options, apart="firm") if options.apart == "off" else options
+            options = options or SamplerOptions()
+            require_crowd(model, scene, context, options)
+            self.settle = options.filled(model.sampling).settle or "off"
+            self._settled: SettledGroups = {}
+            self._sight = options.crowd_enter, options.crowd_leave
+            options = replace(options, settle="off", apart="firm" if options.apart == "off" else options.apart)
         self.viewer, self.model = model, copy.copy(model)  # the same weights with tokens of another layout
         self.model.denoise = self._denoise_in_views  # type: ignore[method-assign, assignment]
         self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with
@@ -123,6 +124,7 @@ class CrowdRollout(Rollout):
         super().__init__(self.model, scene, task, context, frames, 1, options, generator, progress, stats, chunk, cond)
         if self.crowd:
             self.world.decode_rows = self._decode_rows
+            self.world.steer = None if self.world.causal else self._steer  # nobody gives way to what is not seen yet
         if self.crowd and not bool((self.known[context // TOKEN_FRAMES - 1] | ~self.scene.present[0].cpu()).all()):
             raise ValueError(
                 "in a crowd everybody's start must be known, because partners are chosen by place: generation needs "
@@ -140,7 +142,7 @@ class CrowdRollout(Rollout):
             both = self._present[:, None] & self._present & (person[:, None] != person)
             self._bonds = (away < BOND) & both
             nobody = person[:, None].repeat(1, slots - 1)
-            table = nearest_partners(stood[-1], self._present, nobody, self._bonds)
+            table = nearest_partners(stood[-1], self._present, nobody, self._bonds, *self._sight)
         else:
             table = self.viewer.layout.partners(self.viewer.device)
         self._point(table)
@@ -174,7 +176,7 @@ class CrowdRollout(Rollout):
         person = torch.arange(len(last), device=last.device)
         T_world_now = self.world.T_world_can[0, last * TOKEN_FRAMES + TOKEN_FRAMES - 1, person]
         before = self.model.layout.partners(last.device)
-        table = nearest_partners(to_planar(T_world_now)[1], self._present, before, self._bonds)
+        table = nearest_partners(to_planar(T_world_now)[1], self._present, before, self._bonds, *self._sight)
         who, slot = (table != before).nonzero(as_tuple=True)
         if not len(who):
             return
@@ -255,6 +257,23 @@ class CrowdRollout(Rollout):
             return poses[:, (first - low) * TOKEN_FRAMES :][:, : rows * TOKEN_FRAMES]
 
         return decode
+
+    def _steer(self, rows: slice, new: Tensor) -> None:
+        """Whom a stage has placed makes room for strangers; not those on the way to a keyframe. new (n, P) bool"""
+        new = new & ~self.world.known[rows.stop] if rows.stop < len(self.world.known) else new
+        lead = min(SMOOTHED, rows.start * TOKEN_FRAMES)  # frames before, by which everybody walks
+        frames = slice(rows.start * TOKEN_FRAMES - lead, rows.stop * TOKEN_FRAMES)
+        may = torch.nn.functional.pad(self.world.by_frame(new), (0, 0, lead, 0)).to(self._present.device)
+        here = self.world.T_world_can[:, frames]
+        self.world.T_world_can[:, frames] = room_made(here, may, self._bonds, self._present)
+
+    def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
+        made = super()._decoded(start, stop, before, needed)
+        if not self.crowd or self.settle == "off":
+            return made
+        groups = bonded_groups(self._bonds, self._present, self.viewer.layout.agents)
+        made, self._settled = settled_groups(made, groups, self.settle, self._settled)
+        return made
 
     # -- the network sees views --------------------------------------------------------------------
 
@@ -362,21 +381,3 @@ class CrowdRollout(Rollout):
         about = pairs[person, :, :, views.partner_slot.clamp_min(0)]  # (P, K, R, W, 36)
         read = torch.cat([mine[..., :own], about.permute(0, 2, 3, 1, 4).flatten(-2)], dim=-1)
         return read.permute(1, 2, 0, 3)
-
-
-def _refuse(model: Denoiser, scene: Scene, context: int, options: SamplerOptions) -> None:
-    """Raise ValueError for what is not made for crowds."""
-    if scene.agents > MOST:
-        raise ValueError(f"got {scene.agents} people, expected at most {MOST}")
-    if model.layout.agents < 2 or not model.layout.slots:
-        raise ValueError("crowds need a model with pairwise transforms of two people or more")
-    if context < TOKEN_FRAMES or context > scene.frames:
-        raise ValueError(
-            f"context: got {context} of {scene.frames} frames; a crowd goes on from where everybody stands: give at "
-            f"least {TOKEN_FRAMES} frames of everybody, for example by magnet.generation.crowd_start.compose"
-        )
-    for name in ("body_guidance", "settle"):
-        if getattr(options, name) not in (None, "off"):
-            raise ValueError(f"{name}: got {getattr(options, name)}, expected off in a crowd; apart works there")
-    if options.placement == "anchor":
-        raise ValueError("placement: got anchor, expected fuse or integrate in a crowd: nobody knows everybody")

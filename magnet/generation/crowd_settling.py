@@ -1,7 +1,8 @@
-"""Moments of a finished crowd in which two people are still in each other's bodies are settled, one by one."""
+"""A crowd's poses are corrected: pairs by themselves, then the moments in which two are still in each other."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,9 +11,9 @@ from torch import Tensor
 from magnet.body.apart import APART, REACH, excess_depth, near_pairs
 from magnet.body.repair import repaired
 from magnet.generation.separation import open_body_on
-from magnet.generation.settling import FINISHED, LEAD
+from magnet.generation.settling import FINISHED, LEAD, Corrected, settled_chunk
 from magnet.motion.runs import true_runs
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate
 
 ROUNDS = 3
 """How often all moments are settled: whoever makes way for one may step into another."""
@@ -24,6 +25,10 @@ BESIDE = 6
 """Others who stand by at most, as they are, so that nobody makes way into them."""
 
 
+SettledGroups = dict[int, Corrected]
+"""How the last chunk of groups was corrected, by how many people they are of."""
+
+
 class Encounter(NamedTuple):
     """Two people who are in each other in the frames [start, stop), or nearly all of them."""
 
@@ -31,6 +36,54 @@ class Encounter(NamedTuple):
     other: int
     start: int
     stop: int
+
+
+def bonded_groups(bonds: Tensor, present: Tensor, most: int) -> list[tuple[int, ...]]:
+    """Who belongs together: those whom bonds join; each alone where they are more than `most`.
+
+    bonds (P, P) bool, present (P,) bool -> everybody who is there, in one group each
+
+    >>> bonds = torch.zeros(4, 4, dtype=torch.bool)
+    >>> bonds[0, 2] = bonds[2, 0] = True
+    >>> bonded_groups(bonds, torch.tensor([True, True, True, False]), 4)
+    [(0, 2), (1,)]
+    """
+    groups: list[tuple[int, ...]] = []
+    left = present.nonzero()[:, 0].tolist()
+    while left:
+        group, new = {left[0]}, {left[0]}
+        while new:
+            new = {q for p in new for q in bonds[p].nonzero()[:, 0].tolist() if q in left} - group
+            group |= new
+        left = [p for p in left if p not in group]
+        groups += [tuple(sorted(group))] if len(group) <= most else [(p,) for p in sorted(group)]
+    return groups
+
+
+def settled_groups(
+    scene: Scene, groups: Sequence[tuple[int, ...]], how: str, past: SettledGroups
+) -> tuple[Scene, SettledGroups]:
+    """A chunk of a crowd whose groups are corrected as scenes of their own are: feet, floor, hands and each other.
+
+    Args:
+        scene: (1, T, P), with what is `given`, which stays.
+        groups: the same for all chunks.
+        how: `light`, `firm` or `hold`.
+        past: what the last call returned; empty: the chunk is the first.
+
+    Returns:
+        The scene, and how its last frames were corrected.
+    """
+    given = torch.zeros_like(scene.T_world_root[..., 0, 0], dtype=torch.bool) if scene.given is None else scene.given
+    body_rot, root, now = scene.body_rot.clone(), scene.T_world_root.clone(), SettledGroups()
+    for size in sorted({len(group) for group in groups}):
+        who = torch.tensor([group for group in groups if len(group) == size], device=scene.device)  # (G, size)
+        parts = [scene.permute_agents(each).replace(given=None, valid=None, names=()) for each in who]
+        fixed = torch.stack([given[0][:, each] for each in who])
+        made, now[size] = settled_chunk(concatenate(parts), fixed, how, past.get(size))
+        body_rot[0, :, who.flatten()] = made.body_rot.transpose(0, 1).flatten(1, 2)
+        root[0, :, who.flatten()] = made.T_world_root.transpose(0, 1).flatten(1, 2)
+    return scene.replace(body_rot=body_rot, T_world_root=root), now
 
 
 @torch.no_grad()

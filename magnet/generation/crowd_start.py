@@ -17,6 +17,9 @@ from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import Generation
 
+MOST = 200
+"""People of a crowd: more were not tried."""
+
 SPACING = 3.0
 """Metres from the middle of a group to that of the next, where nothing is said."""
 
@@ -119,3 +122,25 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
         T_floor_cell = from_planar(turn, cell)
         placed.append(part.transformed((T_floor_cell @ T_cell_middle).to(part.T_world_root)))
     return cat_agents(placed)
+
+
+def require_crowd(model: Denoiser, scene: Scene, context: int, options: SamplerOptions) -> None:
+    """Check that a crowd can go on from a scene so.
+
+    Raises:
+        ValueError: too many people, no context, or a model or options that are not for crowds.
+    """
+    if scene.agents > MOST:
+        raise ValueError(f"got {scene.agents} people, expected at most {MOST}")
+    if model.layout.agents < 2 or not model.layout.slots:
+        raise ValueError("crowds need a model with pairwise transforms of two people or more")
+    if context < TOKEN_FRAMES or context > scene.frames:
+        raise ValueError(
+            f"context: got {context} of {scene.frames} frames; a crowd goes on from where everybody stands: give at "
+            f"least {TOKEN_FRAMES} frames of everybody, for example by `compose`"
+        )
+    for name, off in (("body_guidance", "off"), ("settle_blocks", False)):
+        if getattr(options, name) != off:
+            raise ValueError(f"{name}: got {getattr(options, name)}, expected {off} in a crowd; apart works there")
+    if options.placement == "anchor":
+        raise ValueError("placement: got anchor, expected fuse or integrate in a crowd: nobody knows everybody")

@@ -127,7 +127,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
 
     Args:
         scene: (B, T, P) bodies; whoever is not present is not seen.
-        fixed: (T, P) bool, who stays.
+        fixed: (T, P) or (B, T, P) bool, who stays.
         how: `light`, `firm` or `hold`.
         past: what the last call returned; None: the chunk is the first.
 
@@ -140,7 +140,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
     offset, holding = (None, None) if past is None else past[:2]
-    still = fixed[:, there.to(fixed.device)]
+    still = fixed[..., there.to(fixed.device)]
     offset = settling(shaped, body, how, still, FINISHED, begun, offset, holding=holding)
     made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None

@@ -84,6 +84,7 @@ class WorldState:
         self.chunk: Corrected | None = None  # and in others
         self.uncorrected: Scene | None = None  # those frames of a causal plan without it
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
+        self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
         self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
 
@@ -127,6 +128,8 @@ class WorldState:
             latent = torch.where(new[..., None], code, latent)
         placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
+        if self.steer is not None:
+            self.steer(slice(first, stop), finished[first:stop])
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
         if self.options.settle_blocks and self.settle is not None:

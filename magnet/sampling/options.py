@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from magnet.checks import require_choice, require_number, require_whole
+from magnet.motion.neighbours import ENTER, LEAVE
 from magnet.motion.placement import Placement
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
@@ -70,6 +71,9 @@ class SamplerOptions:
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
+        crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
+            beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
+            models learned from couples (docs/tasks.md).
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step share one level; `independent`: each token of each agent has
@@ -98,6 +102,8 @@ class SamplerOptions:
     blend: int = 20
     eta: float = 1.0
     shift: float = 1.0
+    crowd_enter: float = ENTER
+    crowd_leave: float = LEAVE
     any_floor: bool = False
     guidance: Guidance = field(default_factory=Guidance)
     noise_sampling: NoiseSampling = "joint"
@@ -120,6 +126,8 @@ class SamplerOptions:
             require_whole("pyramid_offset", self.pyramid_offset, 0)
         require_number("pairwise_weight", self.pairwise_weight, least=0)
         require_whole("blend", self.blend, 0)
+        require_number("crowd_enter", self.crowd_enter, over=0)
+        require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
         require_number("eta", self.eta, 0, 1)
         require_spacing(self.spacing, self.shift)
 

@@ -140,3 +140,11 @@ def test_who_sends_too_fast_for_somebody_else_or_from_an_ended_process_is_not_he
 def test_a_token_of_another_model_does_not_matter_and_the_poses_are_taken():
     sent = dataclasses.replace(message(), model="other", token=np.full(9999, np.nan, np.float32))
     assert gate().take(pack(sent), 0.0) is not None
+
+
+def test_what_is_told_somebody_else_of_its_past_is_neither_taken_nor_refused():
+    ours = Gate(("A", "B", "C"), "A", "feed", LATENT)
+    ours.now = 4000  # what somebody is told who was away for long is long ago
+    assert ours.take(pack(dataclasses.replace(message(token=False), agent="C")), 0.0, peer="B") is None
+    assert (ours.taken, ours.passed_over, dict(ours.refused)) == (0, 1, {})
+    assert ours.take(pack(dataclasses.replace(message(4000, token=False), agent="A")), 0.0, peer="B") is not None

@@ -60,13 +60,13 @@ class Line:
         return [self.coming.pop(0)] if self.coming else []
 
 
-def played(line: Line, coming: int) -> tuple[Process, Player]:
+def played(line: Line, coming: int, speed: float = 1.0) -> tuple[Process, Player]:
     """B, who plays a recording, and messages of A, who plays the same and is so many tokens on."""
     start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 2), (400, 1)))
     other, member = (Player(recording, start, "AB", name) for name in "AB")
     told = [other.step() for _ in range(coming)]
     line.coming += [("A", pack(message)) for message in told if message is not None]
-    return Process(member, line, Gate("AB", "B", "", 0), {"A"}, clock=lambda: line.now, session=1), member
+    return Process(member, line, Gate("AB", "B", "", 0), {"A"}, clock=lambda: line.now, session=1, speed=speed), member
 
 
 def test_hellos_are_not_answered_by_hellos():
@@ -92,3 +92,17 @@ def test_who_has_fallen_behind_goes_on_where_the_others_are():
     assert process.turn()
     assert member.next == 61 and process.report.jumps == 1
     assert process.turn() and process.report.jumps == 1
+
+
+def test_where_the_clock_runs_slower_tokens_are_due_later_and_nothing_else_changes():
+    """Ten tokens at a quarter of real time take as long as forty."""
+    took, reports = [], []
+    for speed in (1.0, 0.25):
+        line = Line([])
+        process, _ = played(line, 0, speed)
+        process.meet = 0.0
+        begun = line.now
+        reports.append(process.run(10))
+        took.append(line.now - begun)
+    assert took[1] == pytest.approx(4 * took[0], rel=0.02)
+    assert reports[0]["late"] == reports[1]["late"] == 0 and reports[1]["tokens"] == 10

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[2]
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -66,22 +69,55 @@ def trained(out: Path, *launcher: str, batch: int, devices: int) -> list[float]:
     return losses(out)
 
 
+def torchrun(processes: int) -> tuple[str, ...]:
+    """What runs a module in so many processes."""
+    return (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes), "-m")
+
+
 @pytest.mark.slow
 def test_torchrun_trains_as_one_process_with_the_same_global_batch(
     tmp_path: Path,
 ) -> None:
     one = trained(tmp_path / "one", sys.executable, "-m", batch=16, devices=1)
-    torchrun = (
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc_per_node",
-        "2",
-        "-m",
+    for processes in (2, 4):
+        out = tmp_path / f"of_{processes}"
+        several = trained(out, *torchrun(processes), batch=16 // processes, devices=processes)
+        assert len(one) == 4 and several == pytest.approx(one, rel=0.1), processes
+
+
+def workers(launcher: int) -> list[int]:
+    """The processes that torchrun has started, by their numbers."""
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(launcher)], capture_output=True, text=True, check=True)
+    return [int(number) for number in found.stdout.split()]
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_ends_what_torchrun_runs_and_it_goes_on_from_the_last_checkpoint(
+    tmp_path: Path,
+) -> None:
+    out, log = tmp_path / "run", tmp_path / "log.txt"
+    rest = [*FIT, *QUIET[:4], "--trainer.devices", "2", "--data.batch_size", "8", "--data.epoch_size", "96"]
+    command = [*torchrun(2), "magnet", *rest, "--out", str(out)]
+    with log.open("w") as told:
+        both = subprocess.Popen(
+            [*command, "--trainer.max_epochs", "1000"], cwd=ROOT, env=ENV, stdout=told, stderr=subprocess.STDOUT
+        )
+    until = time.monotonic() + 200
+    while not list(out.glob("checkpoints/last.ckpt.sha256")) and time.monotonic() < until and both.poll() is None:
+        time.sleep(0.2)
+    os.kill(workers(both.pid)[1], signal.SIGKILL)
+    assert both.wait(120) != 0
+    said = log.read_text()
+    assert "Signal 9 (SIGKILL)" in said and "ChildFailedError" in said
+    done = torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["epoch"]
+    subprocess.run(
+        [*command, "--trainer.max_epochs", str(done + 2), "--ckpt_path", "last"],
+        cwd=ROOT,
+        env=ENV,
+        check=True,
+        timeout=280,
     )
-    two = trained(tmp_path / "two", *torchrun, batch=8, devices=2)
-    assert len(one) == 4 and two == pytest.approx(one, rel=0.1)
+    assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["epoch"] > done
 
 
 @pytest.mark.slow

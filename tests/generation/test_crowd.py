@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 import magnet
 from magnet.body.apart import APART, excess_depth, kept_apart, lifted
 from magnet.denoiser.module import Denoiser
+from magnet.denoiser.options import Sampling
 from magnet.generation.crowd import CrowdRollout, generate_crowd
 from magnet.generation.crowd_start import compose, start_crowd
 from magnet.generation.rollout import generate
@@ -148,6 +150,31 @@ def test_bodies_are_kept_apart_as_they_are_shown_in_the_end() -> None:
     assert near < 0.7 * alone, (near, alone)
 
 
+def test_how_far_people_see_each_other_is_an_option(model: Denoiser) -> None:
+    """Partners of a couple alone, of whoever is within a few metres, and not of anybody by accident."""
+    scene = crowd(8, spacing=1.3)
+    partners_of = []
+    for enter, leave in ((0.01, 0.01), (9.0, 9.0)):
+        options = replace(QUICK, crowd_enter=enter, crowd_leave=leave)
+        rollout = CrowdRollout(model, scene, registry.get("joint_future")(), 16, 8, options, seeded())
+        table = rollout.model.layout.partners()
+        partners_of.append((table != torch.arange(8)[:, None]).sum(dim=1))
+    assert bool((partners_of[1] == 3).all()) and bool((partners_of[0] < partners_of[1]).any())
+    assert bool((partners_of[0] >= 1).all()), "those who belong together see each other however far"
+    with pytest.raises(ValueError, match="crowd_leave"):
+        SamplerOptions(crowd_enter=2.0, crowd_leave=1.0)
+
+
+def test_pairs_of_a_crowd_are_corrected_where_a_scene_of_two_is() -> None:
+    model = tiny_denoiser(max_agents=4, window=8, sampling=Sampling(settle="hold"))
+    scene, task = crowd(6), registry.get("joint_future")()
+    made = [
+        generate_crowd(model, scene, task, 16, 12, 1, replace(QUICK, settle=how), seeded()) for how in ("off", None)
+    ]
+    assert torch.equal(made[0].T_world_root[:, :16], made[1].T_world_root[:, :16]), "what is given stays"
+    assert not torch.equal(made[0].body_rot, made[1].body_rot)
+
+
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_length_of_a_crowd(model: Denoiser) -> None:
     rollout = CrowdRollout(model, crowd(6), registry.get("joint_future")(), 16, None, QUICK, seeded(), chunk=4)
@@ -217,5 +244,6 @@ def test_what_is_not_made_for_crowds_is_refused(model: Denoiser) -> None:
     refused("generation", "context 0")
     refused("agentic_sync", "square", people=18)
     refused("joint_future", "placement", placement="anchor")
-    refused("joint_future", "settle", settle="light")
+    refused("joint_future", "settle_blocks", settle_blocks=True)
+    refused("joint_future", "body_guidance", body_guidance="light")
     refused("joint_future", "at most", people=201)

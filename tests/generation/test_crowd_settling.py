@@ -3,9 +3,10 @@
 import torch
 
 from magnet.bench.speed import standing
-from magnet.generation.crowd_settling import deep_moments, settled_moments
+from magnet.generation.crowd_settling import bonded_groups, deep_moments, settled_groups, settled_moments
+from magnet.generation.settling import settled_chunk
 from magnet.metrics.body_depth import deepest
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_time
 
 FRAMES = 90
 
@@ -58,3 +59,36 @@ def test_a_moment_is_found_with_its_frames() -> None:
     scene = passing()
     (moment,) = deep_moments(load_body().joints(scene)[0], scene.present[0])
     assert (moment.one, moment.other) == (0, 1) and moment.start < FRAMES / 2 < moment.stop < FRAMES - 10
+
+
+def test_those_whom_bonds_join_are_a_group_and_too_many_are_each_alone() -> None:
+    bonds = torch.zeros(7, 7, dtype=torch.bool)
+    for one, other in ((0, 3), (3, 5), (1, 6)):
+        bonds[one, other] = bonds[other, one] = True
+    present = torch.arange(7) != 2
+    assert bonded_groups(bonds, present, 3) == [(0, 3, 5), (1, 6), (4,)]
+    assert bonded_groups(bonds, present, 2) == [(0,), (3,), (5,), (1, 6), (4,)]
+
+
+def test_a_pair_in_a_crowd_is_corrected_as_it_is_alone() -> None:
+    """In two chunks; whom nobody belongs to is corrected alone, what is given stays."""
+    given = torch.zeros(1, FRAMES, 5, dtype=torch.bool)
+    given[:, :8] = True
+    scene = passing()
+    root = scene.T_world_root.clone()
+    root[:, :, 3, 1, 3] += torch.linspace(0, 0.06, FRAMES)  # rises off the floor
+    scene = scene.replace(T_world_root=root, given=given)
+    past, parts = {}, []
+    for part in (scene.slice(0, 40), scene.slice(40)):
+        made, past = settled_groups(part, [(0, 2), (1,), (3,)], "firm", past)
+        parts.append(made)
+    made = cat_time(parts)
+    assert torch.equal(made.T_world_root[:, :8], scene.T_world_root[:, :8]) and torch.equal(made.given, given)
+    assert torch.equal(made.body_rot[:, :, 4], scene.body_rot[:, :, 4]), "in no group"
+    pair, alone, before = scene.permute_agents(torch.tensor([0, 2])), [], None
+    for part, still in ((pair.slice(0, 40), given[0, :40, :2]), (pair.slice(40), given[0, 40:, :2])):
+        one, before = settled_chunk(part.replace(given=None), still, "firm", before)
+        alone.append(one)
+    torch.testing.assert_close(made.T_world_root[:, :, [0, 2]], cat_time(alone).T_world_root)
+    torch.testing.assert_close(made.body_rot[:, :, [0, 2]], cat_time(alone).body_rot)
+    assert made.T_world_root[0, -1, 3, 1, 3] < scene.T_world_root[0, -1, 3, 1, 3] - 0.02, "back on the floor"
