@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from magnet.body.apart import lifted
 from magnet.body.base import Body
 from magnet.body.holding import holds
-from magnet.body.joints import TOES
+from magnet.body.joints import FEET, TOES
 from magnet.body.settle_wishes import SLIDES, Wishes
 from magnet.motion.frames import from_planar
 from magnet.motion.resample import smoothstep
@@ -31,8 +31,9 @@ def drift(joints: Tensor, stands: Tensor, fps: float) -> Tensor:
     """Velocity over the ground of bodies whose standing feet slide along. -> (B, T, P, 2) m/s
 
     The slower standing toe counts. Averaging cancels feet that turn or step, which move to and fro; drift remains.
-    joints (B, T, P, 22, 3), stands (B, T - 1, P, 2) bool
+    joints (B, T, P, 22, 3), stands (B, T - 1, P, 4) bool of the feet's joints, see `Wishes`
     """
+    stands = stands[..., [FEET.index(toe) for toe in TOES]]
     half = max(round(AVERAGED * fps), 1)
     velocity = joints[..., TOES, :][..., [0, 2]].diff(dim=1) * fps  # (B, T - 1, P, 2 toes, 2)
     slower = velocity.norm(dim=-1).masked_fill(~stands, torch.inf).argmin(dim=-1)

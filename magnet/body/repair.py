@@ -94,10 +94,12 @@ def settling(
     past: Tensor | None = None,
     slides: float = SLIDES,
     holding: Tensor | None = None,
+    last: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
-    Arguments as for `repaired`, `Wishes.of` and `correction`. Scenes are corrected a few at a time.
+    Arguments as for `repaired`, `correction` and `Wishes.of`, whose `before` is `last` here. Scenes are corrected a few
+    at a time.
     """
     B, T, P = scene.T_world_root.shape[:3]
     few = max(POSES // (T * P), 1)
@@ -106,7 +108,8 @@ def settling(
         some = slice(start, start + few)
         still = fixed[some] if fixed is not None and fixed.ndim == 3 and len(fixed) == B else fixed
         before, hold = (None if each is None else each[some] for each in (past, holding))
-        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold))
+        ends = None if last is None else (last[0][some], last[1][some])
+        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold, ends))
     return torch.cat(made)
 
 
@@ -120,10 +123,11 @@ def _settling(
     past: Tensor | None,
     slides: float,
     holding: Tensor | None,
+    last: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
     toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
-    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding)
+    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last)
     first, second = torch.triu_indices(scene.agents, scene.agents, 1)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.

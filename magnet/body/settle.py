@@ -61,6 +61,7 @@ class Settle:
         root: factor of these costs for moving the whole body.
         tilt: factor for turning the whole body or the back.
         most: largest change of a step, metres or radians.
+        stand: factor for the cost of standing feet that move.
     """
 
     iterations: int = 12
@@ -71,6 +72,7 @@ class Settle:
     root: float = 3.0
     tilt: float = 3.0
     most: float = 0.15
+    stand: float = 1.0
 
 
 def _ancestry() -> Tensor:
@@ -328,7 +330,7 @@ def correct_window(
         now = corrected(scene, offset)
         R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)
-        residuals = all_residuals(seen, capsules, wishes, free)
+        residuals = all_residuals(seen, capsules, wishes, free, settle.stand)
         if not len(residuals.node):
             break
         if ramp:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -85,13 +85,13 @@ def residuals_of(
     return Residuals(node, bone, point, *(other or (node, bone, point)), along, value, weight, two, one_sided)
 
 
-def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
-    """All unmet wishes of people who can move. free (B, T, P) bool"""
+def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor, stand: float = 1.0) -> Residuals:
+    """All unmet wishes of people who can move. free (B, T, P) bool; stand: factor for the cost of feet that move."""
     parts = [
         between_residuals(seen, capsules, wishes),
         within_residuals(seen, capsules, wishes),
         hold_residuals(seen, wishes),
-        stand_residuals(seen, wishes),
+        stand_residuals(seen, wishes, stand),
         height_residuals(seen, wishes),
         floor_residuals(seen, wishes),
         float_residuals(seen, wishes),
@@ -201,19 +201,43 @@ def hold_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     return residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach)
 
 
-def stand_residuals(seen: Seen, wishes: Wishes) -> Residuals:
-    """Standing toes move over the floor no faster than `Wishes.still`."""
+def stand_residuals(seen: Seen, wishes: Wishes, cost: float = 1.0) -> Residuals:
+    """Standing feet stay where they are on the floor from a frame to the next.
+
+    Both ways along the floor count: less than that, such as the speed alone, lets feet go sideways as each step of the
+    solver turns.
+    """
     b, t, p, i = wishes.stands.nonzero(as_tuple=True)
-    toes = torch.tensor(TOES, device=b.device)[i]
-    before, after = seen.by_frame[b, t, p, toes], seen.by_frame[b, t + 1, p, toes]
-    moved = (after - before) * torch.tensor([1.0, 0.0, 1.0]).to(after)
-    length = moved.norm(dim=-1)
-    over = length - wishes.still / wishes.fps
-    along = moved / length.clamp_min(1e-6)[:, None]
-    residuals = residuals_of(
-        "stand", seen.node(b, t + 1, p), toes, after, along, over, (seen.node(b, t, p), toes, before)
-    )
-    return residuals.kept(over > 0)
+    feet = torch.tensor(FEET, device=b.device)[i]
+    before, after = seen.by_frame[b, t, p, feet], seen.by_frame[b, t + 1, p, feet]
+    node = seen.node(b, t, p).repeat_interleave(2)
+    other = node, feet.repeat_interleave(2), before.repeat_interleave(2, dim=0)
+    part = kept_on_floor(seen.node(b, t + 1, p), feet, after, before[:, [0, 2]], cost, other)
+    if wishes.stood is None:
+        return part
+    b, p, i = wishes.stood.isfinite().all(dim=-1).nonzero(as_tuple=True)
+    feet = torch.tensor(FEET, device=b.device)[i]
+    node, now = seen.node(b, torch.zeros_like(b), p), seen.by_frame[b, 0, p, feet]
+    return cat([part, kept_on_floor(node, feet, now, wishes.stood[b, p, i], cost)])
+
+
+def kept_on_floor(
+    node: Tensor,
+    bone: Tensor,
+    point: Tensor,
+    place: Tensor,
+    cost: float,
+    other: tuple[Tensor, Tensor, Tensor] | None = None,
+) -> Residuals:
+    """Two residuals for each of M points that shall be at a place on the floor. point (M, 3), place (M, 2)
+
+    other: whose point the place is, see `residuals_of`; None: nobody's.
+    """
+    node, bone, point = (x.repeat_interleave(2, dim=0) for x in (node, bone, point))
+    off = (point[::2, [0, 2]] - place).flatten()
+    along = axes(1, point)[[0, 2]].repeat(len(place), 1)
+    part = residuals_of("stand", node, bone, point, along, off, other)
+    return replace(part, root_weight=part.root_weight * cost**0.5)
 
 
 def height_residuals(seen: Seen, wishes: Wishes) -> Residuals:

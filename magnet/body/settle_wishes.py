@@ -12,7 +12,7 @@ from magnet.body.base import Body
 from magnet.body.energy import CONTACT, GRAVITY, Contact
 from magnet.body.fit import clearance
 from magnet.body.holding import holds, lasting_holds
-from magnet.body.joints import FEET, TOES
+from magnet.body.joints import ANKLES, FEET, TOES
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
 
@@ -22,6 +22,8 @@ LOW = 0.05
 """Height in metres below which a toe can stand, as in the metric FS."""
 SLIDES = 0.6
 """Speed in m/s above which a low toe is stepping."""
+RAISED = 0.02
+"""Metres that a heel may be raised and still stand: from there on CMU's heels move more than toes."""
 FLOATS = 0.03
 """Metres between the lower sole and the floor above which somebody floats or jumps: a little less than in the metric,
 whose 6 cm are of joints. In CMU's salsa 0.2 % of the frames are higher."""
@@ -37,13 +39,14 @@ class Wishes:
         contact: depths that are no penetration.
         present: (B, P) bool, who is there.
         clearance: (B, P, 4) height of the feet's joints over the sole, metres.
-        stands: (B, T - 1, P, 2) bool, toes that shall not move from a frame to the next.
+        stands: (B, T - 1, P, 4) bool, joints of the feet that shall not move over the floor from a frame to the next.
+        stood: (B, P, 4, 2) metres, where on the floor joints of the feet were in the frame before and shall stay, NaN
+            for others; None: there is no frame before.
         heights: (B, T, P, 2) metres over y = 0 of low toes, NaN for others.
         highest: (B, T, P) metres over the floor that the lower foot shall be at most: 0 for who floats, as it is for
             who stands or steps, infinite for who jumps.
         held: (B, T, Q, 2, 2) bool, hands that hold, of each pair of people in the order of `combinations`.
         between: (B, T, Q, 2, 2, 3) metres from the second's hands to the first's, as it shall be.
-        still: m/s at which a toe still stands.
         fps: frames a second.
     """
 
@@ -51,11 +54,11 @@ class Wishes:
     present: Tensor
     clearance: Tensor
     stands: Tensor
+    stood: Tensor | None
     heights: Tensor
     highest: Tensor
     held: Tensor
     between: Tensor
-    still: float
     fps: float
 
     @classmethod
@@ -65,9 +68,9 @@ class Wishes:
         body: Body,
         how: str = "firm",
         slides: float = SLIDES,
-        still: float = 0.04,
         begun: bool = False,
         holding: Tensor | None = None,
+        before: tuple[Tensor, Tensor] | None = None,
     ) -> Wishes:
         """The wishes that a motion (B, T, P) itself shows.
 
@@ -75,9 +78,10 @@ class Wishes:
             how: a name in `CONTACT`; with `hold` hands that met go on holding (`lasting_holds`), else they keep what is
                 between them in each frame.
             slides: m/s below which a low toe is meant to stand.
-            still: m/s that a standing toe is allowed.
             begun: the first frames continue others; who is in the air then may have jumped.
             holding: (B, Q, 2, 2) bool, hands that held in the frame before the first.
+            before: joints (B, 1, P, 22, 3) of that frame, uncorrected and corrected; None: feet need not stay where
+                they were.
         """
         joints = body.joints(scene)
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
@@ -90,13 +94,18 @@ class Wishes:
             held, between = lasting_holds(joints, scene.present, scene.fps, holding)
         else:
             held, between = holds(joints, scene.present)
-        stands = standing(joints, above, scene.fps, slides) & there[..., None]
+        rest, stood = body.rest_joints(scene.betas), None
+        stands = standing_feet(joints, rest, above, scene.fps, slides) & there[..., None]
+        if before is not None:
+            begin = torch.cat([before[0], joints[:, :1]], dim=1)
+            stays = standing_feet(begin, rest, above, scene.fps, slides)[:, 0]
+            stood = torch.where(stays[..., None], before[1][:, 0, :, FEET][..., [0, 2]], torch.nan)
         on = low_toes(joints, above) & there[..., None]
-        toes = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
-        heights = torch.where(on, toes, torch.nan)
+        kept = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
+        heights = torch.where(on, kept, torch.nan)
         highest = torch.where(floats, 0.0, torch.where(height > FLOATS, torch.inf, height.clamp_min(LIFTED)))
         return cls(
-            CONTACT[FIRM.get(how, how)], scene.present, above, stands, heights, highest, held, between, still, scene.fps
+            CONTACT[FIRM.get(how, how)], scene.present, above, stands, stood, heights, highest, held, between, scene.fps
         )
 
     def everybody(self, frames: int) -> Tensor:
@@ -108,6 +117,7 @@ class Wishes:
         frames = slice(start, stop)
         return replace(
             self,
+            stood=self.stood if start == 0 else None,
             stands=self.stands[:, start : max(stop - 1, start)],
             heights=self.heights[:, frames],
             highest=self.highest[:, frames],
@@ -124,6 +134,18 @@ def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) 
     low = low_toes(joints, above)
     speed = joints[..., TOES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
     return low[:, 1:] & low[:, :-1] & (speed < slides)
+
+
+def standing_feet(joints: Tensor, rest: Tensor, above: Tensor, fps: float, slides: float = SLIDES) -> Tensor:
+    """Joints of the feet that stand: toes, and ankles over heels that are down and slow too. -> (B, T - 1, P, 4) bool
+
+    As for `standing`, and rest (B, P, 22, 3) joints of the bodies.
+    """
+    toes = standing(joints, above, fps, slides)
+    over, flat = (each[..., ANKLES, 1] - each[..., TOES, 1] for each in (joints, rest[:, None]))
+    down = over < flat + RAISED
+    speed = joints[..., ANKLES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
+    return torch.cat([toes & down[:, 1:] & down[:, :-1] & (speed < slides), toes], dim=-1)
 
 
 def low_toes(joints: Tensor, above: Tensor) -> Tensor:

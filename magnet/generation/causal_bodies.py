@@ -136,9 +136,9 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     after = new[-1:] if told is None else new[-1:] & told.to(new.device)
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
-    world.uncorrected = made.slice(own - LEAD, own)
+    uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     unseen = world.known[rows].any(dim=0).to(new.device)
-    made, offset = settled_on(made, before, new, unseen, how, world.correction)
+    made, offset = settled_on(made, before, new, unseen, how, world.correction, uncorrected)
     world.correction = offset[:, own - LEAD : own]
     return made.slice(0, own)
 

@@ -25,7 +25,7 @@ BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 FINISHED = Settle(iterations=8, inner=24, bend=100.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too (docs/tasks.md)."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=4000.0)
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
 PACE = 3
@@ -155,7 +155,13 @@ def hands_held(scene: Scene, body: Body) -> Tensor:
 
 
 def settled_on(
-    scene: Scene, before: Scene | None, new: Tensor, unseen: Tensor, how: str, past: Tensor | None
+    scene: Scene,
+    before: Scene | None,
+    new: Tensor,
+    unseen: Tensor,
+    how: str,
+    past: Tensor | None,
+    uncorrected: Scene | None = None,
 ) -> tuple[Scene, Tensor]:
     """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
 
@@ -166,6 +172,7 @@ def settled_on(
         unseen: (P,) bool, of whom nobody knows more than `before`.
         how: `light`, `firm` or `hold`.
         past: (B, 2, P, DOFS) corrections of the two frames before; None: none.
+        uncorrected: the same two frames without them; None: as shown.
 
     Returns:
         The scene, and its corrections (B, T, P, DOFS).
@@ -177,13 +184,15 @@ def settled_on(
     new, unseen, past = new[:, there], unseen[there], None if past is None else past[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
     holding = None if known is None or how != "hold" else hands_held(known, body)
+    plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
+    last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
     for who in [agents == agent for agent in agents[moving]]:
         hidden = unseen | (moving & ~who)
         if known is None:
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = settling(seen, body, how, ~(new & who), SHOWN, known is not None, past, holding=holding)
+        one = settling(seen, body, how, ~(new & who), SHOWN, known is not None, past, holding=holding, last=last)
         offset[:, :, who] = one[:, :, who]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset

@@ -122,6 +122,20 @@ def test_whoever_slides_stands_and_holds_again(handshake: Scene) -> None:
     assert torch.equal(whole.T_world_root[:, :, 0], damaged.T_world_root[:, :, 0])
 
 
+def test_feet_that_glide_under_a_swaying_body_stand_and_the_body_sways_on() -> None:
+    """Heels as well as toes, from a frame to the next and over a third of a second."""
+    time = torch.arange(90) / 30.0
+    sway = torch.zeros(90, 3)
+    sway[:, 0], sway[:, 2] = 0.03 * (5.0 * time).sin(), 0.02 * (3.0 * time).cos()
+    swaying = moved(arms_out(3.0, 0.0, 90), 0, sway)
+    made = BODY.joints(repaired(swaying, BODY, drifting=False))[0, :, 0][..., [0, 2]]
+    feet, before = made[:, FEET], BODY.joints(swaying)[0, :, 0][:, FEET][..., [0, 2]]
+    for frames in (1, 10):
+        speed, was = ((each[frames:] - each[:-frames]).norm(dim=-1).median(dim=0).values for each in (feet, before))
+        assert (speed < 0.25 * was).all(), (frames, speed / was)
+    assert float(made[:, 12].std(dim=0).norm()) > 0.5 * float(sway[:, [0, 2]].std(dim=0).norm())  # the neck
+
+
 def test_nobody_is_held_back_from_sliding_away_from_hands_that_they_hold(handshake: Scene) -> None:
     slide = torch.zeros(handshake.frames, 3)
     slide[:, 2] = 0.3 * torch.arange(handshake.frames) / 30.0

@@ -9,15 +9,17 @@ import pytest
 import torch
 
 import magnet
+from magnet.bench.speed import standing
 from magnet.body import load_body
 from magnet.body.energy import CONTACT
+from magnet.body.joints import TOES
 from magnet.body.settle_wishes import FIRM
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
-from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk
+from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk, settled_on
 from magnet.metrics import hand_distance
 from magnet.metrics.body_depth import deepest
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions, Separation, Settling
 from magnet.sampling.schedule import Grid
@@ -135,6 +137,27 @@ def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
     assert together(settled_chunk(apart, nobody, "hold", None)[0]) < 3  # they have not met
     assert together(settled_chunk(apart, nobody, "hold", past)[0]) > 20
     assert together(settled_chunk(apart, nobody, "firm", past)[0]) < 3
+
+
+def test_feet_shown_standing_stay_there_block_after_block() -> None:
+    """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
+    frames, block = 32, 4
+    still = standing(1, frames, 1, torch.device("cpu"))
+    root = still.T_world_root.clone()
+    root[0, :, 0, 0, 3] += 0.15 * (torch.arange(frames) - block).clamp(min=0) / 30.0
+    sliding, body = still.replace(T_world_root=root), load_body()
+    new, unseen = torch.ones(2 * block, 1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
+    shown, past, plain = [sliding.slice(0, block)], None, None
+    for start in range(block, frames - block, block):
+        ahead = sliding.slice(start, start + 2 * block)
+        made, offset = settled_on(ahead, shown[-1], new, unseen, "firm", past, plain)
+        shown.append(made.slice(0, block))
+        past, plain = offset[:, block - 2 : block], ahead.slice(block - 2, block)
+    toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (cat_time(shown), sliding))
+    last = frames - 2 * block
+    assert float((slid[last] - slid[0]).mean()) > 0.09
+    assert float((toes[last] - toes[0]).abs().max()) < 0.03
+    assert float(toes.diff(dim=0).abs().max()) < 0.005
 
 
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
