@@ -48,6 +48,13 @@ RUNS = [
 ]
 """Trainings; parts of them and ways of sampling are held to what they say in test_configs.py."""
 
+ABLATIONS = [
+    config
+    for config in RUNS
+    if config.parent.name in ("report", "ablations") and config.stem not in ("base", "no_vqvae", "peer_remos")
+]
+"""Trainings that change an option or two of another one of these."""
+
 
 def own(kind: type, package: str = "magnet") -> dict[str, Any]:
     """A class's arguments and their defaults, from the signatures of itself and its bases, nearest first."""
@@ -191,7 +198,7 @@ def taken_over(name: str | None) -> dict[str, Any]:
     return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
 
 
-@pytest.mark.parametrize("config", RUNS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("config", some_slow(RUNS, *ABLATIONS), ids=lambda path: path.stem)
 def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = told(config)
     got = printed(capsys, "fit", "--config", str(config))
