@@ -2,7 +2,7 @@
 
     python benchmarks/crowd.py --people 2 4 8 16 32 64 128 200 --plot docs/pictures/crowd_cost.png
     python benchmarks/crowd.py --people 200 --frames 900 --out crowd.npz
-    python benchmarks/crowd.py --people 100 --frames 1800 --memory docs/pictures/crowd_memory.png
+    python benchmarks/crowd.py --people 24 --frames 1800 --memory docs/pictures/crowd_memory.png
 
 Views a step are what the network looks at; time is that of the processor and of the clock, of sampling and of what is
 corrected after it, of whoever is more than the model has slots for. With --memory nothing of the crowd is kept.

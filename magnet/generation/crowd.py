@@ -64,8 +64,8 @@ def generate_crowd(
     Scenes and samples are made one after the other. People are kept apart (`firm`, unless `options` say `light`),
     pairs are corrected as a scene of two is (`settle`), and in the end moments in which two still pass through each
     other are settled (`settled_moments`). Of as many people as the model has slots for, or fewer, a single scene is
-    what `generate` makes, bit for bit. `Generation` from nothing begins with couples on a floor plan (`start_crowd`),
-    from which everybody goes on.
+    what `generate` makes, bit for bit. In tasks that go on live neither is done, for both see what comes later.
+    `Generation` from nothing begins with couples on a floor plan (`start_crowd`), from which everybody goes on.
 
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
@@ -82,7 +82,11 @@ def generate_crowd(
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
             whole = whole.replace(given=nobody).slice(0, frames)
         else:
-            whole = cat_time(list(CrowdRollout(model, one, task, context, frames, *more).chunks()))
+            rollout = CrowdRollout(model, one, task, context, frames, *more)
+            whole = cat_time(list(rollout.chunks()))
+            if rollout.world.causal:  # whoever lives now does not make way for what is to come
+                made.append(whole)
+                continue
         made.append(settled_moments(whole) if scene.agents > model.layout.agents else whole)
     return concatenate(made)
 
@@ -269,7 +273,7 @@ class CrowdRollout(Rollout):
 
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:
         made = super()._decoded(start, stop, before, needed)
-        if not self.crowd or self.settle == "off":
+        if not self.crowd or self.settle == "off" or self.world.causal:  # a chunk's later frames are not seen yet there
             return made
         groups = bonded_groups(self._bonds, self._present, self.viewer.layout.agents)
         made, self._settled = settled_groups(made, groups, self.settle, self._settled)

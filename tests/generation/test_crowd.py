@@ -175,6 +175,18 @@ def test_pairs_of_a_crowd_are_corrected_where_a_scene_of_two_is() -> None:
     assert not torch.equal(made[0].body_rot, made[1].body_rot)
 
 
+def test_what_a_crowd_answers_live_is_not_corrected_by_what_comes_later() -> None:
+    model = tiny_denoiser(max_agents=4, window=8, sampling=Sampling(settle="hold"))
+    scene, task = crowd(6, 24), registry.get("motion_control")(target=(0, 5))
+    later = scene.T_world_root.clone()
+    later[:, 20:, 1:5, 0, 3] += 1.0
+    made = [
+        generate_crowd(model, each, task, 8, 16, 1, QUICK, seeded()).T_world_root[:, :16, [0, 5]]
+        for each in (scene, scene.replace(T_world_root=later))
+    ]
+    assert torch.equal(made[0], made[1])
+
+
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_length_of_a_crowd(model: Denoiser) -> None:
     rollout = CrowdRollout(model, crowd(6), registry.get("joint_future")(), 16, None, QUICK, seeded(), chunk=4)
