@@ -58,7 +58,7 @@ def film(rows: Mapping[str, Joints], fps: float = FPS) -> bytes:
         pages.append(page)
     buffer = io.BytesIO()
     tick = round(1000 * EVERY / fps)
-    pages[0].save(buffer, "WEBP", save_all=True, append_images=pages[1:], duration=tick, loop=0, quality=45, method=4)
+    pages[0].save(buffer, "WEBP", save_all=True, append_images=pages[1:], duration=tick, loop=0, quality=35, method=4)
     return buffer.getvalue()
 
 

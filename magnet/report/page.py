@@ -195,11 +195,13 @@ def _film(block: Block, store: Store, name: str) -> list[str]:
         if row.inside in scenes:
             shown[row.title] = scenes[row.inside]
         shown |= {RECORDED: scenes[TRUTH]} if TRUTH in scenes else {}
-    if len(shown) < 2:
-        return []
-    ordered = {RECORDED: shown.pop(RECORDED), **shown}
     path = store.folder / "pictures" / f"{name}.webp"
-    write_whole(path.parent, path.name, film(ordered))
+    if len(shown) > 1:
+        ordered = {RECORDED: shown.pop(RECORDED), **shown}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path.parent, path.name, film(ordered))
+    if not path.is_file():  # where scenes are not kept, an earlier film stays
+        return []
     return [f"![{block.title}: the first test scene, seed 0, one sample](pictures/{path.name})", ""]
 
 
