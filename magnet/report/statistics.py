@@ -48,7 +48,7 @@ def difference(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]], m
     if not a or not b:
         return None
     left, right = _folds(a, metric), _folds(b, metric)
-    folds = {unit: left[unit] - right[unit] for unit in left.keys() & right.keys()}
+    folds = {unit: left[unit] - right[unit] for unit in sorted(left.keys() & right.keys())}
     ones, others = [run["value"][metric] for run in a], [run["value"][metric] for run in b]
     if len(ones) == len(others):
         return _combined([x - y for x, y in zip(ones, others, strict=True)], folds)
@@ -69,7 +69,7 @@ def verdict(difference: Estimate | None, claimed_lower: bool) -> Verdict:
 def _folds(runs: Sequence[Mapping[str, Any]], metric: str) -> dict[str, float]:
     """Without each unit, the mean over seeds."""
     shared = set.intersection(*({unit for unit, row in run["without"].items() if metric in row} for run in runs))
-    return {unit: sum(run["without"][unit][metric] for run in runs) / len(runs) for unit in shared}
+    return {unit: sum(run["without"][unit][metric] for run in runs) / len(runs) for unit in sorted(shared)}
 
 
 def _combined(values: Sequence[float], folds: Mapping[str, float]) -> Estimate:
