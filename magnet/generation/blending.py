@@ -18,7 +18,7 @@ SPRING = 5.0
 put elsewhere slide for longer. With `blend` 20 a difference is halved in 7 frames."""
 
 QUICK = 0.03
-"""Radians or metres a frame beyond which a difference that grows is no speed but an outlier."""
+"""Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
 
 
 def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:
@@ -77,16 +77,19 @@ def seam_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
     after = keep.int().cummax(dim=0).values.bool()
     closed = keep.flip(0).int().cummax(dim=0).values.bool().flip(0)
-    gap = torch.where(closed, next_known(keep) - last_known(keep), blend).clamp(1, max(blend, 1))
-    since = (frame - last_known(keep)).float()
-    left = (1 - since / gap).clamp(0, 1)
-    return torch.where(after, smoothstep(left), 0.0), torch.where(moving(keep), since * left**2, 0.0)
-
-
-def moving(keep: Tensor) -> Tensor:
-    """Frames after two consecutive known ones, so that a speed is known there. (T, P) bool -> (T, P) bool"""
     last = last_known(keep)
-    return keep.int().cummax(dim=0).values.bool() & (last > 0) & keep.gather(0, (last - 1).clamp_min(0))
+    gap = torch.where(closed, next_known(keep) - last, blend).clamp(1, max(blend, 1))
+    since = (frame - last).float()
+    left = (1 - since / gap).clamp(0, 1)
+    return torch.where(after, smoothstep(left), 0.0), torch.where(moving(keep, after, last), since * left**2, 0.0)
+
+
+def moving(keep: Tensor, after: Tensor, last: Tensor) -> Tensor:
+    """Frames after two consecutive known ones, so that a speed is known there. -> (T, P) bool
+
+    keep, after (T, P) bool, known frames and those from the first of them on; last (T, P) int, of `last_known`.
+    """
+    return after & (last > 0) & keep.gather(0, (last - 1).clamp_min(0))
 
 
 def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
@@ -118,12 +121,12 @@ def spring_weights(keep: Tensor, blend: int) -> tuple[Tensor, Tensor]:
     (T, P) bool -> (T, P) twice
     """
     frame = torch.arange(keep.shape[0], device=keep.device)[:, None]
-    after = keep.int().cummax(dim=0).values.bool()
-    since = (frame - last_known(keep)).float()
+    after, last = keep.int().cummax(dim=0).values.bool(), last_known(keep)
+    since = (frame - last).float()
     rate = SPRING / blend if blend else torch.inf
     left = torch.where(since > 0, torch.exp(-rate * since.clamp_min(1)), 1.0)
     stays = torch.where(since > 0, (1 + min(rate, 1e9) * since) * left, 1.0)
-    return torch.where(after, stays, 0.0), torch.where(moving(keep), since * left, 0.0)
+    return torch.where(after, stays, 0.0), torch.where(moving(keep, after, last), since * left, 0.0)
 
 
 def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, blend: int) -> Scene:
@@ -140,7 +143,7 @@ def remainder(
 ) -> Tensor:
     """What is left of a difference at the last known frame, and of its change into it. (B, T, P, ...) -> same
 
-    last (T, P) int, of `last_known`; the weights (T, P). No change is larger than `most`.
+    last (T, P) int, of `last_known`; the weights (T, P). No change counts as more than `most`.
     """
     agents = torch.arange(last.shape[1], device=last.device)
     shape = (*last.shape, *[1] * (difference.dim() - 3))
