@@ -24,14 +24,10 @@ from tests.export.strangers import NAMINGS, rerigged
 from tests.test_tour import run
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/own.md").read_text()
-COMMANDS = [
-    line.partition("  #")[0].strip()
-    for line in re.findall(r"^ {4}magnet (.*)", PAGE.partition("## Without a training")[0], re.MULTILINE)
-]
+TRAINED, UNTRAINED = (ROOT / "docs/own.md").read_text().split("## Without training")
+COMMANDS = [line.partition("  #")[0].strip() for line in re.findall(r"^ {4}magnet (.*)", TRAINED, re.MULTILINE)]
 ANSWERS = [
-    line.partition("  #")[0].strip()
-    for line in re.findall(r"^ {4}magnet (predict .*)", PAGE.partition("## Without a training")[2], re.MULTILINE)
+    line.partition("  #")[0].strip() for line in re.findall(r"^ {4}magnet (predict .*)", UNTRAINED, re.MULTILINE)
 ]
 CPU = ("--trainer.accelerator", "cpu")
 SMALL = {
@@ -134,4 +130,4 @@ def test_every_option_that_the_page_names_is_there() -> None:
 
     known = {flag for kind in registry.readers().values() if kind.own for action in reader_parser(kind)._actions
              for flag in action.option_strings}  # fmt: skip
-    assert set(re.findall(r"--reader\.\w+", PAGE)) <= known
+    assert set(re.findall(r"--reader\.\w+", TRAINED + UNTRAINED)) <= known
