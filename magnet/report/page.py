@@ -13,7 +13,7 @@ from magnet.files import write_whole
 from magnet.metrics import Column, column
 from magnet.report.cells import Cell, Store
 from magnet.report.film import Joints, film, kept
-from magnet.report.plan import PAPER, Block, Claim, Row
+from magnet.report.plan import FLOORS, PAPER, Block, Claim, Row
 from magnet.report.plot import curves, dots
 from magnet.report.statistics import Estimate, difference, estimate, verdict
 from magnet.report.summary import missing, summary
@@ -131,7 +131,8 @@ def _block(block: Block, store: Store, failed: Mapping[Cell, str], lines: list[s
     drawn = {row: values for row, values in found.items() if values}
     if drawn:
         ends = [int(metric[3:]) for metric in block.columns if metric.startswith("fd@")]
-        text = curves(drawn, ends) if ends else dots(drawn, {metric: title(metric) for metric in block.columns})
+        columns = {metric: title(metric) for metric in block.columns}
+        text = curves(drawn, ends) if ends else dots(drawn, columns, FLOORS)
         _write(picture, text)
         lines += [f"![{block.title}](pictures/{picture.name})", ""]
     lines += _film(block, store, name)
@@ -189,17 +190,18 @@ def _not_there(block: Block, runs: Mapping[str, Runs], failed: Mapping[Cell, str
 def _film(block: Block, store: Store, name: str) -> list[str]:
     """A film of the first scene as each row has it, where scenes were kept."""
     shown: dict[str, Joints] = {}
+    one = len({row.cells[0].data for row in block.rows}) == 1  # else each row is of a scene of its own
     for row in block.rows:
         path = store.film(row.cells[0])
         scenes = kept(path) if path is not None and row.title not in UNSHOWN else {}
+        if TRUTH in scenes:
+            shown.setdefault(RECORDED if one else f"{row.title}: {TRUTH}", scenes[TRUTH])
         if row.inside in scenes:
             shown[row.title] = scenes[row.inside]
-        shown |= {RECORDED: scenes[TRUTH]} if TRUTH in scenes else {}
     path = store.folder / "pictures" / f"{name}.webp"
     if len(shown) > 1:
-        ordered = {RECORDED: shown.pop(RECORDED), **shown}
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path.parent, path.name, film(ordered))
+        write_whole(path.parent, path.name, film(shown))
     if not path.is_file():  # where scenes are not kept, an earlier film stays
         return []
     return [f"![{block.title}: the first test scene, seed 0, one sample](pictures/{path.name})", ""]

@@ -123,8 +123,8 @@ def table4(plan: ReportOptions) -> list[Block]:
 
 
 def table_a4(plan: ReportOptions) -> list[Block]:
-    rows = [plan.row("two people, recorded", "joint_future")]
-    rows += [plan.row(f"{n} people", "joint_future", data=f"synthetic{n}") for n in (2, 3, 4)]
+    rows = [plan.row("2 people, recorded scenes", "joint_future")]
+    rows += [plan.row(f"{n} people, synthetic", "joint_future", data=f"synthetic{n}") for n in (2, 3, 4)]
     return [Block("joint future; one model for all", _rows(*rows))]
 
 

@@ -9,31 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageSequence
 
 from magnet import cli
-from magnet.body import load_body
 from magnet.cli.train import run_trainer
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.evaluator import Evaluator
-from magnet.metrics import FootSkating, FrechetDistance, MotionInteraction, PositionError
-from magnet.motion.tokens import TokenLayout
 from magnet.report import measure, run
-from magnet.report.cells import BUDGETS, Cell, Store, Weights
-from magnet.report.film import film, keep, kept
-from magnet.report.folds import Folds
+from magnet.report.cells import Cell, Store, Weights
 from magnet.report.page import page
-from magnet.report.plan import PAPER, ReportOptions
 from magnet.report.run import Runner
-from magnet.report.statistics import difference, estimate, verdict
 from magnet.report.summary import missing, summary
-from magnet.report.tables import TABLES, cells_of, named
-from magnet.tasks import registry
-from magnet.testing import random_scene, tiny_denoiser
-from tests.evaluation.test_evaluator import FAST, data
+from magnet.report.tables import TABLES, cells_of
+from tests.report.toys import PLAN, run_of
 
 TINY_TRAINING = """
 data:
@@ -44,144 +32,6 @@ model:
   init_args: {tokenizer: duet, network: {width: 24, layers: 1, heads: 2, level_width: 16, agent_width: 16}}
 trainer: {accelerator: cpu, max_steps: 4, logger: false, enable_progress_bar: false}
 """
-
-PLAN = ReportOptions(BUDGETS["tiny"], configs=Path(__file__).parents[2] / "configs" / "report")
-
-
-def run_of(values: list[float]) -> dict[str, Any]:
-    """A seed whose number is the mean over units of one value each."""
-    n = len(values)
-    without = {str(k): {"fd": (sum(values) - values[k]) / (n - 1)} for k in range(n)}
-    return {"value": {"fd": sum(values) / n}, "without": without}
-
-
-# -- statistics ------------------------------------------------------------------------------------
-
-
-def test_of_a_mean_the_interval_is_students() -> None:
-    """Of 1, 2, 4, 7, 11: mean 5, deviation 4.062, error 1.817; t of four degrees of freedom 2.776 (any table)."""
-    found = estimate([run_of([1.0, 2.0, 4.0, 7.0, 11.0])], "fd")
-    assert found is not None
-    assert found.interval == pytest.approx((5 - 2.776 * 1.8166, 5 + 2.776 * 1.8166), abs=1e-3)
-
-
-def test_seeds_that_differ_widen_the_interval() -> None:
-    same, apart = ([run_of([1.0 + s, 2.0 + s, 4.0 + s]) for s in (0.0, step, 2 * step)] for step in (0.0, 0.5))
-    narrow, wide = estimate(same, "fd"), estimate(apart, "fd")
-    assert narrow is not None and wide is not None
-    assert wide.error == pytest.approx(math.hypot(narrow.error, 0.5 / math.sqrt(3)))
-
-
-@pytest.mark.parametrize(
-    ("b", "said"),
-    [
-        ([1.1, 2.1, 4.2, 7.1], "holds"),
-        ([0.9, 1.9, 3.8, 6.9], "does not hold"),
-        ([3.0, 0.5, 6.0, 5.0], "cannot be told"),
-    ],
-)
-def test_an_ordering_is_judged_scene_by_scene(b: list[float], said: str) -> None:
-    """The numbers of scenes differ far more than the methods do: pairs tell what two intervals would hide."""
-    a = [run_of([1.0, 2.0, 4.0, 7.0])]
-    assert verdict(difference(a, [run_of(b)], "fd"), claimed_lower=True) == said
-    other = {"holds": "does not hold", "does not hold": "holds"}.get(said, said)
-    assert verdict(difference(a, [run_of(b)], "fd"), claimed_lower=False) == other
-
-
-def test_a_single_scene_tells_nothing() -> None:
-    one = [{"value": {"fd": 1.0}, "without": {}}]
-    found = estimate(one, "fd")
-    assert found is not None and found.interval is None
-    assert verdict(difference(one, one, "fd"), True) == "cannot be told"
-    assert estimate(one, "mi") is None
-
-
-def test_numbers_without_a_scene_are_those_of_the_other_scenes() -> None:
-    generator = torch.Generator().manual_seed(0)
-    future = load_body().joints(random_scene(3, 40, 2, generator))
-    joints = future + 0.1 * torch.randn(2, *future.shape, generator=generator)
-    present, agents = torch.ones(3, 2, dtype=torch.bool), torch.ones(1, 40, 2, dtype=torch.bool)
-    folds = Folds(30.0)
-    folds.update(joints[:, :2], future[:2], present[:2], agents=agents, units=torch.tensor([0, 1]))
-    folds.update(joints[:, 2:], future[2:], present[2:], agents=agents, units=torch.tensor([0]))
-    value, without = folds.rows()
-    for left, row in (([0, 1, 2], value), ([1], without[0]), ([0, 2], without[1])):
-        for metric in (FrechetDistance(), MotionInteraction(), FootSkating(), PositionError()):
-            metric.update(joints[:, left], future[left], present[left], agents=agents)
-            for name, number in metric.compute().items():
-                if name in row:
-                    assert row[name] == pytest.approx(float(number), rel=1e-9), (left, name)
-    assert {"fd", "mi", "fs", "mpjpe", "div", "ip_ratio", "fd_pair"} <= value.keys()
-
-
-# -- tables ----------------------------------------------------------------------------------------
-
-
-def test_printed_numbers_are_those_that_the_text_quotes() -> None:
-    """Section 4.2 and A.6 quote ratios of them; and the paper contradicts itself as issue 21 says."""
-    tables = {
-        name: {row: v for rows in each.values() for row, v in rows.items()} for name, each in PAPER["tables"].items()
-    }
-    assert 1 - tables["Fig. 7"]["Ours"][0] / tables["Fig. 7"]["R2R"][0] == pytest.approx(0.89, abs=0.005)
-    fd, mpjve = (PAPER["columns"].index(name) for name in ("fd", "mpjve"))
-    full = tables["5"]["Ours"][fd]
-    assert tables["5"]["w/o VQ-VAE"][fd] / full == pytest.approx(86, abs=0.5)
-    assert tables["A.5"]["w/o Agent PE"][fd] / full == pytest.approx(11, abs=0.5)
-    assert tables["A.5"]["w/o Time PE"][fd] / full == pytest.approx(39, abs=0.5)
-    assert (tables["3"]["Ours"][fd], full) == (0.118, 0.052)
-    assert (tables["5"]["Ours"][mpjve], tables["A.6"]["Ours"][mpjve]) == (0.034, 0.006)
-    for name, rows in tables.items():
-        assert {len(row) for row in rows.values()} == {1 if name in ("A.3", "Fig. 7") else 7}
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_a_table_claims_what_it_has_rows_for(name: str) -> None:
-    blocks = TABLES[name](PLAN)
-    assert blocks
-    for block in blocks:
-        titles = [row.title for row in block.rows]
-        assert len(titles) == len(set(titles))
-        assert {title for claim in block.claims for title in (claim.better, claim.worse)} <= set(titles)
-    cells = cells_of(blocks)
-    assert len({cell.name for cell in cells}) == len(cells)
-    for number, cell in enumerate(cells):
-        assert cell.needs is None or cell.needs in cells[:number]
-        if cell.kind == "train":
-            assert cell.model is not None and cell.model.digest, "no such configuration"
-    shipped = cells_of(TABLES[name](replace(PLAN, only_shipped=True)))
-    assert all(cell.kind != "train" and cell.needs is None for cell in shipped)
-
-
-@pytest.mark.parametrize(("said", "meant"), [("3", "3"), ("a3", "A.3"), ("Fig7", "Fig. 7"), ("table5", "5")])
-def test_tables_are_known_by_what_one_writes(said: str, meant: str) -> None:
-    assert named(said) == meant
-
-
-@pytest.mark.parametrize(
-    ("task", "leaks"), [("partner_prediction", False), ("partner_inpainting", True), ("motion_control", True)]
-)
-def test_pairs_as_clean_as_their_token_tell_of_who_is_unknown_where_a_partner_is_given(task: str, leaks: bool) -> None:
-    """Where all that the task does not give is noise, the samples are others: what the table calls a leak."""
-    made = []
-    for noisy in (False, True):
-        model = tiny_denoiser(max_agents=2)
-        layout = TokenLayout(model.layout.latent, 2, True, "token")
-        model.layout = model.transformer.layout = layout
-        datamodule = data(max_agents=2)
-        evaluation = Evaluator(model, registry.get(task)(), FAST, 1, baselines=False)
-        evaluation.start(datamodule)
-        batch = next(iter(datamodule.test_dataloader()))
-        if noisy:
-            plan = evaluation.schedule(evaluation.context, evaluation.horizon, 2)
-            known = plan.known.repeat_interleave(4, dim=0)[: batch.frames, :, None, None]
-            noise = random_scene(batch.scenes, batch.frames, 2, torch.Generator().manual_seed(5))
-            batch = batch.replace(
-                body_rot=torch.where(known[..., None], batch.body_rot, noise.body_rot),
-                T_world_root=torch.where(known, batch.T_world_root, noise.T_world_root),
-            )
-        made.append(evaluation.sample(batch, 1, evaluation.generators_of(batch.scenes)).T_world_root)
-    assert torch.equal(*made) != leaks
-
 
 # -- cells that are done once ----------------------------------------------------------------------
 
@@ -410,22 +260,3 @@ def test_the_first_screen_counts_what_holds_and_names_what_is_missing() -> None:
     assert "- 3, dyadic: FD: Ours < R2R (-1)" in lines
     assert "- 3, dyadic: R2R 2 of 3, Ours 0 of 3" in missing(tables)
     assert missing({"A.4": tables["A.4"]}) == []
-
-
-# -- films -----------------------------------------------------------------------------------------
-
-
-def test_a_film_has_a_frame_for_every_third_of_the_motion_and_people_in_every_panel(tmp_path: Path) -> None:
-    joints = load_body().joints(random_scene(2, 30, 2, torch.Generator().manual_seed(0))).numpy()
-    keep(tmp_path / "scene.npz", {"ground truth": joints[0], "ours": joints[1]})
-    again = kept(tmp_path / "scene.npz")
-    assert list(again) == ["ground truth", "ours"]
-    assert abs(again["ours"] - joints[1]).max() <= 0.0006  # millimetres
-    assert kept(tmp_path / "nothing.npz") == {}
-    (tmp_path / "film.webp").write_bytes(film(again))
-    with Image.open(tmp_path / "film.webp") as moving:
-        assert moving.n_frames == 10  # type: ignore[attr-defined]
-        frames = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(moving)]
-    for panel in np.split(frames[0], 2, axis=1):
-        assert (np.ptp(panel, axis=-1) > 60).sum() > 50  # coloured strokes
-    assert abs(frames[0] - frames[-1]).max() > 60

@@ -1,0 +1,83 @@
+"""The paper's tables as rows and claims: what is printed, what each needs, and what the leak table calls a leak."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from magnet.evaluation.evaluator import Evaluator
+from magnet.motion.tokens import TokenLayout
+from magnet.report.plan import PAPER
+from magnet.report.tables import TABLES, cells_of, named
+from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
+from tests.evaluation.test_evaluator import FAST, data
+from tests.report.toys import PLAN
+
+
+def test_printed_numbers_are_those_that_the_text_quotes() -> None:
+    """Section 4.2 and A.6 quote ratios of them; and the paper contradicts itself as issue 21 says."""
+    tables = {
+        name: {row: v for rows in each.values() for row, v in rows.items()} for name, each in PAPER["tables"].items()
+    }
+    assert 1 - tables["Fig. 7"]["Ours"][0] / tables["Fig. 7"]["R2R"][0] == pytest.approx(0.89, abs=0.005)
+    fd, mpjve = (PAPER["columns"].index(name) for name in ("fd", "mpjve"))
+    full = tables["5"]["Ours"][fd]
+    assert tables["5"]["w/o VQ-VAE"][fd] / full == pytest.approx(86, abs=0.5)
+    assert tables["A.5"]["w/o Agent PE"][fd] / full == pytest.approx(11, abs=0.5)
+    assert tables["A.5"]["w/o Time PE"][fd] / full == pytest.approx(39, abs=0.5)
+    assert (tables["3"]["Ours"][fd], full) == (0.118, 0.052)
+    assert (tables["5"]["Ours"][mpjve], tables["A.6"]["Ours"][mpjve]) == (0.034, 0.006)
+    for name, rows in tables.items():
+        assert {len(row) for row in rows.values()} == {1 if name in ("A.3", "Fig. 7") else 7}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_claims_what_it_has_rows_for(name: str) -> None:
+    blocks = TABLES[name](PLAN)
+    assert blocks
+    for block in blocks:
+        titles = [row.title for row in block.rows]
+        assert len(titles) == len(set(titles))
+        assert {title for claim in block.claims for title in (claim.better, claim.worse)} <= set(titles)
+    cells = cells_of(blocks)
+    assert len({cell.name for cell in cells}) == len(cells)
+    for number, cell in enumerate(cells):
+        assert cell.needs is None or cell.needs in cells[:number]
+        if cell.kind == "train":
+            assert cell.model is not None and cell.model.digest, "no such configuration"
+    shipped = cells_of(TABLES[name](replace(PLAN, only_shipped=True)))
+    assert all(cell.kind != "train" and cell.needs is None for cell in shipped)
+
+
+@pytest.mark.parametrize(("said", "meant"), [("3", "3"), ("a3", "A.3"), ("Fig7", "Fig. 7"), ("table5", "5")])
+def test_tables_are_known_by_what_one_writes(said: str, meant: str) -> None:
+    assert named(said) == meant
+
+
+@pytest.mark.parametrize(
+    ("task", "leaks"), [("partner_prediction", False), ("partner_inpainting", True), ("motion_control", True)]
+)
+def test_pairs_as_clean_as_their_token_tell_of_who_is_unknown_where_a_partner_is_given(task: str, leaks: bool) -> None:
+    """Where all that the task does not give is noise, the samples are others: what the table calls a leak."""
+    made = []
+    for noisy in (False, True):
+        model = tiny_denoiser(max_agents=2)
+        layout = TokenLayout(model.layout.latent, 2, True, "token")
+        model.layout = model.transformer.layout = layout
+        datamodule = data(max_agents=2)
+        evaluation = Evaluator(model, registry.get(task)(), FAST, 1, baselines=False)
+        evaluation.start(datamodule)
+        batch = next(iter(datamodule.test_dataloader()))
+        if noisy:
+            plan = evaluation.schedule(evaluation.context, evaluation.horizon, 2)
+            known = plan.known.repeat_interleave(4, dim=0)[: batch.frames, :, None, None]
+            noise = random_scene(batch.scenes, batch.frames, 2, torch.Generator().manual_seed(5))
+            batch = batch.replace(
+                body_rot=torch.where(known[..., None], batch.body_rot, noise.body_rot),
+                T_world_root=torch.where(known, batch.T_world_root, noise.T_world_root),
+            )
+        made.append(evaluation.sample(batch, 1, evaluation.generators_of(batch.scenes)).T_world_root)
+    assert torch.equal(*made) != leaks
