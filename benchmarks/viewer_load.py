@@ -1,6 +1,7 @@
 """How the viewer bears a crowd: memory, bytes and milliseconds a frame, and frames a second in a browser.
 
     python benchmarks/viewer_load.py --people 16 --frames 20000
+    python benchmarks/viewer_load.py --page crowd.html --warm 3   # a self-contained page, which has no server
 
 Chromium runs headless with a software renderer, so its frame rates are the least that a computer without any GPU gives.
 Where the time goes: `server ms` is Python's CPU for a frame that is sent, `script ms` the browser's for its scripts,
@@ -35,8 +36,6 @@ FLAGS = (
     "--disable-background-networking --no-first-run --disable-component-update --disable-sync --disable-quic"
 )
 STEPS = 40
-WARM = 25
-"""Frames drawn before anything counts: the first ones wait for shaders to be compiled."""
 COUNT = """
 window.drawn = {frames: 0, calls: 0, triangles: 0};
 let ticks = 0, last = -1;
@@ -105,10 +104,9 @@ class Listener(threading.Thread):
         return self.total
 
 
-HEAD = (
-    f"{'view':10} {'server MB':>9} {'server ms':>9} {'kB/frame':>8} {'packets':>7} {'sent/s':>6} | "
-    f"{'drawn/s':>7} {'k triangles':>11} "
-    f"{'calls':>5} {'script ms':>9} {'draw ms':>7} {'script MB':>9} {'page MB':>7}"
+HEAD = f"{'view':10} {'server MB':>9} {'server ms':>9} {'kB/frame':>8} {'packets':>7} {'sent/s':>6}"
+HEAD_BROWSER = (
+    f"{'drawn/s':>7} {'k triangles':>11} {'calls':>5} {'script ms':>9} {'draw ms':>7} {'script MB':>9} {'page MB':>7}"
 )
 
 
@@ -123,14 +121,20 @@ def main() -> None:
     options.add_argument("--marks", action="store_true", help="trails, contacts and collisions too")
     options.add_argument("--dpr", type=float, help="viser's ?fixedDpr: 0.5 draws a quarter of the pixels")
     options.add_argument("--no_browser", action="store_true")
+    options.add_argument("--page", type=Path, help="a self-contained page to measure in place of the viewer")
+    first = "frames drawn before anything counts, as the first wait for shaders to be compiled (default: %(default)s)"
+    options.add_argument("--warm", type=int, default=25, help=first)
     asked = options.parse_args()
+    if asked.page:
+        print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; window {asked.size}\n{HEAD_BROWSER}")
+        return print(in_browser(asked.page.resolve().as_uri(), asked))
     torch.set_num_threads(1)
     body = load_body("open")
     empty = memory()
     scene = crowd(asked.people, asked.frames)
     print(f"{asked.people} people x {asked.frames} frames; the scene takes {memory() - empty:.0f} of {memory():.0f} MB")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; window {asked.size}")
-    print(HEAD)
+    print(f"{HEAD} | {HEAD_BROWSER}")
     for style in asked.views:
         measure(asked, scene, body, style)
 
@@ -159,13 +163,14 @@ def measure(asked: argparse.Namespace, scene: Scene, body: Any, style: Style) ->
     time.sleep(asked.seconds)
     rate = (viewer.sent - sent) / asked.seconds
     line = f"{style:10} {memory() - before:9.0f} {1e3 * cost:9.1f} {kilobytes:8.1f} {sent_packets:7.1f} {rate:6.1f}"
-    print(line if asked.no_browser else f"{line} | {in_browser(viewer.port, asked)}", flush=True)
+    address = f"http://127.0.0.1:{viewer.port}/{f'?fixedDpr={asked.dpr}' if asked.dpr else ''}"
+    print(line if asked.no_browser else f"{line} | {in_browser(address, asked)}", flush=True)
     viewer.stop()
     thread.join(timeout=10)
 
 
-def in_browser(port: int, asked: argparse.Namespace) -> str:
-    """What a headless Chromium makes of it while the viewer plays."""
+def in_browser(address: str, asked: argparse.Namespace) -> str:
+    """What a headless Chromium makes of a page while it plays."""
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("google-chrome")
@@ -174,9 +179,9 @@ def in_browser(port: int, asked: argparse.Namespace) -> str:
         browser = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS.split())
         page = browser.new_page(viewport={"width": width, "height": height})
         page.add_init_script(COUNT)
-        page.goto(f"http://127.0.0.1:{port}/{f'?fixedDpr={asked.dpr}' if asked.dpr else ''}")
+        page.goto(address)
         page.get_by_role("button", name="Pause").wait_for(timeout=120_000)
-        page.wait_for_function(f"window.drawn.frames > {WARM}", timeout=300_000)
+        page.wait_for_function(f"window.drawn.frames > {asked.warm}", timeout=300_000)
         tools = page.context.new_cdp_session(page)
         tools.send("Performance.enable")
 

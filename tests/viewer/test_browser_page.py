@@ -7,9 +7,51 @@ import pytest
 import torch
 
 from magnet.export.page.html import save_html
+from magnet.export.page.light import light
+from magnet.testing import random_scene
 from tests.viewer.browser import blue, orange, pale_orange, shot, upright
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+COUNTED = """
+window.calls = 0;
+for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
+  const draw = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...given) {
+    window.calls++;
+    return draw.apply(this, given);
+  };
+}
+"""
+CAUGHT = """
+const link = WebGL2RenderingContext.prototype.linkProgram;
+WebGL2RenderingContext.prototype.linkProgram = function (program) {
+  this.transformFeedbackVaryings(program, ["at"], this.SEPARATE_ATTRIBS);
+  link.call(this, program);
+};
+"""
+"""Where the vertex shader puts vertices can be read back."""
+VERTICES = """([style, frame]) => {
+  const { picture, motion, view } = player;
+  const { gl } = picture;
+  view.style = style;
+  player.seek(frame);
+  picture.draw(motion, frame, view);
+  const { vertexArray, vertices } = picture.mesh(style);
+  const people = view.shown.length;
+  const places = new Float32Array(3 * vertices * people);
+  gl.useProgram(picture.people.program);
+  gl.bindVertexArray(vertexArray);
+  gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, gl.createTransformFeedback());
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, gl.createBuffer());
+  gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, places.byteLength, gl.DYNAMIC_READ);
+  gl.beginTransformFeedback(gl.POINTS);
+  gl.drawArraysInstanced(gl.POINTS, 0, vertices, people);
+  gl.endTransformFeedback();
+  gl.getBufferSubData(gl.TRANSFORM_FEEDBACK_BUFFER, 0, places);
+  gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
+  return Array.from(places);
+}"""
 
 
 def test_the_page_plays_scrubs_and_changes_its_look_without_any_network(page, handshake, body, tmp_path) -> None:
@@ -56,6 +98,31 @@ def test_the_page_draws_what_the_body_says(page, handshake, body, tmp_path) -> N
     places = page.evaluate("(player.motion.pose(1, 40), Array.from(player.motion.places))")
     truth = body.joints(handshake)[0, 40, 1].numpy()
     np.testing.assert_allclose(np.reshape(places, (22, 3)), truth, atol=1e-3)
+
+
+@pytest.mark.parametrize("style", ["body", "light"])
+def test_each_vertex_of_a_crowd_is_drawn_where_the_body_has_it(page, body, tmp_path, style) -> None:
+    crowd = random_scene(1, 6, 12, torch.Generator().manual_seed(3))  # twelve shapes
+    page.add_init_script(CAUGHT)
+    page.goto(save_html(crowd, tmp_path / "a.html", body, styles=(style,)).as_uri())
+    page.wait_for_function("window.player && player.drawn > 0")
+    truth = body.vertices(crowd)[0].numpy()
+    truth = truth if style == "body" else truth[:, :, light(body).keep]
+    for frame in (0, 5):
+        places = np.reshape(page.evaluate(VERTICES, [style, frame]), truth[frame].shape)
+        np.testing.assert_allclose(places, truth[frame], atol=1e-3)
+
+
+def test_any_number_of_people_are_drawn_in_three_calls_and_each_ghost_in_two(page, body, tmp_path) -> None:
+    page.add_init_script(COUNTED)
+    for people, ghosts in ((2, 0), (40, 0), (3, 2)):
+        crowd = random_scene(1, 6, people, torch.Generator().manual_seed(3))
+        truth = random_scene(1, 6, ghosts, torch.Generator().manual_seed(4)) if ghosts else None
+        page.goto(save_html(crowd, tmp_path / "a.html", body, truth=truth, styles=("light", "skeleton")).as_uri())
+        page.wait_for_function("window.player && player.drawn > 0")
+        for style in ("light", "skeleton"):
+            draw = f"view.style = '{style}'; calls = 0; picture.draw(player.motion, 2.5, view); return calls;"
+            assert page.evaluate(f"(() => {{ const {{ picture, view }} = player; {draw} }})()") == 3 + 2 * ghosts
 
 
 def test_the_page_shows_takes_side_by_side_and_each_alone(page, handshake, body, tmp_path) -> None:

@@ -23,6 +23,7 @@ from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
 FULL = 32767
+SCRIPTS = ("motion.js", "picture.js", "player.js")
 CHUNK = 512
 """Frames posed at a time."""
 
@@ -93,7 +94,7 @@ def page(
         "title": html.escape(title or (shown[0].label if len(shown) == 1 else "magnet")),
         "meta": json.dumps(meta, separators=(",", ":")).replace("</", "<\\/"),
         "data": base64.b64encode(data).decode("ascii"),
-        "player": _packaged("player.js"),
+        "player": "\n".join(_packaged(name) for name in SCRIPTS),
     }
     text = _packaged("player.html")
     for name, word in words.items():
