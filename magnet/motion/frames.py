@@ -18,7 +18,7 @@ from magnet.motion.rotations import from_6d, to_6d, yaw_of
 from magnet.motion.scene import Scene
 
 UPRIGHT = 1e-3
-"""Below this horizontal length of the left axis the person lies on the side, and the axis tells no yaw."""
+"""Where the left axis is horizontally shorter than this, the person lies on the side and the axis gives no yaw."""
 
 
 # -- transforms --------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ POSE_FEATURES = 21 * 6 + 9
 def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
     """Inverse of `pose_features`: bodies placed at canonical frames. (B, T, P, 135), (B, T, P, 4, 4)
 
-    Shapes, presence, names and body come from `like`, of which nothing else is read.
+    Shapes, presence, names and body come from `like`; nothing else of it is read.
     """
     body_rot = from_6d(features[..., : 21 * 6].unflatten(-1, (21, 6)))
     T_world_root = T_world_can @ from_9d(features[..., 21 * 6 :])
@@ -187,7 +187,7 @@ def posed(features: Tensor, T_world_can: Tensor, like: Scene) -> Scene:
 def align_planar(path: Tensor, target: Tensor) -> Tensor:
     """The planar transform that best aligns a path with another: headings first, then positions.
 
-    (..., T, 4, 4), (..., T, 4, 4) -> (..., 4, 4), such that shift @ path is about target.
+    (..., T, 4, 4), (..., T, 4, 4) -> (..., 4, 4); the result times `path` is about `target`.
     """
     (yaw, ground), (yaw_target, ground_target) = to_planar(path), to_planar(target)
     off = yaw_target - yaw

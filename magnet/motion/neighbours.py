@@ -12,8 +12,8 @@ from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 
 ENTER, LEAVE = 1.5, 2.2
-"""Metres over the ground within which somebody becomes a partner, and beyond which a partner is one no longer; with 2.5
-and 3.5 strangers crowd together, for the model learned from couples (docs/tasks.md, "Crowds")."""
+"""Metres over the ground: who comes nearer than the first becomes a partner, who is further than the second stops being
+one. With 2.5 and 3.5 strangers crowd together, because the model learned from couples (docs/tasks.md, "Crowds")."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def nearest_partners(
 
 @dataclass(frozen=True)
 class CrowdViews:
-    """The groups that a model looks at: each person with the partners; people with the same group share a view.
+    """The groups that a model looks at: each person with their partners; people of the same group share a view.
 
     Attributes:
         people: (V, M) int, who is in each slot of each view, in the order of their numbers; 0 where the slot is free.
@@ -110,7 +110,7 @@ class CrowdViews:
         pair: (V, M, M - 1) int, which slot of a person's token points at each partner; -1: none does.
         view, slot: (P,) int, where each person is read from.
         partner_slot: (P, K) int, which partner slot of that view each of a person's slots is; -1: nobody's.
-        ego: (V,) int, somebody whose partners the others of the view are.
+        ego: (V,) int, a person of the view whose partners all others of it are.
     """
 
     people: Tensor

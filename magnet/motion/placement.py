@@ -123,8 +123,9 @@ def fuse(predicted: Predicted) -> Tensor:
     """Frame by frame: minimise own * |pose - stepped pose|^2 + pairwise_weight * sum |pair - predicted pair|^2.
 
     Yaws first, then positions with those yaws: two linear systems with the same constant matrix,
-    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight. So each
-    frame's poses are a constant matrix times those before, plus what the frame says: all frames at once, by doubling.
+    diag(own) + 2 pairwise_weight (graph Laplacian of the people present). own (P,) is each agent's weight. Each
+    frame's poses are thus a constant matrix times the poses before, plus what the frame adds; so all frames are
+    computed at once, by doubling (`accumulated`).
     """
     assert predicted.T_self_partner is not None
     pair_yaw, pair_ground = to_planar(predicted.T_self_partner)

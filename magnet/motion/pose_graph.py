@@ -5,7 +5,7 @@ frames to each other, pairwise transforms relate agents to each other, and each 
 Errors of predicted deltas are alike in neighbouring frames (somebody walks a little too fast for a while), so the
 correction can be smooth: then high frequencies come from the deltas and low ones from the pairs.
 Headings are solved first, then positions with those headings: two linear systems in closed form, without iterations.
-Frames are tied to the two before them only, so runs of frames are eliminated at once, in few and batched operations.
+Each frame is tied only to the two before it. So whole runs of frames are eliminated at once, in few batched operations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GAUGE = 1e-6
 """Small precision of the integrated deltas, which decides where nothing else determines a position."""
 
 WHOLE = 2 * 128**3
-"""Matrices are factored whole where their number times the cube of their size is no more; others are reduced first."""
+"""A batch of matrices is factored whole if their number times their size cubed is at most this; else reduced first."""
 
 RUN = 4
 """Blocks of two frames in a run, all but the last of which are eliminated at once."""
@@ -32,13 +32,14 @@ RUN = 4
 class PoseGraph:
     """Headings and positions that fit deltas and pairwise transforms best, each by its precision.
 
-    Minimises the squared differences between consecutive poses and the deltas, their changes from frame to frame, and
-    the differences between the agents of a frame and the pairwise transforms. With pairwise precisions of 0 it is the
-    plain integration of the deltas. This is all that depends on precisions only.
+    Minimises three sums of squares: how far consecutive poses are from the deltas, how much that error changes from
+    frame to frame, and how far the agents of a frame are from their pairwise transforms. With pairwise precisions of 0
+    the answer is the plain integration of the deltas. A graph holds what depends on the precisions alone, and can be
+    solved for several motions.
 
     Attributes:
-        tied: (2, B, T, P, P - 1) precisions of pairwise transforms, of yaws and of ground positions. B may be 1, for
-            any number of scenes.
+        tied: (2, B, T, P, P - 1) precisions of pairwise transforms: of their yaws, then of their ground positions. B
+            may be 1, for any number of scenes.
         systems: the two factored matrices.
     """
 
@@ -50,9 +51,9 @@ class PoseGraph:
         """From precisions in float64, 1 / rad^2 and 1 / m^2; 0 where nothing is known.
 
         Args:
-            held: (2, B, T, P) of deltas; the first one's is how firmly the start holds.
-            smooth: (2, B, T, P) of the change of a delta's error from the frame before; 0: errors are independent. That
-                of the first frame is not read.
+            held: (2, B, T, P) of deltas; that of the first delta says how firmly the start holds.
+            smooth: (2, B, T, P) of the change of a delta's error since the frame before; 0: errors are independent. The
+                first frame's is not read.
             tied: as above.
         """
         return cls(tied, factor(*_in_twos(*_bands(held, smooth, tied))))
@@ -80,9 +81,9 @@ class PoseGraph:
         Returns:
             yaw (B, T, P) and ground (B, T, P, 2), in float64.
 
-        Deltas that were observed a second time, `held` being the sum of both precisions: the pull is the second
-        precision times how far that observation is from the first, yaw (B, T, P), ground (B, T, P) complex. Then the
-        first one's error is smooth, and the second one's independent from frame to frame.
+        Pulls are for deltas that were observed twice. Then `held` is the sum of both precisions, and a pull is the
+        second precision times how far the second observation is from the first: yaw (B, T, P), ground (B, T, P)
+        complex. The first observation's error counts as smooth, the second one's as independent from frame to frame.
         """
         partner = partners(delta_yaw.shape[2], delta_yaw.device)
         start_yaw, start_ground = start_yaw.double(), torch.view_as_complex(start_ground.double().contiguous())
@@ -150,9 +151,9 @@ def _ahead(frames: Tensor, count: int) -> Tensor:
 
 
 def _in_twos(own: Tensor, before: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Bands of single frames as blocks of two, which are tied to the block before only; an odd frame is paired with
-    one that is tied to nothing.
+    """Bands of single frames as blocks of two frames, each tied only to the block before it.
 
+    An odd last frame is paired with one that is tied to nothing.
     own (..., T, P, P), before and second (..., T, P) -> (..., T / 2, 2 P, 2 P) each: own blocks, ties
     """
     if own.shape[-3] % 2:
@@ -180,9 +181,9 @@ class BlockTridiagonal:
     Attributes:
         inner: Cholesky factors of what is eliminated: the whole matrix (..., T P, T P), or the first blocks of each run
             (..., S, (RUN - 1) P, (RUN - 1) P).
-        reach: (..., S, (RUN - 1) P, 2 P) how these follow the last block of the run before and that of their own; None:
-            nothing is left.
-        rest: what is left, the last block of each run.
+        reach: (..., S, (RUN - 1) P, 2 P) how the eliminated blocks depend on the last block of the run before and on
+            the last one of their own run; None: nothing is left.
+        rest: the matrix of what is left, the last block of each run.
     """
 
     inner: Tensor
@@ -214,8 +215,8 @@ class BlockTridiagonal:
 def factor(diagonal: Tensor, before: Tensor) -> BlockTridiagonal:
     """Factor a symmetric positive definite matrix whose blocks are tied to neighbouring ones only.
 
-    All but the last block of each run are eliminated at once, which leaves a matrix of the same kind: T blocks take
-    log T rounds of batched products, each by a factor of `RUN` smaller.
+    All but the last block of each run are eliminated at once. What is left is a matrix of the same kind, `RUN` times
+    smaller; so T blocks take log T rounds of batched products.
 
     Args:
         diagonal: (..., T, P, P) each block on the diagonal.

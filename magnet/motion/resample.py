@@ -32,13 +32,13 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 
 
 def slerp_quat(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
-    """The same of unit quaternions (..., 4)."""
+    """`slerp` of unit quaternions (..., 4)."""
     turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(first), second))
     return roma.quat_product(first, roma.rotvec_to_unitquat(turn * share[..., None]))
 
 
 def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:
-    """Which two frames each new frame i at time i / target lies between, and how far on: before, after, share."""
+    """The two frames that new frame i, at time i / target, lies between, and how far on: before, after, share."""
     count = math.floor((frames - 1) * target / fps + 1e-9) + 1
     place = torch.arange(count, dtype=torch.float64) * (fps / target)
     before = (place + 1e-9).floor().long().clamp_max(frames - 1)

@@ -1,4 +1,4 @@
-"""From a plan of paths, footsteps, hands and gazes to whole bodies."""
+"""Whole bodies that follow a plan of paths, footsteps, hands and gazes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class _Bodies:
     t: dict[int, Tensor]
 
     def attach(self, joint: int, parent: int, R: Tensor | None = None) -> None:
-        """Hang a joint on its parent; without a rotation of its own it turns with the parent."""
+        """Place a joint by its parent; without a rotation of its own it turns with the parent."""
         self.t[joint] = self.t[parent] + rotate(self.R[parent], self.rest[:, joint] - self.rest[:, parent])
         self.R[joint] = self.R[parent] if R is None else R
 
@@ -111,7 +111,7 @@ def _strides(plan: Plan) -> tuple[Tensor, Tensor]:
 
 
 def _trunk(plan: Plan, people: People, drift: Tensor, fore: Tensor, load: Tensor) -> _Bodies:
-    """Pelvis, spine and collars about a pelvis at the origin."""
+    """Pelvis, spine and collars, with the pelvis at the origin."""
     scissor = smooth(fore[..., 0] - fore[..., 1], 1.5).clamp(-0.8, 0.8)
     travel = torch.diff(plan.ground, dim=0, append=plan.ground[-1:]) * FPS
     forward = torch.stack([plan.yaw.sin(), plan.yaw.cos()], dim=-1)
@@ -140,7 +140,7 @@ def _trunk(plan: Plan, people: People, drift: Tensor, fore: Tensor, load: Tensor
 
 
 def _feet(plan: Plan, people: People, bodies: _Bodies) -> list[Tensor]:
-    """Rotations of both feet and toes; where their ankles are. [(T, P, 3)] * 2"""
+    """Set the rotations of both feet and toes. Returns where the ankles are, left and right: [(T, P, 3)] * 2"""
     ankles = []
     for foot in (0, 1):
         ankle, ball = ANKLES[foot], TOES[foot]
@@ -191,7 +191,7 @@ def _leg(plan: Plan, bodies: _Bodies, foot: int, ankle: Tensor) -> None:
 
 
 def _arm(plan: Plan, people: People, bodies: _Bodies, hand: int, scissor: Tensor, drift: Tensor) -> None:
-    """Hanging and swinging against the legs, making a gesture, or bringing the palm to its place."""
+    """Set one arm: it swings against the legs, makes a gesture, or brings the palm to its place."""
     side = 1 - 2 * hand
     collar, shoulder, elbow, wrist = COLLARS[hand], SHOULDERS[hand], ELBOWS[hand], WRISTS[hand]
     chest = bodies.R[SPINE3]
@@ -225,10 +225,10 @@ def _arm(plan: Plan, people: People, bodies: _Bodies, hand: int, scissor: Tensor
 
 
 def _elbow_side(side: int, aim: Tensor) -> Tensor:
-    """Where the elbow points, by where the hand is: back when it hangs, down when ahead, out when up. (..., 3)
+    """Where the elbow points: back when the hand hangs, down when it is ahead, out when it is up. (..., 3)
 
-    Every such field is undefined in some direction; for this one it is high across the other shoulder, where hands
-    seldom are.
+    Any such rule is undefined for some direction of the hand; this one is for high across the other shoulder, where
+    hands seldom are.
     """
     up, ahead = aim[..., 1].clamp_min(0.0) ** 2, aim[..., 2].clamp_min(0.0) ** 2
     return torch.stack([side * (0.4 + 0.7 * up), -0.6 - 0.6 * ahead, -0.9 + 0.9 * ahead], dim=-1)
@@ -248,7 +248,7 @@ def _hand(
     axis = F.normalize(rotate(forearm, lower), dim=-1)
     now = forearm[..., 2]  # the thumb side of the forearm
     now = F.normalize(now - (now * axis).sum(-1, keepdim=True) * axis, dim=-1)
-    # atan2 of the projected thumb: no jump where the thumb runs along the forearm, its share fades there.
+    # No jump where the thumb points along the forearm: its projection, and so the twist, fades there.
     sin = (torch.linalg.cross(now, thumb, dim=-1) * axis).sum(-1)
     cos = (now * thumb).sum(-1)
     twist = torch.atan2(sin, cos.clamp_min(-0.5) + 0.3) * weight
@@ -278,7 +278,7 @@ def _head(plan: Plan, bodies: _Bodies, drift: Tensor) -> None:
     gaze = rotate(chest.transpose(-1, -2), plan.gaze - bodies.t[HEAD])
     yaw = torch.atan2(gaze[..., 0], gaze[..., 2])
     level = gaze[..., [0, 2]].norm(dim=-1)
-    # A sine: far enough aside, people no longer turn their heads that way; never a flip behind the back.
+    # A sine: heads turn back when what they look at moves behind them, and never flip from side to side.
     yaw = 0.95 * yaw.sin() + 0.05 * drift[..., 0]
     pitch = 0.7 * torch.tanh(torch.atan2(-gaze[..., 1], level) / 0.7) + 0.03 * drift[..., 1]
     roll = 0.03 * drift[..., 2]
