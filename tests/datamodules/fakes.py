@@ -1,6 +1,7 @@
 """A data set of random smooth clips in memory, a trainer that says only where it runs, and what is seen of them."""
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from magnet.motion.scene import Scene, concatenate
 from magnet.testing import random_scene
 
 
+@cache
 def random_clip(
     name: str,
     frames: int = 200,
@@ -23,7 +25,7 @@ def random_clip(
     split: Split = "train",
     bad: tuple[int, ...] = (),
 ) -> Clip:
-    """A clip that only its name decides; the frames `bad` are invalid."""
+    """A clip that its arguments alone decide; the frames `bad` are invalid."""
     generator = torch.Generator().manual_seed(sum(map(ord, name)) * 7919 + frames)
     valid = torch.ones(1, frames, dtype=torch.bool)
     valid[:, list(bad)] = False

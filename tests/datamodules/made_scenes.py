@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet.datamodules import registry
 from magnet.datamodules.duobox import DuoBoxReader
 from magnet.datamodules.fakes import remocap as fake_remocap
+from magnet.datamodules.fakes.body import Kind
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
-from magnet.datamodules.reading.recording import Reader, Recording
+from magnet.datamodules.reading.recording import Axis, Reader, Recording
 from tests.datamodules.readers import fake_of, world_joints
 
 MILLIMETRE = 0.001
@@ -64,11 +66,22 @@ def random_scene(like: FakeMotion, seconds: float, seed: int, rate: float = 1.0)
         seed: of all but their steps.
         rate: true frame rate over the declared one; unless 1 they only walk.
     """
-    walking = people(round(seconds * like.fps), like.poses.shape[1], rate * like.fps, kind=like.kind)
-    if not like.betas.any():
-        walking = replace(walking, betas=like.betas, transl=walking.transl + walking.pelvis - like.pelvis)
+    persons, frames = like.poses.shape[1], round(seconds * like.fps)
+    return moving(frames, persons, like.fps, like.up, like.kind, bool(like.betas.any()), seed, rate)
+
+
+@lru_cache(maxsize=64)
+def moving(
+    frames: int, persons: int, fps: float, up: Axis, kind: Kind, shaped: bool, seed: int, rate: float
+) -> FakeMotion:
+    """`random_scene` of numbers alone; whoever is not `shaped` has zero shape. Nobody may write into its arrays."""
+    walking = people(frames, persons, rate * fps, kind=kind)
+    if not shaped:
+        betas = np.zeros((persons, 10))
+        transl = walking.transl + walking.pelvis - rest_joints(betas, kind)[:, 0]
+        walking = replace(walking, betas=betas, transl=transl)
     walking = wild(walking, seed) if rate == 1.0 else with_positions(walking)
-    return turned(replace(walking, fps=like.fps), like.up)
+    return turned(replace(walking, fps=fps), up)
 
 
 def turns(vectors: NDArray) -> Rotation:

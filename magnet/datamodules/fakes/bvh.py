@@ -56,7 +56,7 @@ def _file(shown: FakeMotion, person: int) -> str:
     turns = torch.from_numpy(local[:, depth_first(PARENTS)])
     degrees = roma.rotmat_to_euler("ZYX", turns, degrees=True).numpy().reshape(shown.frames, -1)
     numbers = np.concatenate([CENTIMETRES * shown.positions[:, person, 0], degrees], axis=1)
-    rows = [" ".join(f"{x:.6f}" for x in row) for row in numbers]
+    rows = [" ".join(f"{x:.6f}" for x in row) for row in numbers.tolist()]
     tips = {joint: np.array([0.0, 0.0, 5.0]) for joint in range(len(rest)) if joint not in PARENTS}
     names = [named(joint) for joint in JOINT_NAMES]
     return bvh_text(names, PARENTS, rest - rest[[0, *PARENTS[1:]]], tips, "ZYX", rows, shown.fps)

@@ -118,7 +118,7 @@ def turned(motion: FakeMotion, up: Axis) -> FakeMotion:
     return replace(motion, up=up, poses=poses, transl=transl, positions=motion.positions @ R_new_old.T)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def _scene(frames: int, persons: int, seed: int, kind: Kind) -> Scene:
     coupling = "follow" if persons <= 6 else "circle"
     generator = torch.Generator().manual_seed(seed)

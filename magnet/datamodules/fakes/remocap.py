@@ -151,16 +151,13 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
     above = {child.name: joint for joint in declared for child in joint.children}
     world = world_rotations(shown.poses[:, person])
     offset = {j.name: j.rest - above[j.name].rest if j.name in above else np.zeros(3) for j in declared}
-    place, turn = {}, {}
-    for joint in declared:
-        if joint is root:
-            place[joint.name], local = shown.positions[:, person, 0], world[:, 0]
-        else:
-            parent = above[joint.name]
-            place[joint.name] = place[parent.name] + world[:, parent.turns] @ offset[joint.name]
-            local = np.swapaxes(world[:, parent.turns], -1, -2) @ world[:, joint.turns]
-        degrees = roma.rotmat_to_euler(CHANNELS, torch.from_numpy(local), degrees=True).numpy()
-        turn[joint.name] = degrees[:, [CHANNELS.index(axis) for axis in "XYZ"]]
+    place, local = {root.name: shown.positions[:, person, 0]}, {root.name: world[:, 0]}
+    for joint in declared[1:]:
+        parent = above[joint.name]
+        place[joint.name] = place[parent.name] + world[:, parent.turns] @ offset[joint.name]
+        local[joint.name] = np.swapaxes(world[:, parent.turns], -1, -2) @ world[:, joint.turns]
+    degrees = roma.rotmat_to_euler(CHANNELS, torch.from_numpy(np.stack(list(local.values()))), degrees=True).numpy()
+    turn = dict(zip(local, degrees[..., [CHANNELS.index(axis) for axis in "XYZ"]], strict=True))
     millimetres = {name: MILLIMETRES * at for name, at in place.items()}
     _write_csv(folder / "motion_worldpos.csv", [j.name for j in listed], millimetres)
     _write_csv(folder / "motion_rotations.csv", [j.name for j in listed], turn)
@@ -168,7 +165,7 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
     (folder / "motion_offsets.pkl").write_bytes(pickle.dumps(offsets))
     columns = [np.round(millimetres[root.name], 6)]
     columns += [turn[j.name][:, ["XYZ".index(axis) for axis in CHANNELS]] for j in declared if not j.end]
-    rows = [" ".join(f"{x:.6f}" for x in row) for row in np.concatenate(columns, axis=1)]
+    rows = [" ".join(f"{x:.6f}" for x in row) for row in np.concatenate(columns, axis=1).tolist()]
     joints = [j.name for j in declared if not j.end]
     parents = [joints.index(above[name].name) if name in above else -1 for name in joints]
     tips = {joints.index(above[j.name].name): offsets[j.name] for j in declared if j.end}
@@ -179,5 +176,5 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
 def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> None:
     values = np.stack([columns[name] for name in names], axis=1).reshape(len(columns[names[0]]), -1)
     lines = [",".join(["Time", *(f"{name}.{axis}" for name in names for axis in "XYZ")])]
-    lines += [",".join([f"{t / RATE:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values)]
+    lines += [",".join([f"{t / RATE:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values.tolist())]
     path.write_text("\n".join(lines) + "\n")

@@ -30,6 +30,15 @@ def order(tmp_path) -> PrepareJob:
     return PrepareJob(made.NAME, str(tmp_path / "dl"), {}, str(made.write(tmp_path / "dl")), CanonicalizeOptions())
 
 
+@pytest.fixture(scope="module")
+def whole(known, tmp_path_factory) -> dict[str, bytes]:
+    """The store of the same download elsewhere."""
+    root = tmp_path_factory.mktemp("whole")
+    job = PrepareJob(made.NAME, str(root / "dl"), {}, str(made.write(root / "dl")), CanonicalizeOptions())
+    prepare(job, root / "store", shard_rows=700)
+    return content(root / "store")
+
+
 def content(store: Path) -> dict[str, bytes]:
     """Every byte of a store, but not what a later prepare goes on from."""
     return {path.name: path.read_bytes() for path in store.iterdir() if path.name != STATE}
@@ -114,8 +123,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp
 
 
 @pytest.mark.parametrize("dies_at", ["first shard", "second shard", "index", "manifest"])
-def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, tmp_path, monkeypatch, dies_at):
-    prepare(order, tmp_path / "new", shard_rows=700)
+def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, whole, tmp_path, monkeypatch, dies_at):
     prepare(order, tmp_path / "store", limit=1, shard_rows=700)
     before = content(tmp_path / "store")
     write, calls = prepare_pack.write_whole, []
@@ -135,7 +143,7 @@ def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, tmp_pa
     assert content(tmp_path / "store").items() >= before.items()
     assert not check_store(StoreReader(tmp_path / "store")).problems
     prepare(order, tmp_path / "store", shard_rows=700)
-    assert content(tmp_path / "store") == content(tmp_path / "new")
+    assert content(tmp_path / "store") == whole
 
 
 @pytest.mark.slow

@@ -37,11 +37,13 @@ def content(store: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in store.iterdir() if path.name != STATE}
 
 
-@pytest.fixture
-def alone(order: PrepareJob, tmp_path: Path) -> dict[str, bytes]:
-    """What one process makes of it."""
-    prepare(order, tmp_path / "alone", shard_rows=700)
-    return content(tmp_path / "alone")
+@pytest.fixture(scope="module")
+def alone(known: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What one process makes of the same download elsewhere."""
+    root = tmp_path_factory.mktemp("alone")
+    order = PrepareJob(made.NAME, str(root / "dl"), {}, str(made.write(root / "dl")), CanonicalizeOptions())
+    prepare(order, root / "store", shard_rows=700)
+    return content(root / "store")
 
 
 # -- two at once -------------------------------------------------------------------------------
