@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from lightning.pytorch import LightningDataModule, LightningModule
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from magnet.cli import train
+from magnet.datamodules import registry
 from magnet.evaluation.evaluator import Evaluator
 
 
@@ -104,3 +108,12 @@ class OtherData(ToyData):
     def __init__(self, root: str = "elsewhere", takes: int = 1, window_frames: int = 64, max_agents: int = 2) -> None:
         super().__init__(window_frames, max_agents, root)
         self.takes = takes
+
+
+def play(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Path:
+    """Work in a folder, with toys in place of the real models and data."""
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("MAGNET_DEBUG", raising=False)
+    monkeypatch.setattr(train, "MODELS", {"ToyModel": "tests.toys"})
+    monkeypatch.setattr(registry, "classes", lambda: {"ToyData": ToyData, "OtherData": OtherData})
+    return folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,30 @@ from lightning.pytorch.trainer.connectors import checkpoint_connector
 
 from magnet import cli
 from magnet.cli import train
-from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel
+from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel, play
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 
 
+OPTIONS = ("--model.lr", "0.25", "--data", "OtherData", "--data.root", "here", "--data.takes", "7")
+LINKED = ("--data.max_agents", "3", "--data.window_frames", "32", "--trainer.max_epochs", "2")
+FIT = ("fit", "--model", "ToyModel", *OPTIONS, *LINKED, "--out", "trained")
+"""Two epochs with options that are nobody's default."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, of which tests get copies."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = play(patch, tmp_path_factory.mktemp("run"))
+        go(*FIT)
+    return folder / "trained"
+
+
 @pytest.fixture
-def trained(toy: Path) -> Path:
-    """A run of two epochs with options that are nobody's default."""
-    options = ("--model.lr", "0.25", "--data", "OtherData", "--data.root", "here", "--data.takes", "7")
-    linked = ("--data.max_agents", "3", "--data.window_frames", "32", "--trainer.max_epochs", "2")
-    assert cli.main(["fit", "--model", "ToyModel", *options, *linked, "--out", "trained", *CPU]) == 0
-    return toy / "trained"
+def trained(toy: Path, run: Path) -> Path:
+    """A run in the working folder."""
+    return shutil.copytree(run, toy / "trained", symlinks=True)
 
 
 @pytest.fixture
@@ -42,8 +55,8 @@ def go(*arguments: str) -> tuple[ToyModel, Any]:
     return ToyModel.seen["model"], ToyModel.seen["data"]
 
 
-def test_linked_options_follow_the_data_in_training(trained: Path) -> None:
-    model = ToyModel.seen["model"]
+def test_linked_options_follow_the_data_in_training(toy: Path) -> None:
+    model, _ = go(*FIT)
     assert (model.max_agents, model.window) == (3, 8)
 
 
