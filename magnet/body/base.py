@@ -45,6 +45,14 @@ BY_DEPTH = (0, *(j for joints, _ in DEPTHS for j in joints))
 FROM_DEPTH = tuple(BY_DEPTH.index(j) for j in range(BODY_JOINTS))
 
 
+@lru_cache(maxsize=8)
+def _tree(device: torch.device) -> tuple[Tensor, tuple[tuple[Tensor, Tensor], ...], Tensor]:
+    """Indices of `bone_chain`: each joint's parent; of each depth, rotations and parents; from depths to joints."""
+    with torch.inference_mode(False):  # or training, later, could not use them
+        depths = [(torch.tensor(joints, device=device) - 1, torch.tensor(up, device=device)) for joints, up in DEPTHS]
+        return torch.tensor(PARENTS[1:], device=device), tuple(depths), torch.tensor(FROM_DEPTH, device=device)
+
+
 class Body(nn.Module):
     """A frozen body model; its tensors are float32 buffers.
 
@@ -149,23 +157,22 @@ class Body(nn.Module):
     def bone_chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
         """World rotations (..., 22, 3, 3) and positions (..., 22, 3), in one batched product per level of the tree."""
         body_rot, T_world_root = _wide(body_rot), _wide(T_world_root)
-        parents = list(PARENTS[1:])
-        offset = (rest_joints[..., 1:, :] - rest_joints[..., parents, :])[..., None]
+        parents, depths, order = _tree(rest_joints.device)
+        # By tensors that are kept: lists of indices would become tensors at every call, and once more for gradients.
+        offset = (rest_joints[..., 1:, :] - rest_joints.index_select(-2, parents))[..., None]
         with _exact(body_rot):
             R, t = T_world_root[..., None, :3, :3], T_world_root[..., None, :3, 3]
             Rs, ts = [R], [t]
-            for joints, parent in DEPTHS:
-                mine = [j - 1 for j in joints]
-                R, t = R[..., parent, :, :], t[..., parent, :]
-                t = t + (R @ offset[..., mine, :, :])[..., 0]
-                R = R @ body_rot[..., mine, :, :]
+            for mine, parent in depths:
+                R, t = R.index_select(-3, parent), t.index_select(-2, parent)
+                t = t + (R @ offset.index_select(-3, mine))[..., 0]
+                R = R @ body_rot.index_select(-3, mine)
                 Rs.append(R)
                 ts.append(t)
             lead = torch.broadcast_shapes(Rs[-1].shape[:-3], ts[-1].shape[:-2])
             Rs = [level.expand(*lead, *level.shape[-3:]) for level in Rs]
             ts = [level.expand(*lead, *level.shape[-2:]) for level in ts]
-            order = list(FROM_DEPTH)
-            return torch.cat(Rs, dim=-3)[..., order, :, :], torch.cat(ts, dim=-2)[..., order, :]
+            return torch.cat(Rs, dim=-3).index_select(-3, order), torch.cat(ts, dim=-2).index_select(-2, order)
 
 
 def _exact(like: Tensor) -> torch.autocast:

@@ -134,7 +134,7 @@ def fit_body(
     tell = progress or (lambda done, total: None)
     if betas is None:
         betas = shape_from_lengths(targets, joints, body, weights > 0, settings.shape_prior)
-    floor = None
+    floor = soles = None
     if fit_shape or grounded:
         # Evenly spaced frames suffice for ten numbers and a height, and cost far less than all.
         good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
@@ -144,9 +144,9 @@ def fit_body(
         R, t, betas = few.solve(betas, settings.shape_steps, fit_shape, lambda done: tell(done, total))
         if grounded:
             found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
-            floor = float(floor_height(found, body, betas).median())
+            floor, soles = float(floor_height(found, body, betas).median()), clearance(body, betas)
     smooth = settings.smooth * (fps / FPS) ** 4
-    problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor)
+    problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor, soles)
     R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(total - settings.steps + done, total))
     scene = Scene(
         body_rot=R[None, :, :, 1:],
@@ -248,7 +248,8 @@ class _Problem:
     hints: Tensor | None  # (T, P, 22, 3, 3)
     settings: FitSettings
     smooth: float
-    floor: float | None = None
+    floor: float | None = None  # height in metres, for shapes that are known
+    soles: Tensor | None = None  # their `clearance`
 
     def solve(
         self, betas: Tensor, steps: int, shape: bool, tell: Callable[[int], None]
@@ -283,9 +284,9 @@ class _Problem:
         loss = (self.weights * off.square().sum(-1)).sum()
         loss = loss + (trust * (R - prior).square().sum((-1, -2))).sum()
         loss = loss + self.settings.shape * len(self.targets) * betas.square().sum()
-        if self.floor is not None:
+        if self.floor is not None and self.soles is not None:
             height = found[:, :, list(FEET), 1] - self.floor
-            deep = (clearance(self.body, betas) - height).clamp_min(0.0) / CENTIMETRE
+            deep = (self.soles - height).clamp_min(0.0) / CENTIMETRE
             loss = loss + self.settings.floor * deep.square().sum()
         if self.smooth and len(R) > 2:
             loss = loss + self.smooth * (R[2:] - 2 * R[1:-1] + R[:-2]).square().sum()
