@@ -106,34 +106,26 @@ def in_turn(names: Iterable[str], commands: Iterable[str]) -> list[Any]:
 
 
 @pytest.mark.parametrize(("name", "command"), in_turn(DATA, TRAINER_COMMANDS))
-def test_data_named_by_a_flag_have_their_own_defaults(
+def test_models_and_data_named_by_a_flag_have_their_own_defaults(
     name: str, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("--model", "Tokenizer") if command == "fit" else ()
-    assert printed(capsys, command, *words, "--data", name)["data"]["init_args"] == own(DATA[name])
+    model = list(MODELS)[list(DATA).index(name) // len(TRAINER_COMMANDS) % len(MODELS)]
+    linked = set(LINKS.values()) if command == "fit" else set()
+    got = printed(capsys, command, "--model", model, "--data", name)
+    assert got["data"]["init_args"] == own(DATA[name])
+    assert got["model"]["init_args"] == {k: value for k, value in own(MODELS[model]).items() if k not in linked}
 
 
-@pytest.mark.parametrize("name", DATA)
-def test_data_named_by_a_file_have_their_own_defaults_over_any_other_file(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("name", "named_by"), in_turn(DATA, ["file", "flag"]))
+def test_data_named_by_a_file_or_a_flag_have_their_own_defaults_over_any_other_file(
+    name: str, named_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     below = written(tmp_path / "below.yaml", model="Tokenizer", data=SPELT | {"class_path": "Synthetic"})
     given = {"class_path": name, "init_args": {"batch_size": 5}}
     above = written(tmp_path / "above.yaml", extends="below.yaml", data=given)
-    if name == "Synthetic":
-        assert printed(capsys, "fit", "--config", above)["data"]["init_args"] == SPELT["init_args"] | {"batch_size": 5}
-    else:
-        assert printed(capsys, "fit", "--config", above)["data"]["init_args"] == own(DATA[name]) | {"batch_size": 5}
-        words = ("--config", below, "--data.batch_size", "7", f"--data={name}")
-        assert printed(capsys, "fit", *words)["data"]["init_args"] == own(DATA[name]) | {"batch_size": 7}
-
-
-@pytest.mark.parametrize("command", TRAINER_COMMANDS)
-@pytest.mark.parametrize("name", MODELS)
-def test_models_have_their_own_defaults(name: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    linked = set(LINKS.values()) if command == "fit" else set()
-    expected = {key: value for key, value in own(MODELS[name]).items() if key not in linked}
-    assert printed(capsys, command, "--model", name)["model"]["init_args"] == expected
+    flags = ("--config", below, "--data.batch_size", "5", f"--data={name}")
+    got = printed(capsys, "fit", *(flags if named_by == "flag" else ("--config", above)))["data"]["init_args"]
+    assert got == (SPELT["init_args"] if name == "Synthetic" else own(DATA[name])) | {"batch_size": 5}
 
 
 def test_a_model_over_a_file_that_spells_the_other_out_has_its_own_defaults(
@@ -167,11 +159,11 @@ def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
     lower = {"class_path": "Mixed", "init_args": {"data": [below] * len(inside), "epoch_size": 9}}
     words = ("--config", written(tmp_path / "lower.yaml", model="Tokenizer", data=lower))
     more = ("--config", written(tmp_path / "mixed.yaml", data=mixed))
-    flag = ("--data.data", json.dumps(parts))
-    for given, agents in (((*words, *more), 3), ((*words, *flag), 2), ((*words, "--data.data=" + flag[1]), 2)):
-        got = printed(capsys, "fit", *given)["data"]["init_args"]
+    flag, first = ("--data.data", json.dumps(parts)), f"--data.data={json.dumps(parts[:1])}"
+    for given, agents, count in ((more, 3, len(inside)), (flag, 2, len(inside)), ((first,), 2, 1)):
+        got = printed(capsys, "fit", *words, *given)["data"]["init_args"]
         found = [part["init_args"] for part in got.pop("data")]
-        assert found == [own(DATA[name]) | {"seed": 3} for name in inside]
+        assert found == [own(DATA[name]) | {"seed": 3} for name in inside[:count]]
         rest = own(DATA["Mixed"]) | {"max_agents": agents, "epoch_size": 9}
         assert got == {key: value for key, value in rest.items() if key != "data"}
 
