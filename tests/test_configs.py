@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
+import io
+import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,10 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from magnet import cli
-from magnet.cli.config_files import read_layers
+from magnet import checkpoints, cli
+from magnet.cli.checkpoint_config import LINKS, OWN_WAY
+from magnet.cli.config_files import merged, read_layers
 from magnet.datamodules import registry
 from magnet.sampling.presets import PRESETS
+from tests.options import DATA, MODELS, own
 
 ROOT = Path(__file__).parents[1] / "configs"
 PAPER = ROOT / "paper"
@@ -86,26 +91,60 @@ def is_part(options: dict[str, Any]) -> bool:
     return not is_sampling(options) and not ("model" in options and "data" in options)
 
 
-@pytest.fixture
-def resolved(capsys: pytest.CaptureFixture[str]):
-    """What would run, by every field of it, with a file as the only argument."""
-
-    def run(path: Path) -> dict[str, Any]:
-        command = "test" if is_sampling(said(path)) else "fit"
+@functools.cache
+def printed(path: Path) -> dict[str, Any]:
+    """What would run, with a file as the only argument."""
+    command = "test" if is_sampling(said(path)) else "fit"
+    with contextlib.redirect_stdout(io.StringIO()) as out:
         assert cli.main([command, "--config", str(path), "--print_config"]) == 0
-        return dict(leaves(yaml.safe_load(capsys.readouterr().out)))
+    return yaml.safe_load(out.getvalue())
 
-    return run
+
+def resolved(path: Path) -> dict[str, Any]:
+    """The same by every field."""
+    return dict(leaves(printed(path)))
 
 
 @pytest.mark.parametrize("path", [p for p in FILES if not is_part(said(p))], ids=relative)
-def test_what_a_configuration_says_is_what_would_run(path: Path, resolved) -> None:
+def test_what_a_configuration_says_is_what_would_run(path: Path) -> None:
     run = resolved(path)
     for place, value in leaves(said(path)):
         if place.endswith("class_path"):
             assert run[place].rpartition(".")[2] == value.rpartition(".")[2], place
         else:
             assert run[place] == (float(value) if isinstance(run[place], float) else value), place
+
+
+def told(path: Path) -> dict[str, Any]:
+    """What a file and those it extends say, merged as the command does: another class takes over nothing."""
+    return functools.reduce(merged, (layer.options for layer in layers(path)), {})
+
+
+def taken_over(name: str | None) -> dict[str, Any]:
+    """What a configuration that starts from a shipped model has from it."""
+    if name not in checkpoints.names():
+        return {}
+    stored = checkpoints.read(checkpoints.resolve(name))["hyper_parameters"]
+    return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if not is_part(said(p)) and not is_sampling(said(p))], ids=relative)
+def test_what_a_configuration_does_not_say_is_the_classes_own_default(path: Path) -> None:
+    options, got = told(path), printed(path)
+    fields, name = options["model"].get("init_args", {}), options["model"]["class_path"]
+    kind = MODELS[name] if name in MODELS else pkgutil.resolve_name(name)  # peers have no short names
+    model = merged(own(kind), merged(taken_over(fields.get("start_from")), fields))
+    assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
+
+    def whole(spec: dict[str, Any]) -> dict[str, Any]:
+        options = merged(own(DATA[spec["class_path"]]), spec.get("init_args", {}))
+        return options | ({"data": [whole(part) for part in options["data"]]} if "data" in options else {})
+
+    def plain(options: dict[str, Any]) -> dict[str, Any]:
+        parts = options.get("data")
+        return options | ({"data": [plain(part["init_args"]) for part in parts]} if parts else {})
+
+    assert plain(got["data"]["init_args"]) == whole(options["data"])
 
 
 @pytest.mark.parametrize("path", [p for p in FILES if is_part(said(p))], ids=relative)
@@ -130,7 +169,7 @@ def test_a_configuration_of_the_paper_says_what_it_needs_and_costs(path: Path) -
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -> None:
+def test_the_papers_five_data_sets_are_trained_as_it_says(name: str) -> None:
     """Paper 3, 4, A.3, A.4 and Table A.2; 64 frames are the released code's."""
     tokenizer, denoiser = (resolved(PAPER / f"{name}_{what}.yaml") for what in ("tokenizer", "denoiser"))
     assert (tokenizer["trainer.max_steps"], denoiser["trainer.max_steps"]) == (100_000, 300_000)
@@ -157,7 +196,7 @@ def test_the_papers_five_data_sets_are_trained_as_it_says(name: str, resolved) -
 
 
 @pytest.mark.parametrize(("table", "row"), [(table, row) for table, rows in ROWS.items() for row in rows])
-def test_a_row_of_a_table_changes_only_what_it_is_about(table: str, row: str, resolved) -> None:
+def test_a_row_of_a_table_changes_only_what_it_is_about(table: str, row: str) -> None:
     path = PAPER / "ablations" / f"{row}.yaml"
     base = PAPER / ("sampling.yaml" if table == "Table A.6" else "duobox_denoiser.yaml")
     changed, full = resolved(path), resolved(base)

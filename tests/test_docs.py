@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import pkgutil
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -34,15 +35,22 @@ def model() -> magnet.api.Model:
     return magnet.load("duet", steps=1)
 
 
-@pytest.fixture
-def files(model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The files that pages read lie in the working directory."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def made(model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the files that pages read."""
+    folder = tmp_path_factory.mktemp("made")
     duet = model.generate(people=2, frames=64, seed=0)
-    duet.save("dance.npz")
+    duet.save(folder / "dance.npz")
     for slot, letter in enumerate("AB"):
         one = duet.replace(present=duet.present & (duet.present.cumsum(dim=1) == slot + 1))
-        Path(one.save(f"take_{letter}.bvh")).rename(f"take_{letter}.bvh")
+        Path(one.save(folder / f"take_{letter}.bvh")).rename(folder / f"take_{letter}.bvh")
+    return folder
+
+
+@pytest.fixture
+def files(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The files that pages read lie in the working directory."""
+    monkeypatch.chdir(shutil.copytree(made, tmp_path / "here"))
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ FOLDERS = ("magnet", "tests", "examples", "scripts", "benchmarks")
 
 
 @functools.cache
-def parsed(folder: str) -> list[tuple[Path, str, ast.Module]]:
+def parsed(folder: str) -> list[tuple[Path, str, list[ast.AST]]]:
+    """Path, text and all nodes of each file of a folder."""
     texts = [(path, path.read_text(encoding="utf-8")) for path in sorted((ROOT / folder).rglob("*.py"))]
-    return [(path.relative_to(ROOT), text, ast.parse(text)) for path, text in texts]
+    return [(path.relative_to(ROOT), text, list(ast.walk(ast.parse(text)))) for path, text in texts]
 
 
 def test_no_file_is_longer_than_a_reader_keeps_in_mind() -> None:
@@ -27,8 +28,8 @@ def test_no_function_is_longer_than_a_screen() -> None:
     long = {
         f"{path}:{node.lineno} {node.name}": lines
         for folder in FOLDERS
-        for path, _, tree in parsed(folder)
-        for node in ast.walk(tree)
+        for path, _, nodes in parsed(folder)
+        for node in nodes
         if isinstance(node, functions) and (lines := node.end_lineno - node.lineno + 1) > MOST_FUNCTION_LINES
     }
     assert not long
@@ -37,8 +38,8 @@ def test_no_function_is_longer_than_a_screen() -> None:
 def test_the_frame_rate_of_models_is_written_once() -> None:
     written = [
         f"{path}:{default.lineno}"
-        for path, _, tree in parsed("magnet")
-        for node in ast.walk(tree)
+        for path, _, nodes in parsed("magnet")
+        for node in nodes
         for name, default in defaults(node)
         if name in ("fps", "FPS") and isinstance(default, ast.Constant) and default.value == 30
     ]
@@ -49,8 +50,8 @@ def test_joints_are_written_by_name() -> None:
     """`magnet.body.joints` has a name for each: no table of joints says 16 for a shoulder."""
     bare = [
         f"{path}:{node.lineno}"
-        for path, _, tree in parsed("magnet")
-        for node in ast.walk(tree)
+        for path, _, nodes in parsed("magnet")
+        for node in nodes
         if isinstance(node, ast.Dict) and len(node.keys) > 4
         if all(isinstance(key, ast.Constant) and isinstance(key.value, int) and key.value < 22 for key in node.keys)
     ]
@@ -73,10 +74,10 @@ def private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("_")
 
 
-def defined(tree: ast.Module) -> set[str]:
+def defined(nodes: list[ast.AST]) -> set[str]:
     """Names that a file gives to functions, classes, variables and attributes."""
     made = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             made.add(node.name)
         elif isinstance(node, (ast.Attribute, ast.Name)) and isinstance(node.ctx, ast.Store):
@@ -84,9 +85,9 @@ def defined(tree: ast.Module) -> set[str]:
     return made
 
 
-def reached_for(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def reached_for(nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
     """Private names that a file imports, reads of something, or names to `monkeypatch.setattr`, with the line."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom):
             words = [*(node.module or "").split("."), *(name.name for name in node.names)]
         elif isinstance(node, ast.Attribute):
@@ -100,12 +101,12 @@ def reached_for(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def test_no_test_reaches_for_a_private_name_of_the_package() -> None:
-    ours = {name for _, _, tree in parsed("magnet") for name in defined(tree) if private(name)}
+    ours = {name for _, _, nodes in parsed("magnet") for name in defined(nodes) if private(name)}
     found = [
         f"{path}:{line} {name}"
-        for path, _, tree in parsed("tests")
-        for own in [defined(tree)]
-        for line, name in reached_for(tree)
+        for path, _, nodes in parsed("tests")
+        for own in [defined(nodes)]
+        for line, name in reached_for(nodes)
         if name in ours and name not in own
     ]
     assert not found

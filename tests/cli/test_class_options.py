@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 import itertools
 import json
 import operator
-import pkgutil
 import re
 import shlex
 from collections.abc import Iterable, Sequence
@@ -19,57 +17,18 @@ import pytest
 import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
 
-from magnet import checkpoints, cli
-from magnet.cli import class_options, train
-from magnet.cli.checkpoint_config import LINKS, OWN_WAY
-from magnet.cli.config_files import Layer, merged, read_layers
+from magnet import cli
+from magnet.cli import class_options
+from magnet.cli.checkpoint_config import LINKS
+from magnet.cli.config_files import Layer
 from magnet.cli.main import TRAINER_COMMANDS
 from magnet.tasks import registry as task_registry
 from tests.cases import some_slow
+from tests.options import DATA, MODELS, own, plain
 from tests.toys import OtherData, ToyData, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
-MODELS, DATA = train.named_classes()
 TASKS = {entry.name: entry.kind for entry in task_registry.entries()}
-
-
-def told(config: Path) -> dict[str, Any]:
-    """What a configuration and those that it extends say together."""
-    options: dict[str, Any] = {}
-    for layer in read_layers(str(config)):
-        options = merged(options, layer.options)
-    return options
-
-
-RUNS = [
-    config
-    for config in sorted(Path(__file__).parents[2].joinpath("configs").rglob("*.yaml"))
-    if {"model", "data"} <= told(config).keys() and "sampler" not in told(config)
-]
-"""Trainings; parts of them and ways of sampling are held to what they say in test_configs.py."""
-
-ABLATIONS = [
-    config
-    for config in RUNS
-    if config.parent.name in ("report", "ablations") and config.stem not in ("base", "no_vqvae", "peer_remos")
-]
-"""Trainings that change an option or two of another one of these."""
-
-
-def own(kind: type, package: str = "magnet") -> dict[str, Any]:
-    """A class's arguments and their defaults, from the signatures of itself and its bases, nearest first."""
-    found: dict[str, Any] = {}
-    for base in kind.__mro__:
-        if "__init__" in vars(base) and base.__module__.split(".")[0] in (package, "magnet"):
-            for name, parameter in list(inspect.signature(base.__init__).parameters.items())[1:]:
-                if parameter.kind is not parameter.VAR_KEYWORD:
-                    found.setdefault(name, parameter.default)
-    return plain({name: None if value is inspect.Parameter.empty else value for name, value in found.items()})
-
-
-def plain(value: Any) -> Any:
-    """As YAML has it: lists for tuples, mappings for dataclasses."""
-    return json.loads(json.dumps(value, default=dataclasses.asdict))
 
 
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
@@ -180,35 +139,6 @@ def test_callbacks_have_their_own_defaults(tmp_path: Path, capsys: pytest.Captur
         assert callback["init_args"] == expected
     (callback,) = printed(capsys, "fit", "--config", upper, "--config", lower)["trainer"]["callbacks"]
     assert callback["init_args"] == own(ModelCheckpoint, "lightning") | kept["init_args"]
-
-
-def taken_over(name: str | None) -> dict[str, Any]:
-    """What a configuration that starts from a shipped model has from it."""
-    if name not in checkpoints.names():
-        return {}
-    stored = checkpoints.read(checkpoints.resolve(name))["hyper_parameters"]
-    return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
-
-
-@pytest.mark.parametrize("config", some_slow(RUNS, *ABLATIONS), ids=lambda path: path.stem)
-def test_a_configuration_of_the_repository_runs_what_it_says(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = told(config)
-    got = printed(capsys, "fit", "--config", str(config))
-    fields = said["model"].get("init_args", {})
-    name = said["model"]["class_path"]
-    kind = MODELS[name] if name in MODELS else pkgutil.resolve_name(name)  # peers have no short names
-    model = merged(own(kind), merged(taken_over(fields.get("start_from")), fields))
-    assert got["model"]["init_args"] == {key: value for key, value in model.items() if key not in LINKS.values()}
-
-    def resolved(spec: dict[str, Any]) -> dict[str, Any]:
-        options = merged(own(DATA[spec["class_path"]]), spec.get("init_args", {}))
-        return options | ({"data": [resolved(part) for part in options["data"]]} if "data" in options else {})
-
-    def plain(options: dict[str, Any]) -> dict[str, Any]:
-        parts = options.get("data")
-        return options | ({"data": [plain(part["init_args"]) for part in parts]} if parts else {})
-
-    assert plain(got["data"]["init_args"]) == resolved(said["data"])
 
 
 PAGES = [Path(__file__).parents[2] / "README.md", *sorted(Path(__file__).parents[2].glob("docs/*.md"))]
