@@ -59,7 +59,7 @@ def test_small_groups_are_sampled_as_ever_bit_for_bit(model: Denoiser, task: str
 @pytest.mark.parametrize("task", ["joint_future", "motion_control", "inbetweening"])
 def test_a_crowd_costs_a_view_a_person_and_no_more(model: Denoiser, task: str) -> None:
     fields = {"motion_control": {"target": (0, 5)}}.get(task, FIELDS.get(task, {}))
-    for people in (6, 24):
+    for people in (6, 12):
         stats = SamplingStats()
         scene = crowd(people, 24)
         made = generate_crowd(model, scene, registry.get(task)(**fields), 8, 16, 1, QUICK, seeded(), stats=stats)
@@ -230,16 +230,16 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
 
 @pytest.mark.parametrize("frames", [16, 40])
 def test_a_crowd_is_made_from_nothing_in_its_slots_and_of_its_shapes(model: Denoiser, frames: int) -> None:
-    scene = crowd(7, 4)
-    betas = torch.randn(1, 7, 10, generator=torch.Generator().manual_seed(0))
-    scene = scene.replace(present=torch.arange(7)[None] != 2, betas=betas)
+    scene = crowd(5, 4)
+    betas = torch.randn(1, 5, 10, generator=torch.Generator().manual_seed(0))
+    scene = scene.replace(present=torch.arange(5)[None] != 2, betas=betas)
     generation = registry.get("generation")()
     made = generate_crowd(model, scene, generation, 0, frames, 2, QUICK, seeded())
-    assert (made.scenes, made.frames, made.agents) == (2, frames, 7)
+    assert (made.scenes, made.frames, made.agents) == (2, frames, 5)
     assert torch.equal(made.present, scene.present.expand(2, -1)) and torch.equal(made.betas[1], betas[0])
     assert not bool(made.given.any()), "nothing was given"
     ground = made.T_world_root[0, 0, scene.present[0]][:, [0, 2], 3]
-    assert (torch.cdist(ground, ground) + 99 * torch.eye(6)).min() > 0.01
+    assert (torch.cdist(ground, ground) + 99 * torch.eye(4)).min() > 0.01
     assert not torch.equal(made.T_world_root[0], made.T_world_root[1])
     again = generate_crowd(model, scene, generation, 0, frames, 2, QUICK, seeded())
     assert torch.equal(made.T_world_root, again.T_world_root)

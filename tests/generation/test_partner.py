@@ -102,7 +102,7 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(model, 
 )
 def test_answers_are_what_motion_control_gives_bit_for_bit(model, block, options):
     """Live and offline score the same: fed as it comes, or all known at once."""
-    scene, past = random_scene(2, 88, 3, torch.Generator().manual_seed(7)), 16
+    scene, past = random_scene(2, 64, 3, torch.Generator().manual_seed(7)), 16
     task, frames = MotionControl((0, 2), block), scene.frames - past
     whole = generate(model, scene, task, past, frames, 1, options, torch.Generator().manual_seed(1))
     partner = Partner(model, scene.slice(0, past), (0, 2), options, torch.Generator().manual_seed(1), block)

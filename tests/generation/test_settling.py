@@ -32,7 +32,7 @@ from tests.cases import some_slow
 BOTH = SamplerOptions(
     steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="hold", settle_blocks=True, smooth_path=True
 )
-GRID = Grid(12, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
+GRID = Grid(10, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
 
 
 def run(model, scene: Scene, name: str, options: SamplerOptions, **more) -> Scene:
