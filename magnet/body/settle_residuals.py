@@ -85,16 +85,19 @@ def residuals_of(
     return Residuals(node, bone, point, *(other or (node, bone, point)), along, value, weight, two, one_sided)
 
 
-def all_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor, stand: float = 1.0) -> Residuals:
-    """All unmet wishes of people who can move. free (B, T, P) bool; stand: factor for the cost of feet that move."""
+def all_residuals(
+    seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor, stand: float = 1.0, hard: float = 1.0
+) -> Residuals:
+    """All unmet wishes of people who can move. free (B, T, P) bool; stand, hard: see `Settle`."""
+    between, floats = between_residuals(seen, capsules, wishes), float_residuals(seen, wishes)
     parts = [
-        between_residuals(seen, capsules, wishes),
+        replace(between, root_weight=between.root_weight * hard**0.5),
         within_residuals(seen, capsules, wishes),
         hold_residuals(seen, wishes),
         stand_residuals(seen, wishes, stand),
         height_residuals(seen, wishes),
         floor_residuals(seen, wishes),
-        float_residuals(seen, wishes),
+        replace(floats, root_weight=floats.root_weight * hard**0.5),
     ]
     residuals, can = cat(parts), free.flatten()
     return residuals.kept(can[residuals.node] | (can[residuals.other] & (residuals.two > 0)))

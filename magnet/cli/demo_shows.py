@@ -73,7 +73,7 @@ SHOWS = (
     Show("joint_future", "three people's future, from a second of their past", JointFuture(), ("circle", 3)),
     Show("duet", "two people from nothing", Generation(), ("handshake", 2), context=0),
     Show("quartet", "four people from nothing", Generation(), ("follow", 4), context=0),
-    Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("handshake", 2), context=0),
+    Show("partner", "a partner filled in: A is generated, B given", PartnerInpainting(), ("patty_cake", 2), context=0),
     Show("turns", "two agents that take turns", AgenticAsync(0.5, block=4), ("circle", 2)),
     Show("minute", "a minute from a second", JointFuture(), (MADE, 2), frames=LONG, stabilization_level=STEADY),
 )

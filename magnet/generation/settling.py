@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.body.apart import Apart, excess_depth
 from magnet.body.holding import holds
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
@@ -25,8 +26,14 @@ BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 FINISHED = Settle(iterations=8, inner=24, bend=100.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too (docs/tasks.md)."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0)
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
+
+PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, stand=16.0, hard=20.0)
+"""How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
+
+LEFT = Apart(body=0.07, arms=0.07)
+"""Metres of depth that `SHOWN` may leave."""
 
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
@@ -154,6 +161,38 @@ def hands_held(scene: Scene, body: Body) -> Tensor:
     return holds(body.joints(scene.slice(scene.frames - 1)), scene.present)[0][:, -1]
 
 
+def own_correction(
+    seen: Scene,
+    body: Body,
+    how: str,
+    fixed: Tensor,
+    begun: bool,
+    past: Tensor | None,
+    holding: Tensor | None,
+    last: tuple[Tensor, Tensor] | None,
+) -> Tensor:
+    """How one person's next frames are corrected (`SHOWN`), and anew where that leaves people deep in each other.
+
+    Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
+    """
+    offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
+    deep = left_deep(corrected(seen, offset), body)
+    if bool(deep.any()):
+        before, hold = (None if each is None else each[deep] for each in (past, holding))
+        ends = None if last is None else (last[0][deep], last[1][deep])
+        few = seen.select(deep.nonzero()[:, 0])
+        offset[deep] = settling(few, body, how, fixed, PRESSED, begun, before, holding=hold, last=ends)
+    return offset
+
+
+def left_deep(scene: Scene, body: Body) -> Tensor:
+    """In which scenes two people are deeper in each other than `LEFT` in some frame. -> (B,) bool"""
+    joints = body.joints(scene)
+    first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
+    both = (scene.present[:, first] & scene.present[:, second])[:, None]
+    return ((excess_depth(joints[:, :, first], joints[:, :, second], LEFT) > 0) & both).flatten(1).any(dim=1)
+
+
 def settled_on(
     scene: Scene,
     before: Scene | None,
@@ -192,7 +231,7 @@ def settled_on(
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = settling(seen, body, how, ~(new & who), SHOWN, known is not None, past, holding=holding, last=last)
+        one = own_correction(seen, body, how, ~(new & who), known is not None, past, holding, last)
         offset[:, :, who] = one[:, :, who]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset

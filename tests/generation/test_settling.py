@@ -160,6 +160,36 @@ def test_feet_shown_standing_stay_there_block_after_block() -> None:
     assert float(toes.diff(dim=0).abs().max()) < 0.005
 
 
+def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Scene:
+    """Shown block by block: the model lets A walk through B, who stands. Scenes but the first: A stands, too."""
+    still = standing(scenes, frames, 2, torch.device("cpu"))
+    root = still.T_world_root.clone()
+    root[:, :, 0, 0, 3], root[:, :, 0, 2, 3] = root[:, :, 1, 0, 3] - 0.8, root[:, :, 1, 2, 3]
+    root[0, :, 0, 0, 3] += speed / 30 * (torch.arange(frames) - block).clamp(min=0)
+    walking, body = still.replace(T_world_root=root), load_body()
+    new = torch.tensor([True, False]).expand(2 * block, -1)
+    shown, past, plain = [walking.slice(0, block)], None, None
+    for start in range(block, frames - block, block):
+        ahead = walking.slice(start, start + 2 * block)
+        made, offset = settled_on(ahead, shown[-1], new, ~new[0], "firm", past, plain)
+        shown.append(made.slice(0, block))
+        past, plain = offset[:, block - 2 : block], ahead.slice(block - 2, block)
+    return cat_time(shown).replace(body=body.id)
+
+
+@pytest.mark.parametrize("speed", [1.0, 1.5])
+def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
+    joints = load_body().joints(walked_on(1, speed))[0]
+    assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08
+
+
+def test_corrections_made_anew_in_one_scene_change_no_other() -> None:
+    two, one = walked_on(2, 1.0, frames=28), walked_on(1, 1.0, frames=28)
+    torch.testing.assert_close(two.select(torch.tensor([0])).T_world_root, one.T_world_root, rtol=0, atol=1e-5)
+    still = walked_on(2, 0.0, frames=28)
+    torch.testing.assert_close(two.T_world_root[1], still.T_world_root[1], rtol=0, atol=1e-5)
+
+
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
     scene = random_scene(2, 24, 3, torch.Generator().manual_seed(0))
     root = scene.T_world_root.clone()
