@@ -62,6 +62,7 @@ class Settle:
         tilt: factor for turning the whole body or the back.
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
+        hold: factor for the cost of held hands that part.
         hard: factor for the cost of what must not be: depth between people, feet over the floor.
     """
 
@@ -74,6 +75,7 @@ class Settle:
     tilt: float = 3.0
     most: float = 0.15
     stand: float = 1.0
+    hold: float = 1.0
     hard: float = 1.0
 
 
@@ -332,7 +334,7 @@ def correct_window(
         now = corrected(scene, offset)
         R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)
-        residuals = all_residuals(seen, capsules, wishes, free, settle.stand, settle.hard)
+        residuals = all_residuals(seen, capsules, wishes, free, settle.stand, settle.hold, settle.hard)
         if not len(residuals.node):
             break
         if ramp:

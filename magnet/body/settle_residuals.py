@@ -86,21 +86,31 @@ def residuals_of(
 
 
 def all_residuals(
-    seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor, stand: float = 1.0, hard: float = 1.0
+    seen: Seen,
+    capsules: FittedCapsules,
+    wishes: Wishes,
+    free: Tensor,
+    stand: float = 1.0,
+    hold: float = 1.0,
+    hard: float = 1.0,
 ) -> Residuals:
-    """All unmet wishes of people who can move. free (B, T, P) bool; stand, hard: see `Settle`."""
-    between, floats = between_residuals(seen, capsules, wishes), float_residuals(seen, wishes)
+    """All unmet wishes of people who can move. free (B, T, P) bool; stand, hold, hard: see `Settle`."""
     parts = [
-        replace(between, root_weight=between.root_weight * hard**0.5),
+        weighted(between_residuals(seen, capsules, wishes), hard),
         within_residuals(seen, capsules, wishes),
-        hold_residuals(seen, wishes),
+        weighted(hold_residuals(seen, wishes), hold),
         stand_residuals(seen, wishes, stand),
         height_residuals(seen, wishes),
         floor_residuals(seen, wishes),
-        replace(floats, root_weight=floats.root_weight * hard**0.5),
+        weighted(float_residuals(seen, wishes), hard),
     ]
     residuals, can = cat(parts), free.flatten()
     return residuals.kept(can[residuals.node] | (can[residuals.other] & (residuals.two > 0)))
+
+
+def weighted(residuals: Residuals, factor: float) -> Residuals:
+    """The residuals with their cost times a factor."""
+    return replace(residuals, root_weight=residuals.root_weight * factor**0.5)
 
 
 def touching(
@@ -239,8 +249,7 @@ def kept_on_floor(
     node, bone, point = (x.repeat_interleave(2, dim=0) for x in (node, bone, point))
     off = (point[::2, [0, 2]] - place).flatten()
     along = axes(1, point)[[0, 2]].repeat(len(place), 1)
-    part = residuals_of("stand", node, bone, point, along, off, other)
-    return replace(part, root_weight=part.root_weight * cost**0.5)
+    return weighted(residuals_of("stand", node, bone, point, along, off, other), cost)
 
 
 def height_residuals(seen: Seen, wishes: Wishes) -> Residuals:

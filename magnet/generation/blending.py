@@ -17,6 +17,9 @@ SPRING = 5.0
 """Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
 put elsewhere slide for longer. With `blend` 20 a difference is halved in 7 frames."""
 
+GAINS = 2.0
+"""Frames within which people who go on stop to gain or lose speed as they did (docs/training.md)."""
+
 QUICK = 0.03
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
 
@@ -176,27 +179,29 @@ def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left
 
 
 def gone_on(before: Tensor, path: Tensor, blend: int) -> Tensor:
-    """A path that begins as fast as the one before it went; the difference in speed fades within `blend` frames.
+    """A path that goes on as the one before it went; its own speed takes over within `blend` frames.
 
-    Networks predict the first deltas after what is given too coarsely: how fast people go and turn would jump.
+    Networks predict the first deltas after what is given too coarsely: how fast people go and turn would jump. What
+    people are ahead or behind of the path by then stays, since they go on from where they are.
 
     Args:
-        before: (B, 2, P, 4, 4) canonical frames of the last known frames.
-        path: (B, T, P, 4, 4) those after them, T at least 2.
+        before: (B, 4, P, 4, 4) canonical frames of the last known frames.
+        path: (B, T, P, 4, 4) those after them.
         blend: frames.
 
     Returns:
         (B, T, P, 4, 4).
     """
-    near = torch.cat([before, path[:, :2]], dim=1).double()
-    yaw, ground = to_planar(near)
+    yaw, ground = to_planar(torch.cat([before, path], dim=1).double())
     turns = yaw.diff(dim=1)
-    steps = torch.cat([torch.atan2(turns.sin(), turns.cos())[..., None], ground.diff(dim=1)], dim=-1)  # (B, 3, P, 3)
-    change = steps[:, :1] - steps[:, 1:].mean(dim=1, keepdim=True)
-    since = torch.arange(1, path.shape[1] + 1, device=path.device, dtype=change.dtype)
-    off = (since * (1 - since / blend).clamp(0, 1) ** 2)[:, None, None] * change
-    yaw, ground = to_planar(path.double())
-    return from_planar(yaw + off[..., 0], ground + off[..., 1:]).to(path)
+    steps = torch.cat([torch.atan2(turns.sin(), turns.cos())[..., None], ground.diff(dim=1)], dim=-1)
+    known = before.shape[1] - 1
+    gain = (steps[:, known - 1] - steps[:, 0]) / (known - 1)  # (B, P, 3) a frame
+    since = torch.arange(1, path.shape[1] + 1, device=path.device, dtype=steps.dtype)[:, None, None]
+    onward = steps[:, known - 1, None] + GAINS * (1 - torch.exp(-since / GAINS)) * gain[:, None]
+    share = (1 - since / blend).clamp(0, 1) ** 2
+    off = (share * (onward - steps[:, known:])).cumsum(dim=1)
+    return from_planar(yaw[:, known + 1 :] + off[..., 0], ground[:, known + 1 :] + off[..., 1:]).to(path)
 
 
 def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Scene:

@@ -39,7 +39,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
 
-GOES_ON = 20
+GOES_ON = 18
 """Frames in which people who were given come from the speed they had to the one predicted (docs/training.md)."""
 
 
@@ -289,7 +289,7 @@ class WorldState:
         if not first or not self.options.smooth_path or not bool(self.known[first - 1].any()):
             return placed
         onward = self.known[first - 1] & ~self.known[stop] if stop < len(self.known) else self.known[first - 1]
-        before = self.T_world_can[:, first * TOKEN_FRAMES - 2 : first * TOKEN_FRAMES]
+        before = self.T_world_can[:, (first - 1) * TOKEN_FRAMES : first * TOKEN_FRAMES]
         return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed, GOES_ON), placed)
 
     def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:

@@ -114,24 +114,35 @@ def test_generated_poses_leave_given_ones_as_fast_as_these_turn(pair):
     assert torch.allclose(step[:, 21:], torch.tensor(-0.01), atol=1e-5)  # twelve frames on nothing is left
 
 
-def test_people_go_on_as_fast_as_they_went_and_end_where_they_would_have():
-    """Known: 5 cm and 0.03 rad a frame, the yaw through a half turn; predicted: standing."""
-    before = from_planar(torch.tensor([3.12, 3.15]), torch.tensor([[0.0, 0.0], [0.03, 0.04]]))[None, :, None]
-    path = from_planar(torch.full((30,), 3.15), torch.tensor([0.03, 0.04]).expand(30, 2))[None, :, None]
+def test_people_go_on_as_they_went_until_they_go_as_predicted():
+    """Known: 5 cm and 0.03 rad a frame, the yaw through a half turn; predicted: standing. What they went by stays."""
+    time = torch.arange(4.0)
+    before = from_planar(3.09 + 0.03 * time, 0.05 * time[:, None] * torch.tensor([0.6, 0.8]))[None, :, None]
+    path = before[:, -1:].expand(1, 30, 1, 4, 4)
     made = gone_on(before, path, 10)
-    yaw, ground = to_planar(torch.cat([before, made], dim=1)[0, :, 0])
+    yaw, ground = to_planar(torch.cat([before[:, -2:], made], dim=1)[0, :, 0])
     pace, turn = ground.diff(dim=0).norm(dim=-1), torch.atan2(yaw.diff().sin(), yaw.diff().cos())
-    assert pace[0] == pytest.approx(0.05) and turn[0] == pytest.approx(0.03, abs=1e-5)
-    assert 0.035 < pace[1] < 0.05 and 0.021 < turn[1] < 0.03
-    assert (turn[1:4].diff() < 0).all()  # ever slower, then back
-    assert torch.allclose(made[:, 9:], path[:, 9:], atol=1e-5)
+    share = (1 - torch.arange(31.0) / 10).clamp(min=0) ** 2
+    assert torch.allclose(pace, 0.05 * share, atol=1e-6) and torch.allclose(turn, 0.03 * share, atol=1e-5)
     steady = gone_on(before, gone_on(before, path, 10), 10)
     assert (steady - made).abs().max() < (made - path).abs().max()
 
 
+def test_people_who_gain_speed_go_on_gaining_for_a_moment():
+    """1, 2 and 3 cm a frame; predicted is what they have, so that all that is added is what they gain."""
+    before = from_planar(torch.zeros(4), torch.tensor([[0.0, 0.0], [0.01, 0.0], [0.03, 0.0], [0.06, 0.0]]))[
+        None, :, None
+    ]
+    even = 0.06 + 0.03 * torch.arange(1, 31.0)[:, None]
+    path = from_planar(torch.zeros(30), even * torch.tensor([1.0, 0.0]))[None, :, None]
+    pace = to_planar(torch.cat([before[:, -1:], gone_on(before, path, 10)], dim=1)[0, :, 0])[1][:, 0].diff()
+    assert 0.03 < pace[0] < 0.04 and pace[:3].max() < 0.045
+    assert torch.allclose(pace[10:], torch.tensor(0.03), atol=1e-6)
+
+
 def test_a_path_that_goes_on_evenly_stays():
     walk = path(*(0.04 * k for k in range(12)))
-    assert torch.allclose(gone_on(walk[:, :2], walk[:, 2:], 20), walk[:, 2:], atol=1e-6)
+    assert torch.allclose(gone_on(walk[:, :4], walk[:, 4:], 20), walk[:, 4:], atol=1e-6)
 
 
 def test_without_blending_only_given_frames_are_put_back(pair):
