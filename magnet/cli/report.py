@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from magnet.cli.flags import PlainParser
 
@@ -77,6 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         given.configs,
         given.ckpt_path,
         plan.budget.speed_rounds,
+        told(run_folder.provenance()["git"]),
         own_data,
     )
     wanted = [cell for cell in cells if held(cell.name, given.only) and not held(cell.name, given.skip)]
@@ -96,6 +98,11 @@ def main(arguments: Sequence[str] = ()) -> int:
     store.pack()
     print(f"written: {written}, report.json and cells.json")
     return int(bool(runner.failed))
+
+
+def told(git: Mapping[str, Any] | None) -> str:
+    """A state of the source tree: its short commit, and a plus where files were changed; empty where none is known."""
+    return "" if git is None else git["commit"][:7] + "+" * git["changed"]
 
 
 def held(name: str, texts: Sequence[str]) -> bool:

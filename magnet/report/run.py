@@ -34,6 +34,7 @@ class Runner:
         configs: folder of configurations to train.
         shipped: checkpoint that speeds are compared with.
         rounds: of a speed.
+        code: commit of the code that runs them; empty where there is none.
         data: file of data options that trainings see in place of their own; None: their own.
         say: is told each line of progress.
     """
@@ -43,6 +44,7 @@ class Runner:
     configs: Path
     shipped: str
     rounds: int = 3
+    code: str = ""
     data: Path | None = None
     say: Callable[[str], None] = print
     failed: dict[Cell, str] = field(default_factory=dict)
@@ -84,13 +86,14 @@ class Runner:
                 self.say(f"  not done: {self.failed[cell]}")
 
     def _run(self, cell: Cell) -> None:
-        began = time.perf_counter()
+        began, worked = time.perf_counter(), time.process_time()
         if cell.kind == "train":
             result = {"rows": {}, "checkpoint": str(self._train(cell).relative_to(self.store.folder))}
         else:
             where = (self._weights(cell), self.shipped, self.rounds, self.store.film(cell))
             result = dict(measure.run(cell, *where))
-        self.store.put(cell, {**result, "seconds": round(time.perf_counter() - began, 1)})
+        took = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
+        self.store.put(cell, {**result, **{name: round(each, 1) for name, each in took.items()}, "code": self.code})
 
     def _weights(self, cell: Cell) -> str | None:
         if cell.model is None:
