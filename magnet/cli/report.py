@@ -11,9 +11,9 @@ from magnet.cli.flags import PlainParser
 
 EPILOG = """\
 TABLE is 2, 3, 4, 5, A.3, A.4, A.5, A.6, Fig.7, own (choices of ours), leak (what partner tasks gain by the reference's
-reading) or all; several may be named. A table is made of cells: a measurement with one seed, or a training. Those that
-are done are kept in OUT/cells, one file each, so a run that was stopped goes on where it was, a training from its last
-checkpoint.
+reading), benchmark (the open one, as magnet score measures it) or all; several may be named. A table is made of cells:
+a measurement with one seed, or a training. Those that are done are kept in OUT/cells, one file each, so a run that was
+stopped goes on where it was, a training from its last checkpoint.
 
 for example:
   magnet report 3 --dry_run            the cells of Table 3, and how long they may take

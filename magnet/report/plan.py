@@ -87,6 +87,8 @@ class ReportOptions:
         data: name or file of test scenes of two people.
         checkpoint: of our model.
         only_shipped: leave out what has to be trained.
+        configs: folder of the trainings' configurations.
+        own_seeds: in place of 0, 1, ...
     """
 
     budget: Budget
@@ -94,6 +96,7 @@ class ReportOptions:
     checkpoint: str = SHIPPED
     only_shipped: bool = False
     configs: Path = Path("configs/report")
+    own_seeds: tuple[int, ...] = ()
 
     def row(self, title: str, task: str, config: str = "", kind: Kind = "measure", **options: Any) -> Row | None:
         """A row of our checkpoint, or of a configuration that is trained; None where no training is wanted."""
@@ -104,12 +107,17 @@ class ReportOptions:
             model = Weights(config=config, steps=self.budget.steps, batch=self.budget.batch, digest=digest)
         else:
             model = Weights(self.checkpoint, digest=digest_of_weights(self.checkpoint))
-        seeds = 1 if kind == "speed" else self.budget.seeds  # a speed has rounds, and does not depend on the draw
-        return Row(title, tuple(self._cell(kind, seed, model, task, **options) for seed in range(seeds)))
+        seeds = self.seeds[:1] if kind == "speed" else self.seeds  # a speed has rounds, and does not depend on the draw
+        return Row(title, tuple(self._cell(kind, seed, model, task, **options) for seed in seeds))
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of sampling or training."""
+        return self.own_seeds or tuple(range(self.budget.seeds))
 
     def floors(self, task: str, among: Iterable[str] = FLOORS, **options: Any) -> list[Row]:
         """Rows without a model; all but RS are the same for every seed, so one is enough."""
-        cell = self._cell("measure", 0, None, task, **options)
+        cell = self._cell("measure", self.seeds[0], None, task, **options)
         return [Row(name, (cell,), name) for name in among]
 
     def _cell(self, kind: Kind, seed: int, model: Weights | None, task: str, **options: Any) -> Cell:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from magnet.cli.train import run_trainer
 from magnet.denoiser.module import Denoiser
 from magnet.report import measure, run
 from magnet.report.cells import Cell, Store, Weights
+from magnet.report.made import by_code, took
 from magnet.report.page import page
 from magnet.report.run import Runner
 from magnet.report.summary import missing, summary
@@ -243,6 +245,44 @@ def test_a_report_goes_on_from_packed_cells_and_trains_again_only_what_is_wanted
     assert runner.store.of_kind("measure") == [2.0]
     assert not runner.missing([first.needs, first])
     assert runner.missing([first.needs, first, second]) == [first.needs, second]
+
+
+def test_the_page_says_what_its_cells_took_and_which_code_ran_them() -> None:
+    training = Cell("train", 0, model=Weights(config="base"))
+    cells = [training, CELL, replace(CELL, seed=1), replace(CELL, seed=2), replace(CELL, model=None)]
+    found = [
+        {"seconds": 3600.0, "code": "1a2b3c4"},
+        {"seconds": 600.0, "processor_seconds": 120.0, "code": "5d6e7f8"},
+        {"seconds": 1200.0, "processor_seconds": 240.0, "code": "5d6e7f8"},
+        {"seconds": 60.0},
+        {"seconds": 0.0, "code": ""},
+    ]
+    done = dict(zip(cells, found, strict=True))
+    assert took(done) == {
+        "time on the clock": "5 cells, one after another: 1:31 h (measure 4 in 0:31 h, train 1 in 1:00 h)",
+        "processor time": "0:06 h of the 2 cells that kept it",
+    }
+    assert by_code(done)[-4:-1] == [
+        "- 5d6e7f8: 2 cells (measure duet 2)",
+        "- 1a2b3c4: 1 cells (train base 1)",
+        "- code that was not kept: 2 cells (measure duet 1, measure floors 1)",
+    ]
+    assert took({}) == {} and by_code({}) == []
+
+
+def test_a_cell_keeps_the_code_and_the_time_that_it_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(*arguments: Any) -> dict[str, Any]:
+        end = time.process_time() + 0.15
+        while time.process_time() < end:
+            pass
+        return made_up(*arguments)
+
+    monkeypatch.setattr(measure, "run", work)
+    store = Store(tmp_path)
+    Runner(store, lambda _: 0, PLAN.configs, "duet", code="1a2b3c4+", say=lambda _: None).run([CELL])
+    content = Store(tmp_path).get(CELL)
+    assert content is not None and content["code"] == "1a2b3c4+"
+    assert content["processor_seconds"] >= 0.1 and content["seconds"] >= 0.1
 
 
 def test_the_first_screen_counts_what_holds_and_names_what_is_missing() -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 
+from magnet.cli import score
+from magnet.evaluation.benchmark import SPLIT_FILE
 from magnet.evaluation.evaluator import Evaluator
 from magnet.motion.tokens import TokenLayout
+from magnet.report.cells import BUDGETS
 from magnet.report.plan import PAPER
 from magnet.report.tables import TABLES, cells_of, named
 from magnet.tasks import registry
@@ -50,6 +54,17 @@ def test_a_table_claims_what_it_has_rows_for(name: str) -> None:
             assert cell.model is not None and cell.model.digest, "no such configuration"
     shipped = cells_of(TABLES[name](replace(PLAN, only_shipped=True)))
     assert all(cell.kind != "train" and cell.needs is None for cell in shipped)
+
+
+def test_the_open_benchmark_is_measured_as_magnet_score_measures_it_whatever_the_budget() -> None:
+    split = json.loads(SPLIT_FILE.read_text(encoding="utf-8"))
+    for budget in ("evening", "paper"):
+        blocks = TABLES["benchmark"](replace(PLAN, budget=BUDGETS[budget], data="synthetic2"))
+        assert [block.title.rpartition(" ")[2] for block in blocks] == split["tasks"]
+        for cell in cells_of(blocks):
+            assert (cell.scenes, cell.samples) == (len(split["scenes"]), split["samples"])
+            assert cell.seed == score.parser().get_default("seed")
+            assert cell.data == "salsa" and not cell.task_options and not cell.sampler
 
 
 @pytest.mark.parametrize(("said", "meant"), [("3", "3"), ("a3", "A.3"), ("Fig7", "Fig. 7"), ("table5", "5")])
