@@ -15,7 +15,7 @@ from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_tokenizer
 from magnet.tokenizer.raw import RawPose
 from tests.datamodules.fakes import FakeData, random_clip
-from tests.test_configs import ROOT, TINY, leaves, said
+from tests.test_configs import PAPER, ROOT, TINY, leaves, said
 
 REPORT = ROOT / "report"
 NETWORK = "model.init_args.network"
@@ -68,6 +68,27 @@ def test_a_row_of_the_report_changes_what_it_says_trains_and_samples(row: str) -
         options = SamplerOptions(steps=2, **sampler)
         made = generate(model.eval(), scene, JointFuture(), 8, 8, 1, options, torch.Generator().manual_seed(0))
         assert made.frames == 16 and made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_row_of_the_report_at_the_papers_size_changes_the_same(row: str) -> None:
+    options = said(PAPER / "ablations" / f"{row}.yaml")
+    base = dict(leaves(said(PAPER / "duobox_denoiser.yaml")))
+    assert {place: value for place, value in leaves(options) if value != base.get(place)} == ROWS[row]
+
+
+def test_peers_at_the_papers_size_are_the_peers_as_wide_and_for_as_long_as_the_papers_model() -> None:
+    full = said(PAPER / "duobox_denoiser.yaml")
+    peers = sorted(REPORT.glob("peer_*.yaml"))
+    assert len(peers) == 3
+    for path in peers:
+        small, large = said(path), said(PAPER / "ablations" / path.name)
+        assert large["model"]["class_path"] == small["model"]["class_path"]
+        assert large["trainer"] == full["trainer"]
+        sizes = large["model"]["init_args"]["network"]
+        assert sizes == {name: full["model"]["init_args"]["network"][name] for name in sizes}
+        windows = [options["data"]["init_args"].get("window_frames") for options in (small, large)]
+        assert windows[0] in (None, windows[1])
 
 
 def test_every_file_of_the_report_is_a_row_a_peer_or_their_data() -> None:

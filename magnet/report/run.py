@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import yaml
+
 from magnet.report import measure
 from magnet.report.cells import Cell, Store
 from magnet.shared import sharing
@@ -114,7 +116,7 @@ class Runner:
         last = self._checkpoint(cell)
         folder = last.parents[1]
         words = ["--config", str(config)]
-        words += ["--config", str(self.data)] if self.data is not None else []
+        words += ["--config", str(self.data), *own_window(config)] if self.data is not None else []
         words += ["--out", str(folder), "--seed_everything", str(cell.seed)]
         words += ["--model.seed", str(cell.seed), "--data.seed", str(cell.seed)]
         words += ["--trainer.max_steps", str(cell.model.steps)] if cell.model.steps is not None else []
@@ -130,6 +132,13 @@ class Runner:
         if code or not last.is_file():
             raise ValueError(f"{config.name}: the training ended with code {code}; its messages say why")
         return last
+
+
+def own_window(config: Path) -> list[str]:
+    """Flags for the window that a training asks for itself, whatever other data it is given."""
+    data = (yaml.safe_load(config.read_text(encoding="utf-8")) or {}).get("data") or {}
+    frames = data.get("init_args", {}).get("window_frames")
+    return [] if frames is None else ["--data.window_frames", str(frames)]
 
 
 def clock(seconds: float) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from magnet import cli
 from magnet.cli.train import run_trainer
@@ -174,6 +175,36 @@ def test_a_small_report_is_made_from_nothing(tmp_path: Path, capsys: pytest.Capt
     capsys.readouterr()
     assert cli.main(words) == 0
     assert "/" not in capsys.readouterr().out.partition("written")[0]
+
+
+REMOS = """
+data: {class_path: Synthetic, init_args: {people: [2], window_frames: 184}}
+model: {class_path: magnet.peers.ReMoS, init_args: {tokenizer: duet, network: {width: 24, layers: 1, heads: 2}}}
+trainer: {accelerator: cpu, logger: false, enable_progress_bar: false}
+"""
+DUOBOX = (
+    "data: {class_path: DuoBox, init_args: {path: store, body_model: fake/body.npz, max_agents: 2, window_frames: 64}}"
+)
+
+
+@pytest.mark.slow
+def test_a_report_on_other_recordings_trains_on_them_by_windows_that_a_peer_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a made-up DuoBox; the peer answers for 182 frames and says so, the file of the data has windows of 64."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", "duobox", "fake", "--frames", "200", "--takes", "4"]) == 0
+    store = ["--root", "fake", "--out", "store", "--workers", "1", "--body", "fake/body.npz"]
+    assert cli.main(["data", "prepare", "duobox", *store]) == 0
+    Path("peer_remos.yaml").write_text(REMOS, encoding="utf-8")
+    Path("data.yaml").write_text(DUOBOX, encoding="utf-8")
+    words = ["--budget", "tiny", "--data", "data.yaml", "--configs", ".", "--out", "out"]
+    assert cli.main(["report", "2", *words, "--only", "remos-partner_inpainting-data-seed0"]) == 0
+    rows = json.loads(Path("out/report.json").read_text())["tables"]["2"][0]["rows"]
+    assert rows["ReMoS"]["mpjpe"]["value"] > 0
+    (run_config,) = Path("out/trainings").glob("*/config.yaml")
+    trained = yaml.safe_load(run_config.read_text())["data"]
+    assert trained["class_path"].endswith("DuoBox") and trained["init_args"]["window_frames"] == 184
 
 
 class Gone(BaseException):
