@@ -290,9 +290,10 @@ def test_every_ablation_trains_and_both_ways_of_sampling_sample(folder: Path, tm
     for row in sorted((PAPER / "ablations").glob("*.yaml")):
         if is_sampling(said(row)):
             continue
-        raw = "tokenizer" in yaml.safe_load(row.read_text())["model"]["init_args"]
+        raw = said(row)["model"]["init_args"]["tokenizer"] == "raw"
         more = () if raw else ("--model.tokenizer", tokenizer)
-        checkpoint = two_steps(row, data, tmp_path / row.stem, *more)
+        assert two_steps(row, data, tmp_path / row.stem, *more).exists()
+    checkpoint = tmp_path / "base" / "checkpoints" / "last.ckpt"
     short = ("--data.test.context_frames", "8", "--data.test.horizon_frames", "8", "--data.test.limit", "2")
     quick = ("--sampler.steps", "3", "--samples", "1", "--baselines", "false", "--ckpt_path", str(checkpoint))
     for row in (PAPER / "ablations" / f"{name}.yaml" for name in ROWS["Table A.6"]):
