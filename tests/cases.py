@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
+from _pytest.mark import ParameterSet
 
 
 def some_slow(cases: Iterable[Any], *slow: Any) -> list[Any]:
@@ -13,7 +14,17 @@ def some_slow(cases: Iterable[Any], *slow: Any) -> list[Any]:
     every = list(cases)
     assert set(slow) <= set(every), f"no cases {sorted(set(slow) - set(every))}"
 
-    def values(case: Any) -> tuple[Any, ...]:
-        return case if isinstance(case, tuple) else (case,)
+    return [slow_case(case) if case in slow else case for case in every]
 
-    return [pytest.param(*values(case), marks=pytest.mark.slow) if case in slow else case for case in every]
+
+def few(cases: Iterable[Any], quick: int = 2) -> list[Any]:
+    """All cases for `parametrize`, of which so many, spread evenly, run with the quick tests; the others are slow."""
+    every = list(cases)
+    chosen = {number * len(every) // quick for number in range(quick)}
+    return [case if number in chosen else slow_case(case) for number, case in enumerate(every)]
+
+
+def slow_case(case: Any) -> Any:
+    """A case that runs with the slow tests alone."""
+    given = case if isinstance(case, ParameterSet) else pytest.param(*(case if isinstance(case, tuple) else (case,)))
+    return pytest.param(*given.values, id=given.id, marks=[*given.marks, pytest.mark.slow])

@@ -66,15 +66,15 @@ def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind
     """Of a model, too, that is best sampled with corrections, which agents leave out, and with averaged paths."""
     best = Sampling(settle="hold", smooth_path=True) if posterior else Sampling()
     denoiser = tiny_denoiser(max_agents=4, window=8, network={"pairwise_posterior": posterior}, sampling=best)
-    task, frames, plain = TASKS[kind], 4 * 12, replace(REFERENCE, settle="off")
+    task, frames, plain = TASKS[kind], 4 * 8, replace(REFERENCE, settle="off")
     whole = generate(denoiser, start, task, 24, frames, 1, plain, torch.Generator().manual_seed(1)).slice(24)
     agents = group(denoiser, start, task)
-    made = together(agents, 12, Lossy(delay=int(kind == "in step")))
+    made = together(agents, 8, Lossy(delay=int(kind == "in step")))
     for slot, agent in enumerate(agents):
         told = poses_of(whole.permute_agents(torch.tensor([slot])))
         assert (poses_of(cat_time(made[slot])) - told).max() < 1e-6
         assert torch.equal(
-            torch.stack([torch.from_numpy(agent.pieces[slot][n].poses) for n in range(12)]).flatten(0, 1),
+            torch.stack([torch.from_numpy(agent.pieces[slot][n].poses) for n in range(8)]).flatten(0, 1),
             torch.from_numpy(told),
         )
         assert agent.gaps == 0

@@ -11,6 +11,7 @@ from magnet.body import load_body
 from magnet.motion.frames import canonical_frame, from_planar, inverse
 from magnet.motion.scene import Scene, concatenate
 from tests.baselines.test_retrieval import CONTEXT, HORIZON, somewhere_else, wander
+from tests.cases import few
 
 BODY = load_body()
 
@@ -31,7 +32,7 @@ def walking(scenes: int, people: int, seed: int, frames: int = CONTEXT + HORIZON
     return still.replace(body_rot=still.body_rot.expand(-1, frames, -1, -1, -1, -1), T_world_root=T_world_root)
 
 
-@pytest.mark.parametrize("people", [1, 2, 5])
+@pytest.mark.parametrize("people", few([1, 2, 5]))
 def test_straight_walks_are_continued(people: int) -> None:
     """A position is the last one and the last step so many times: linear, so nothing but the penalty is in the way."""
     made = RidgeRegression(windows(walking(120, people, seed=1)))

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from magnet.body import JOINT_NAMES, MIRROR, PARENTS, load_body
 from magnet.motion.scene import Scene, empty_scene
+from tests.cases import some_slow
 
 PARENTS_55 = (*PARENTS, 15, 15, 15, 20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38,
               21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53)  # fmt: skip
@@ -308,7 +309,7 @@ def smplx_output(path, scene):
     return (out.joints[:, :22] + shift).view(B, T, P, 22, 3), (out.vertices + shift).view(B, T, P, -1, 3)
 
 
-@pytest.mark.parametrize("source", ["open", "synthetic"])
+@pytest.mark.parametrize("source", some_slow(["open", "synthetic"], "synthetic"))
 def test_joints_and_vertices_equal_the_smplx_package(tmp_path, source):
     pytest.importorskip("smplx")
     path = tmp_path / "SMPLX_NEUTRAL.npz"

@@ -23,6 +23,7 @@ from magnet.metrics.body_depth import deepest
 from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene, cat_time
 from magnet.synthesis import synthesize
+from tests.cases import some_slow
 
 BODY = load_body()
 
@@ -82,7 +83,9 @@ def test_what_is_right_is_let_be(handshake: Scene) -> None:
     assert float((BODY.joints(once) - BODY.joints(handshake)).norm(dim=-1).mean()) < 0.012
 
 
-@pytest.mark.parametrize(("apart", "before"), [(0.55, 0.0), (0.7, 0.05), (1.1, 0.02)])
+@pytest.mark.parametrize(
+    ("apart", "before"), some_slow([(0.55, 0.0), (0.7, 0.05), (1.1, 0.02)], (0.55, 0.0), (0.7, 0.05))
+)
 def test_depth_that_is_measured_is_corrected_and_does_not_come_back_with_the_next_step(
     apart: float, before: float
 ) -> None:
@@ -93,7 +96,7 @@ def test_depth_that_is_measured_is_corrected_and_does_not_come_back_with_the_nex
         assert float(depths(repaired(scene, BODY, settle=Settle(iterations=iterations))).max()) < 0.055
 
 
-@pytest.mark.parametrize("height", [0.05, 0.15])
+@pytest.mark.parametrize("height", some_slow([0.05, 0.15], 0.05))
 def test_whoever_floats_comes_down_and_whoever_jumps_does_not(handshake: Scene, height: float) -> None:
     T = handshake.frames
     up = torch.zeros(T, 3)
@@ -185,11 +188,15 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(1)
 
 
-def test_long_batches_are_corrected_by_several_threads_as_by_one(two_threads: None) -> None:
-    pushed = arms_out(0.3, 0.1, 184)  # more than 150 frames: torch's batched LU fails then (pytorch issue 142815)
-    several = repaired(pushed.repeat(4), BODY, settle=Settle(iterations=2))
+# More than 150 frames: torch's batched LU fails then (pytorch issue 142815).
+@pytest.mark.parametrize(("frames", "iterations"), some_slow([(24, 1), (184, 2)], (184, 2)))
+def test_long_batches_are_corrected_by_several_threads_as_by_one(
+    frames: int, iterations: int, two_threads: None
+) -> None:
+    pushed = arms_out(0.3, 0.1, frames)
+    several = repaired(pushed.repeat(4), BODY, settle=Settle(iterations=iterations))
     torch.set_num_threads(1)
-    one = repaired(pushed, BODY, settle=Settle(iterations=2))
+    one = repaired(pushed, BODY, settle=Settle(iterations=iterations))
     assert float((one.T_world_root - pushed.T_world_root).abs().max()) > 0.01
     torch.testing.assert_close(several.T_world_root, one.T_world_root.expand(4, -1, -1, -1, -1), rtol=0, atol=1e-4)
 

@@ -18,7 +18,7 @@ from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
 from tests import toys
-from tests.cases import some_slow
+from tests.cases import few, some_slow
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "lightning", "numpy", "jsonargparse", "rich", "matplotlib")
@@ -138,50 +138,59 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [
-        (["fti"], "did you mean fit?"),
-        (["xyzzy"], "there are fit, validate"),
-        (["test", "--help", "modle"], "no help topic modle; did you mean model?"),
-        (["test", "--task", "joint_futur"], "did you mean joint_future?"),
-        (["test", "--task=nothing_like_it"], "There are "),
-        (["fit"], "say which model: --model ToyModel"),
-        (["fit", "--model", "Nosuch"], "no model Nosuch; there are ToyModel"),
-        (["fit", "--model", "ToyModel", "--lr", "1"], "no option --lr; did you mean --model.lr?"),
-        (["fit", "--model", "ToyModel", "--model.lrr", "1"], "no option --model.lrr; did you mean --model.lr?"),
-        (["fit", "--model", "ToyModel", "--data.max_agents", "two"], "got two, expected a whole number"),
-        (["test", "generation"], "got generation, expected an option; did you mean --task generation?"),
-        (["test", "."], "got ., expected an option; options are written --NAME VALUE"),
-        (["fit", "--model", "ToyModel", "--data.", "1"], "no option --data.; the name of a field belongs behind"),
-        (["fit", "--model", "."], "no model .; there are ToyModel"),
-        (
-            ["fit", "--model", "ToyModel", "--data.takes", "1"],
-            "no option --data.takes of this data; it belongs to another: --data OtherData",
-        ),
-        (["fit", "--model", "ToyModel", "--data.root.x", "1"], "no option --data.root.x; --data.root takes a value"),
-        (["test", "2"], "options are written --NAME VALUE"),
-        (["test", "--out", __file__], "got a file, expected a folder"),
-        (["test", "--frames", "9"], "did you mean --data.window_frames?"),
-        (["predict", "--peopel", "2"], "no option --peopel; did you mean --people?"),
-        (["test", "--sampler.step", "4"], "no option --sampler.step; did you mean --sampler.steps?"),
-        (["test", "--trainer.max_epoch", "4"], "no option --trainer.max_epoch; did you mean --trainer.max_epochs?"),
-        (["fit", "--model", "ToyModel", "--data.root"], "--data.root: got nothing, expected a value"),
-        (
-            ["fit", "--model", "ToyModel", "--trainer.callbacks", "x"],
-            "callbacks: got x, expected a list such as [0,1] or a",
-        ),
-        (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
-        (
-            ["test", "--sampler.pyramid_offset", "four"],
-            "--sampler.pyramid_offset: got four, expected a whole number or null",
-        ),
-        (["test", "--task", "inbetweening", "--task.keys", "20"], "--task.keys: got 20, expected a list such as [0,1]"),
-        (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
-        (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),
-        (["fit", "--config", "nosuch.yaml"], "no configuration file nosuch.yaml"),
-        (["fit", "--model", "ToyModel", "--ckpt_path", "last"], "no run with a checkpoints/last.ckpt"),
-        (["test", "--ckpt_path"], "--ckpt_path: got nothing, expected a value"),
-        (["test", "--ckpt_path", "nosuch.ckpt"], "no checkpoint nosuch.ckpt"),
-    ],
+    few(
+        [
+            (["fti"], "did you mean fit?"),
+            (["xyzzy"], "there are fit, validate"),
+            (["test", "--help", "modle"], "no help topic modle; did you mean model?"),
+            (["test", "--task", "joint_futur"], "did you mean joint_future?"),
+            (["test", "--task=nothing_like_it"], "There are "),
+            (["fit"], "say which model: --model ToyModel"),
+            (["fit", "--model", "Nosuch"], "no model Nosuch; there are ToyModel"),
+            (["fit", "--model", "ToyModel", "--lr", "1"], "no option --lr; did you mean --model.lr?"),
+            (["fit", "--model", "ToyModel", "--model.lrr", "1"], "no option --model.lrr; did you mean --model.lr?"),
+            (["fit", "--model", "ToyModel", "--data.max_agents", "two"], "got two, expected a whole number"),
+            (["test", "generation"], "got generation, expected an option; did you mean --task generation?"),
+            (["test", "."], "got ., expected an option; options are written --NAME VALUE"),
+            (["fit", "--model", "ToyModel", "--data.", "1"], "no option --data.; the name of a field belongs behind"),
+            (["fit", "--model", "."], "no model .; there are ToyModel"),
+            (
+                ["fit", "--model", "ToyModel", "--data.takes", "1"],
+                "no option --data.takes of this data; it belongs to another: --data OtherData",
+            ),
+            (
+                ["fit", "--model", "ToyModel", "--data.root.x", "1"],
+                "no option --data.root.x; --data.root takes a value",
+            ),
+            (["test", "2"], "options are written --NAME VALUE"),
+            (["test", "--out", __file__], "got a file, expected a folder"),
+            (["test", "--frames", "9"], "did you mean --data.window_frames?"),
+            (["predict", "--peopel", "2"], "no option --peopel; did you mean --people?"),
+            (["test", "--sampler.step", "4"], "no option --sampler.step; did you mean --sampler.steps?"),
+            (["test", "--trainer.max_epoch", "4"], "no option --trainer.max_epoch; did you mean --trainer.max_epochs?"),
+            (["fit", "--model", "ToyModel", "--data.root"], "--data.root: got nothing, expected a value"),
+            (
+                ["fit", "--model", "ToyModel", "--trainer.callbacks", "x"],
+                "callbacks: got x, expected a list such as [0,1] or a",
+            ),
+            (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
+            (
+                ["test", "--sampler.pyramid_offset", "four"],
+                "--sampler.pyramid_offset: got four, expected a whole number or null",
+            ),
+            (
+                ["test", "--task", "inbetweening", "--task.keys", "20"],
+                "--task.keys: got 20, expected a list such as [0,1]",
+            ),
+            (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
+            (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),
+            (["fit", "--config", "nosuch.yaml"], "no configuration file nosuch.yaml"),
+            (["fit", "--model", "ToyModel", "--ckpt_path", "last"], "no run with a checkpoints/last.ckpt"),
+            (["test", "--ckpt_path"], "--ckpt_path: got nothing, expected a value"),
+            (["test", "--ckpt_path", "nosuch.ckpt"], "no checkpoint nosuch.ckpt"),
+        ],
+        12,
+    ),
 )
 def test_a_mistake_is_answered_by_what_would_be_right(
     toy: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str

@@ -12,6 +12,7 @@ from magnet.export import save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
+from tests.cases import few, some_slow
 
 QUICK = ["--sampler.steps", "2"]
 
@@ -34,7 +35,7 @@ def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("task", registry.names())
+@pytest.mark.parametrize("task", some_slow(registry.names(), "agentic_async", "agentic_sync"))
 def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> None:
     out = tmp_path / "out.npz"
     said(capsys, *duet["bvh"], "--task", task, "--frames", "16", "--out", str(out), *QUICK)
@@ -91,19 +92,22 @@ def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [
-        ("BVH", "say where to: --out FILE"),
-        ("BVH --out a.obj", "nothing writes .obj"),
-        ("BVH --out a.npz --context 400", "the files hold 48 frames"),
-        ("BVH --out a.npz --people 1", "expected at least 2, as many as IN holds"),
-        ("BVH --out a.npz --people 3", "joint_future reads motion of person 2, of whom no file tells"),
-        ("BVH --out a.npz --sampler.stps 3", "no option --sampler.stps; did you mean --sampler.steps?"),
-        ("BVH --out a.npz --sampler steddy", "did you mean steady?"),
-        ("BVH --out a.npz --task partner_inpaintin", "did you mean partner_inpainting?"),
-        ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
-        ("none.bvh --out a.npz", "none.bvh"),
-        ("--task joint_future a.bvh", "files come first"),
-    ],
+    few(
+        [
+            ("BVH", "say where to: --out FILE"),
+            ("BVH --out a.obj", "nothing writes .obj"),
+            ("BVH --out a.npz --context 400", "the files hold 48 frames"),
+            ("BVH --out a.npz --people 1", "expected at least 2, as many as IN holds"),
+            ("BVH --out a.npz --people 3", "joint_future reads motion of person 2, of whom no file tells"),
+            ("BVH --out a.npz --sampler.stps 3", "no option --sampler.stps; did you mean --sampler.steps?"),
+            ("BVH --out a.npz --sampler steddy", "did you mean steady?"),
+            ("BVH --out a.npz --task partner_inpaintin", "did you mean partner_inpainting?"),
+            ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
+            ("none.bvh --out a.npz", "none.bvh"),
+            ("--task joint_future a.bvh", "files come first"),
+        ],
+        4,
+    ),
 )
 def test_a_mistake_is_answered_by_what_would_be_right(
     words: str, message: str, duet, tmp_path, capsys, monkeypatch

@@ -12,6 +12,7 @@ import pytest
 
 from magnet.datamodules.chi3d import CHI3DReader
 from magnet.datamodules.reading.recording import DataError
+from tests.cases import few
 from tests.datamodules.readers import check_damaged, cut
 
 
@@ -76,6 +77,6 @@ DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("how", DAMAGED)
+@pytest.mark.parametrize("how", few(DAMAGED, 5))
 def test_damaged_takes_are_refused_and_others_read(how: str, root: Path) -> None:
     check_damaged(CHI3DReader(root), *DAMAGED[how])

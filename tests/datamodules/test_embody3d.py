@@ -17,7 +17,7 @@ import pytest
 from magnet.datamodules.embody3d import Embody3D, Embody3DReader
 from magnet.datamodules.preparing.check import recognise
 from magnet.datamodules.reading.recording import DataError, Take
-from tests.cases import some_slow
+from tests.cases import few, some_slow
 from tests.datamodules.readers import Foreign, cut, refused
 
 
@@ -250,7 +250,7 @@ DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("how", DAMAGED)
+@pytest.mark.parametrize("how", few(DAMAGED, 5))
 def test_damaged_takes_are_refused_and_others_read(how: str, root: Path) -> None:
     damage, match = DAMAGED[how]
     reader = Embody3DReader(root)

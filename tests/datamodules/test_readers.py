@@ -26,7 +26,7 @@ from magnet.datamodules.preparing.prepare import prepare, select_takes
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.store.windows import recorded_windows
 from magnet.motion.resample import times
-from tests.cases import some_slow
+from tests.cases import few
 from tests.datamodules.made_scenes import (
     FITTED,
     FORMS,
@@ -61,7 +61,7 @@ def test_messages_name_options_as_the_command_line_takes_them(name: str) -> None
 # -- joints ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", few(FORMS, 4))
 def test_a_recording_is_what_was_written_at_its_own_rate_and_axes(form: str, tmp_path: Path) -> None:
     name = FORMS[form][0]
     fakes = fake_of(name).scenes(1 if name == "duobox" else 5, 20, 0)
@@ -78,7 +78,7 @@ def test_a_recording_is_what_was_written_at_its_own_rate_and_axes(form: str, tmp
             np.testing.assert_allclose(found.positions, shown.positions[:, :, list(found.joints)], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", registry.readers())
+@pytest.mark.parametrize("name", few(registry.readers(), 4))
 def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp_path: Path) -> None:
     registry.reader(name).write_fake(tmp_path, 1 if name == "duobox" else 4, 20)
     reader = registry.reader(name)(tmp_path)
@@ -87,7 +87,7 @@ def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp
     assert set(lengths) == {20}
 
 
-@pytest.mark.parametrize("form", some_slow(FORMS, "bvh", "chi3d", "duobox, bare skeleton", "remocap"))
+@pytest.mark.parametrize("form", few(FORMS, 4))
 def test_prepared_and_read_back_joints_are_those_that_were_written(form: str) -> None:
     fitted = FORMS[form][2] == FITTED
 
@@ -200,9 +200,7 @@ SAID = {
 """Where it is said otherwise."""
 
 
-@pytest.mark.parametrize(
-    "form", some_slow(FORMS, "bvh", "chi3d", "duobox, bare skeleton", "hi4d", "remocap, ready fits")
-)
+@pytest.mark.parametrize("form", few(FORMS, 4))
 def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,7 +239,7 @@ def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
 MANY = 12
 
 
-@pytest.fixture(scope="module", params=registry.readers())
+@pytest.fixture(scope="module", params=few(registry.readers(), 4))
 def download(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Many takes of two frames."""
     root = tmp_path_factory.mktemp(request.param)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from magnet.sampling.planned_stage import run_planned_stage
 from magnet.sampling.schedule import Grid
 from magnet.sampling.solvers import History
 from magnet.tasks import registry
+from tests.cases import some_slow
 
 SMALL = {"width": 32, "layers": 3, "heads": 2, "dropout": 0.0}
 
@@ -173,8 +175,15 @@ def test_what_a_stage_does_not_change_enters_once(options: dict[str, Any], prese
     assert rows == {2}
 
 
-@pytest.mark.parametrize("task", ["joint_future", "motion_control", "agentic_async"])
-@pytest.mark.parametrize("solver", ["ddim", "dpmpp_2m"])
+@pytest.mark.parametrize(
+    ("task", "solver"),
+    some_slow(
+        itertools.product(["joint_future", "motion_control", "agentic_async"], ["ddim", "dpmpp_2m"]),
+        ("motion_control", "ddim"),
+        ("agentic_async", "ddim"),
+        ("agentic_async", "dpmpp_2m"),
+    ),
+)
 @torch.no_grad()
 def test_inside_a_stage_nothing_waits_for_the_device(task: str, solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The device is one whose numbers cannot be read: an item, nonzero, unique or copy back would be an error.

@@ -6,6 +6,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
+from tests.cases import few
 from tests.datamodules.fakes import FakeData, couples_and_singles
 
 SIZES = {"network": {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "level_width": 16}}
@@ -128,7 +129,7 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
     generator = torch.Generator().manual_seed(0)
     optimizer = torch.optim.AdamW(model.transformer.parameters(), lr=3e-3)
     losses = []
-    for _ in range(150):
+    for _ in range(80):
         loss = model.losses(batch, generator)["loss"]
         optimizer.zero_grad()
         loss.backward()
@@ -139,20 +140,23 @@ def test_a_few_scenes_can_be_learnt(tmp_path):
 
 @pytest.mark.parametrize(
     "ablation",
-    [
-        {"network": {"pairwise": False}},
-        {"network": {"rope": "none"}},
-        {"network": {"agent_embedding": False}},
-        {"noise": {"distribution": "per_timestep"}},
-        {"noise": {"distribution": "per_sequence"}},
-        {"noise": {"distribution": "mixture"}},
-        {"noise": {"pairwise": "token"}},
-        {"network": {"rope": "heads"}},
-        {"network": {"causal_block": 2}},
-        {"target": "continuous"},
-        {"target": "continuous", "self_forcing": {"share": 1.0}, "noise": {"distribution": "mixture"}},
-        {"loss": {"weighting": "min_snr"}},
-    ],
+    few(
+        [
+            {"network": {"pairwise": False}},
+            {"network": {"rope": "none"}},
+            {"network": {"agent_embedding": False}},
+            {"noise": {"distribution": "per_timestep"}},
+            {"noise": {"distribution": "per_sequence"}},
+            {"noise": {"distribution": "mixture"}},
+            {"noise": {"pairwise": "token"}},
+            {"network": {"rope": "heads"}},
+            {"network": {"causal_block": 2}},
+            {"target": "continuous"},
+            {"target": "continuous", "self_forcing": {"share": 1.0}, "noise": {"distribution": "mixture"}},
+            {"loss": {"weighting": "min_snr"}},
+        ],
+        4,
+    ),
     ids=str,
 )
 def test_every_ablation_trains_and_samples(tmp_path, ablation):

@@ -16,6 +16,7 @@ from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
+from tests.cases import few, some_slow
 
 FAST = SamplerOptions(steps=2, stride=2)
 OPTIONS = [{"network": {"causal_block": 2}}, {"network": {"causal_block": 3}}, {"target": "continuous"}]
@@ -38,7 +39,7 @@ def sampled(
     return generate(model, scene, task or JointFuture(), context, 40 - context, 1, options, generator, **more)
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", few(registry.names(), 3))
 def test_every_task_runs_with_every_option(model: Denoiser, scene: Scene, name: str):
     made = sampled(model, scene, registry.get(name)(), context=0 if name == "generation" else 16)
     assert made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
@@ -145,7 +146,7 @@ def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, mon
 BEST = {"stride": 6, "pyramid_offset": 0, "settle": "hold", "smooth_path": True}
 
 
-@pytest.mark.parametrize("name", ["joint_future", "motion_control"])
+@pytest.mark.parametrize("name", some_slow(["joint_future", "motion_control"], "motion_control"))
 def test_what_a_sampler_leaves_open_is_as_the_model_is_best_sampled(scene: Scene, name: str):
     plain, best = tiny_denoiser(), tiny_denoiser(sampling=BEST)
     asked = sampled(plain, scene, registry.get(name)(), SamplerOptions(steps=2, **BEST))

@@ -104,7 +104,7 @@ def test_what_was_given_comes_back_as_it_was_given(task: object, scored: Tensor)
 @pytest.mark.parametrize(
     ("task", "scored"),
     [
-        pytest.param(*case, id=name, marks=pytest.mark.slow if name in ("a key each 4", "a key each 2") else ())
+        pytest.param(*case, id=name, marks=() if name == "a plug-in" else pytest.mark.slow)
         for name, case in CASES.items()
     ],
 )

@@ -15,11 +15,12 @@ from magnet.export.cast import STYLES, Style
 from magnet.export.drawing import AGENTS, CONTEXT
 from magnet.export.figures import bulged
 from magnet.motion.scene import Scene
+from tests.cases import few
 
 Count = Callable[[Image.Image, tuple[int, int, int]], int]
 
 
-@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("style", few(STYLES))
 def test_every_cell_of_a_sheet_shows_its_people(
     style: Style, duet: Scene, body: Body, tmp_path: Path, pixels_like: Count
 ) -> None:

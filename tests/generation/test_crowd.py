@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +24,7 @@ from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing import random_scene, standing_people, tiny_denoiser
+from tests.cases import some_slow
 
 QUICK = SamplerOptions(steps=2, stride=2)
 
@@ -29,6 +32,12 @@ QUICK = SamplerOptions(steps=2, stride=2)
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "posterior"])
 def model(request: pytest.FixtureRequest) -> Denoiser:
     return tiny_denoiser(max_agents=4, window=8, network={"pairwise_posterior": request.param})
+
+
+def each_model(name: str, cases: Iterable[Any], *quick: tuple[bool, Any]) -> Any:
+    """Every case with both models, without and with a posterior; the quick ones run with the quick tests."""
+    every = list(itertools.product([False, True], cases))
+    return pytest.mark.parametrize(("model", name), some_slow(every, *(set(every) - set(quick))), indirect=["model"])
 
 
 def crowd(people: int, frames: int = 16, spacing: float = 2.0) -> Scene:
@@ -43,9 +52,10 @@ def seeded() -> torch.Generator:
 
 
 FIELDS: dict[str, dict[str, Any]] = {"inbetweening": {"every": 4}}
+QUICK_TASKS = ("joint_future", "motion_control", "inbetweening", "generation", "agentic_sync")
 
 
-@pytest.mark.parametrize("task", registry.names())
+@each_model("task", registry.names(), *((False, task) for task in QUICK_TASKS), (True, "joint_future"))
 def test_small_groups_are_sampled_as_ever_bit_for_bit(model: Denoiser, task: str) -> None:
     for people in (2, 3, 4):
         scene = random_scene(1, 24, people, torch.Generator().manual_seed(people))
@@ -56,7 +66,9 @@ def test_small_groups_are_sampled_as_ever_bit_for_bit(model: Denoiser, task: str
             assert torch.equal(tensor, crowded.tensors()[name]), (people, name)
 
 
-@pytest.mark.parametrize("task", ["joint_future", "motion_control", "inbetweening"])
+@each_model(
+    "task", ["joint_future", "motion_control", "inbetweening"], (False, "joint_future"), (True, "motion_control")
+)
 def test_a_crowd_costs_a_view_a_person_and_no_more(model: Denoiser, task: str) -> None:
     fields = {"motion_control": {"target": (0, 5)}}.get(task, FIELDS.get(task, {}))
     for people in (6, 12):
@@ -228,7 +240,7 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
     assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
 
 
-@pytest.mark.parametrize("frames", [16, 40])
+@each_model("frames", [16, 40], (False, 16))
 def test_a_crowd_is_made_from_nothing_in_its_slots_and_of_its_shapes(model: Denoiser, frames: int) -> None:
     scene = crowd(5, 4)
     betas = torch.randn(1, 5, 10, generator=torch.Generator().manual_seed(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -11,10 +12,13 @@ from magnet.generation.rollout import generate
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing.models import random_scene, tiny_denoiser
+from tests.cases import some_slow
+
+CASES = list(itertools.product(registry.names(), [1, 2]))
+QUICK = {(name, 1) for name in registry.names() if name != "agentic_async"} | {("joint_future", 2)}
 
 
-@pytest.mark.parametrize("task", registry.names())
-@pytest.mark.parametrize("block", [1, 2])
+@pytest.mark.parametrize(("task", "block"), some_slow(CASES, *(set(CASES) - QUICK)))
 def test_every_task_is_sampled_as_by_the_network_as_it_was_trained(task: str, block: int) -> None:
     model = tiny_denoiser(max_agents=3, network={"causal_block": block, "pairwise_posterior": block == 2})
     scene = random_scene(2, 64, 3, torch.Generator().manual_seed(0))

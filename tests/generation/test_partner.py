@@ -96,7 +96,7 @@ def test_turning_the_world_turns_an_answer_to_somebody_lying_on_the_side(model, 
         (2, SamplerOptions(steps=2, guidance=Guidance("partner"))),
         (1, SamplerOptions(steps=3, keep_given=False, eta=0.0, placement="integrate")),
         (1, SamplerOptions(steps=2, smooth_path=True)),
-        (2, SamplerOptions(steps=2, smooth_path=True, settle="firm")),
+        pytest.param(2, SamplerOptions(steps=2, smooth_path=True, settle="firm"), marks=pytest.mark.slow),
     ],
     ids=["token by token", "three tokens", "guided", "bare", "smooth", "smooth and settled"],
 )

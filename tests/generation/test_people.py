@@ -19,6 +19,7 @@ from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser, without_absent
+from tests.cases import few
 
 FAST = SamplerOptions(steps=2, stride=2)
 
@@ -43,7 +44,7 @@ def close(a: Scene, b: Scene) -> bool:
     return all(torch.allclose(value, getattr(b, name), atol=1e-5) for name, value in a.tensors().items())
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", few(registry.names(), 3))
 def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, name):
     scene, task, stats = people([[True, True]]), registry.get(name)(), SamplingStats()
     context = 0 if name == "generation" else 8
@@ -77,7 +78,7 @@ def test_nobody_waits_for_free_slots(model, task):
     assert len(set(costs)) == 1
 
 
-@pytest.mark.parametrize("task", [JointFuture(), AgenticAsync(), Generation(), Inbetweening(every=4)], ids=str)
+@pytest.mark.parametrize("task", few([JointFuture(), AgenticAsync(), Generation(), Inbetweening(every=4)]), ids=str)
 def test_what_a_free_slot_holds_changes_nobody(model, task):
     """Free slots before, between and behind people."""
     scene = people([[True, False, True, False], [False, True, True, False]])
@@ -95,7 +96,7 @@ def test_what_a_free_slot_holds_changes_nobody(model, task):
     assert a.T_world_root.isfinite().all()
 
 
-@pytest.mark.parametrize("task", [JointFuture(), AgenticAsync(), AgenticSync(), Generation()], ids=str)
+@pytest.mark.parametrize("task", few([JointFuture(), AgenticAsync(), AgenticSync(), Generation()]), ids=str)
 def test_fewer_people_beside_more_in_a_batch_move_as_alone(model, task):
     scene = people([[True, True, False], [True, True, True]])
     context = 0 if isinstance(task, Generation) else 8

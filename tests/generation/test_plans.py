@@ -11,6 +11,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene
+from tests.cases import few
 
 PYRAMID = SamplerOptions(steps=12, stride=2, pyramid_offset=1)
 INDEPENDENT = SamplerOptions(steps=4, stride=2, pyramid_offset=0, noise_sampling="independent")
@@ -23,7 +24,7 @@ def run(model, scene: Scene, task, options: SamplerOptions, context: int = 16, f
 
 
 @pytest.mark.parametrize("options", [PYRAMID, INDEPENDENT], ids=["pyramid", "independent"])
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", few(registry.names(), 3))
 def test_every_task_samples_whole_scenes_by_these_plans(model, scene, name, options):
     if options is PYRAMID and name in CANNOT_ROLL:
         pytest.skip("refuses to roll, with a reason: tests/tasks/test_laws.py")

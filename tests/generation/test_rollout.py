@@ -28,7 +28,7 @@ from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from magnet.testing.poses import blocks_of
-from tests.cases import some_slow
+from tests.cases import few, some_slow
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS = 36
@@ -91,9 +91,10 @@ def same(a: Scene, b: Scene) -> bool:
 CAUSAL = ("motion_control", "agentic_sync", "agentic_async", "blocks", "turns")
 
 
-@pytest.mark.parametrize(
-    ("name", "chunk"), [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
-)
+WHOLE = [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
+
+
+@pytest.mark.parametrize(("name", "chunk"), few(WHOLE, 4))
 def test_pieces_make_up_the_scene_made_at_once(model, recording, name, chunk):
     context = context_of(name)
     frames = 4 * TOKENS - context - 3
@@ -115,7 +116,7 @@ def made(model, recording) -> Callable[..., Scene]:
     return make
 
 
-@pytest.mark.parametrize("name", some_slow(CAUSAL, "blocks", "turns", "agentic_async"))
+@pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
 def test_people_who_make_way_do_not_depend_on_the_pieces_either(made, name):
     """Nor, in causal plans, on when the scene ends: nobody makes way for what has not been seen."""
     options = replace(FAST, apart="firm")
@@ -125,21 +126,21 @@ def test_people_who_make_way_do_not_depend_on_the_pieces_either(made, name):
     assert not same(whole, made(name))
 
 
-@pytest.mark.parametrize("name", CAUSAL)
+@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async", "turns"))
 def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(made, name):
     """Nor on when rows are let go: one chunk holds them all."""
     whole, chunks, rows = (made(name, LONG, chunk) for chunk in (64, 5, 1))
     assert same(whole, chunks) and same(whole, rows)
 
 
-@pytest.mark.parametrize("name", CAUSAL)
+@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async", "turns"))
 def test_the_same_happens_however_long_a_causal_scene_goes_on(made, name):
     """Live, nobody knows where it ends."""
     long, short = made(name), made(name, SHORT)
     assert same(long.slice(0, short.frames), short)
 
 
-@pytest.mark.parametrize("name", CAUSAL)
+@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async"))
 def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model, recording, name):
     done: list[int] = []
     chunks = stream(model, recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, chunk=1)
@@ -150,25 +151,26 @@ def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model
         assert len(done) == sum(len(stage.levels) - 1 for stages in needed for stage in stages)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        SamplerOptions(steps=2, stride=2, placement="integrate"),
-        SamplerOptions(steps=2, stride=3, placement="anchor", keep_given=False),
-        SamplerOptions(steps=2, stride=2, blend=17),
-        SamplerOptions(steps=2, stride=2, requantize=False),
-        SamplerOptions(steps=2, stride=2, smooth_path=True),
-        SamplerOptions(steps=2, stride=2, smooth_path=True, keep_given=False),
-        SamplerOptions(steps=4, pyramid_offset=2),
-        SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
-        SamplerOptions(steps=4, pyramid_offset=2, eta=0.5),
-        SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
-        SamplerOptions(steps=5, pyramid_offset=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
-        SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
-        SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
-    ],
-    ids=str,
-)
+HOWS = [
+    SamplerOptions(steps=2, stride=2, placement="integrate"),
+    SamplerOptions(steps=2, stride=2, blend=17),
+    SamplerOptions(steps=2, stride=2, smooth_path=True, keep_given=False),
+    SamplerOptions(steps=3, stride=2, solver="ddim", spacing="even", eta=1.0, shift=3.0),
+    SamplerOptions(steps=5, pyramid_offset=2, solver="dpmpp_2m", spacing="log_snr", eta=0.5, shift=1.0),
+    SamplerOptions(steps=2, stride=2, guidance=Guidance(smooth=1e-3)),
+]
+SLOW_HOWS = [
+    SamplerOptions(steps=2, stride=3, placement="anchor", keep_given=False),
+    SamplerOptions(steps=2, stride=2, requantize=False),
+    SamplerOptions(steps=2, stride=2, smooth_path=True),
+    SamplerOptions(steps=4, pyramid_offset=2),
+    SamplerOptions(steps=4, pyramid_offset=2, eta=0.5),
+    SamplerOptions(steps=4, stride=2, solver="dpmpp_2m", spacing="log_snr", eta=0.0, shift=1.0),
+    SamplerOptions(steps=2, stride=2, guidance=Guidance("partner")),
+]
+
+
+@pytest.mark.parametrize("options", [*HOWS, *(pytest.param(how, marks=pytest.mark.slow) for how in SLOW_HOWS)], ids=str)
 def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, options):
     for task in (JointFuture(), PartnerInpainting((1,))):
         chunks = list(streamed(model, recording, task, 8, 77, 5, options))
@@ -217,7 +219,7 @@ def test_whoever_ends_stands_still_across_pieces(model, recording):
 # -- memory and time ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", few(registry.names()[::-1], 3))
 def test_no_more_rows_are_held_for_a_longer_scene(model, name):
     scene = random_scene(1, 160, 3, torch.Generator().manual_seed(6))
 
@@ -255,7 +257,7 @@ def test_nothing_that_the_stream_sets_is_left_set_between_pieces(model, recordin
 # -- what is final when ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", few(list(TASKS)[::-1], 5))
 def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording, name):
     context = context_of(name)
     schedule = TASKS[name].schedule(Grid(TOKENS, 3, context // 4, 2, 8, 2))
@@ -284,7 +286,10 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
 GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partner_prediction")
 
 
-@pytest.mark.parametrize(("name", "pyramid_offset"), [*((name, 0) for name in GOES_ON), ("joint_future", 2)])
+@pytest.mark.parametrize(
+    ("name", "pyramid_offset"),
+    some_slow([*((name, 0) for name in GOES_ON), ("joint_future", 2)], ("agentic_async", 0)),
+)
 def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, pyramid_offset):
     context = context_of(name)
     options = SamplerOptions(steps=1 + 3 * bool(pyramid_offset), stride=4, pyramid_offset=pyramid_offset)
@@ -325,8 +330,15 @@ def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
 # -- one generator for each scene --------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("solver", "eta"), [("ddim", 1.0), ("dpmpp_2m", 0.0)])
-@pytest.mark.parametrize("name", registry.names())
+SOLVED = [(name, solver, eta) for solver, eta in (("dpmpp_2m", 0.0), ("ddim", 1.0)) for name in registry.names()]
+
+
+@pytest.mark.parametrize(
+    ("name", "solver", "eta"),
+    some_slow(
+        SOLVED, *(case for case in SOLVED if "agentic_async" in case or ("ddim" in case and "joint_future" not in case))
+    ),
+)
 def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, solver, eta):
     context, options = context_of(name), SamplerOptions(steps=3, stride=2, eta=eta, solver=solver)
 
@@ -350,17 +362,20 @@ def test_as_many_generators_as_scenes_are_needed(model, recording):
 
 @pytest.mark.parametrize(
     ("name", "guidance", "views", "branches"),
-    [
-        ("joint_future", Guidance(), 1, 1),
-        ("joint_future", Guidance("history"), 1, 2),
-        ("joint_future", Guidance("self"), 1, 5),  # everybody, nobody, and each of three alone
-        ("joint_future", Guidance("partner"), 1, 5),
-        ("joint_future", Guidance(smooth=0.01), 1, 1),
-        ("agentic_sync", Guidance(), 3, 1),
-        ("agentic_sync", Guidance("history"), 3, 2),
-        ("agentic_async", Guidance(), 1, 1),  # nobody is hidden from one that another sees
-        ("agentic_async", Guidance("history"), 1, 2),
-    ],
+    few(
+        [
+            ("joint_future", Guidance(), 1, 1),
+            ("joint_future", Guidance("history"), 1, 2),
+            ("joint_future", Guidance("self"), 1, 5),  # everybody, nobody, and each of three alone
+            ("joint_future", Guidance("partner"), 1, 5),
+            ("joint_future", Guidance(smooth=0.01), 1, 1),
+            ("agentic_sync", Guidance(), 3, 1),
+            ("agentic_sync", Guidance("history"), 3, 2),
+            ("agentic_async", Guidance(), 1, 1),  # nobody is hidden from one that another sees
+            ("agentic_async", Guidance("history"), 1, 2),
+        ],
+        4,
+    ),
 )
 def test_calls_and_evaluations_are_counted(model, recording, name, guidance, views, branches):
     stats = SamplingStats()

@@ -27,7 +27,7 @@ from magnet.synthesis import synthesize
 from magnet.tasks import registry
 from magnet.testing import random_scene
 from magnet.testing.poses import pose_law
-from tests.cases import some_slow
+from tests.cases import few, some_slow
 
 BOTH = SamplerOptions(
     steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="hold", settle_blocks=True, smooth_path=True
@@ -64,8 +64,8 @@ CAUSAL = [name for name in registry.names() if registry.get(name)().schedule(GRI
 WHATS = [{"body_guidance": "firm"}, {"settle": "firm"}, {"settle": "hold", "smooth_path": True}]
 
 
-@pytest.mark.parametrize("what", WHATS, ids=str)
-@pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
+@pytest.mark.parametrize("what", few(WHATS[::-1], 1), ids=str)
+@pytest.mark.parametrize("name", some_slow(CAUSAL, *{*CAUSAL} - {"motion_control"}))
 def test_no_pose_depends_on_what_is_not_known_when_it_is_shown(name, what) -> None:
     assert pose_law(registry.get(name)(), GRID, SamplerOptions(**what, settle_blocks=True))
 
@@ -177,7 +177,7 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
     return cat_time(shown).replace(body=body.id)
 
 
-@pytest.mark.parametrize("speed", [1.0, 1.5])
+@pytest.mark.parametrize("speed", few([1.0, 1.5], 1))
 def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
     joints = load_body().joints(walked_on(1, speed))[0]
     assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08

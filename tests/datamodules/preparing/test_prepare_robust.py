@@ -21,6 +21,7 @@ from magnet.datamodules.preparing.check import check_store
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
+from tests.cases import few
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
@@ -147,7 +148,7 @@ def full_after(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     monkeypatch.setattr(files.HashedFile, "write", written)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.45, 0.6, 0.8, 0.97, 0.999])
+@pytest.mark.parametrize("share", few([0.0, 0.2, 0.45, 0.6, 0.8, 0.97, 0.999]))
 def test_a_full_disk_is_told_with_what_to_do_and_the_same_command_goes_on(
     order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
