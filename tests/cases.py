@@ -6,14 +6,12 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from _pytest.mark import ParameterSet
 
 
 def some_slow(cases: Iterable[Any], *slow: Any) -> list[Any]:
     """All cases for `parametrize`, tuples those of several arguments, of which some run with the slow tests alone."""
     every = list(cases)
     assert set(slow) <= set(every), f"no cases {sorted(set(slow) - set(every))}"
-
     return [slow_case(case) if case in slow else case for case in every]
 
 
@@ -26,5 +24,6 @@ def few(cases: Iterable[Any], quick: int = 2) -> list[Any]:
 
 def slow_case(case: Any) -> Any:
     """A case that runs with the slow tests alone."""
-    given = case if isinstance(case, ParameterSet) else pytest.param(*(case if isinstance(case, tuple) else (case,)))
-    return pytest.param(*given.values, id=given.id, marks=[*given.marks, pytest.mark.slow])
+    if not isinstance(case, type(pytest.param())):
+        case = pytest.param(*(case if isinstance(case, tuple) else (case,)))
+    return pytest.param(*case.values, id=case.id, marks=[*case.marks, pytest.mark.slow])

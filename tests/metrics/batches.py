@@ -12,6 +12,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from magnet.metrics import FrechetBySecond, FrechetDistance, MotionInteraction, all_metrics
+from tests.cases import few
 
 Batch = tuple[Tensor, Tensor, Tensor]
 
@@ -70,6 +71,8 @@ CHOICES: dict[str, Choose] = {
 }
 
 WHO = pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
+WHO_SLOWLY = pytest.mark.parametrize("choose", few(CHOICES.values(), 1), ids=CHOICES.keys())
+"""Where a plain loop takes its time."""
 
 
 def scored(batch: Batch, choose: Choose) -> list[list[list[bool]]]:

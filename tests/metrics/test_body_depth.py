@@ -11,7 +11,7 @@ from magnet.body.capsules import CAPSULES
 from magnet.metrics import BodyDepth
 from magnet.metrics.body_depth import ARMS, deepest
 
-from .batches import WHO, Choose, crowd, gridded, pair_places, result
+from .batches import WHO_SLOWLY, Choose, crowd, gridded, pair_places, result
 
 BIN = BodyDepth.BIN
 
@@ -29,7 +29,7 @@ def order_statistic(values: list[float], q: float) -> float:
     return sorted(values)[math.ceil(q * len(values)) - 1]
 
 
-@WHO
+@WHO_SLOWLY
 def test_depths_equal_a_plain_loop(choose: Choose) -> None:
     batch = crowd()
     every, body, arms = [], [], []

@@ -11,8 +11,9 @@ from torch import Tensor
 from magnet.body.capsules import CAPSULES
 from magnet.metrics import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.penetration import FOREARMS
+from tests.cases import few
 
-from .batches import WHO, Choose, crowd, gridded, scored
+from .batches import WHO_SLOWLY, Choose, crowd, gridded, scored
 
 
 def brute_force(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> float:
@@ -74,7 +75,7 @@ KINDS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS))
 def test_segment_distance_equals_brute_force(kind: str) -> None:
     ends = segments(kind)
     got = segment_distance(*ends)
@@ -93,7 +94,7 @@ def test_segment_distance_in_single_precision_keeps_a_tenth_of_a_millimetre(kind
     torch.testing.assert_close(got, segment_distance(*ends), atol=1e-4 * max(1.0, scale / 100), rtol=0)
 
 
-@WHO
+@WHO_SLOWLY
 def test_penetration_equals_a_plain_loop(choose: Choose) -> None:
     batch = generated, truth, present = crowd()
     counts = scored(batch, choose)

@@ -19,6 +19,7 @@ from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.base import Task
 from magnet.testing import random_scene, tiny_tokenizer
+from tests.cases import few
 from tests.datamodules.fakes import FakeData, random_clip
 from tests.test_configs import ROOT, said
 
@@ -85,7 +86,7 @@ def test_every_configured_peer_is_here() -> None:
     assert set(NAMES) == set(TASKS)
 
 
-@pytest.mark.parametrize(("name", "task"), CASES)
+@pytest.mark.parametrize(("name", "task"), few(CASES))
 def test_a_peer_answers_as_a_predictor_by_its_seeds(name: str, task: str, trained: dict[str, Peer]) -> None:
     predictor = trained[name].predictor(task_of(task), CONTEXT, HORIZON, load_body())
     joints = predictor(people(), SAMPLES, sources())
@@ -98,7 +99,7 @@ def test_a_peer_answers_as_a_predictor_by_its_seeds(name: str, task: str, traine
     torch.testing.assert_close(alone[:, 0], joints[:, 1], atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("name", "task"), CASES)
+@pytest.mark.parametrize(("name", "task"), few(CASES))
 def test_what_is_given_comes_back_and_nothing_else_is_read(name: str, task: str, trained: dict[str, Peer]) -> None:
     scene, hidden = people(), people(1)
     keep = known_of(task).repeat_interleave(4, dim=0)[: scene.frames]

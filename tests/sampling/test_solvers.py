@@ -19,6 +19,7 @@ from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.joint import JointFuture
 from magnet.testing import mixing
+from tests.cases import few
 from tests.sampling.plain import solver_step
 
 # -- levels ------------------------------------------------------------------------------------
@@ -198,7 +199,7 @@ def test_numbers_are_solved_as_if_alone_however_a_plan_is_laid(eta, spacing):
 @pytest.mark.parametrize(
     "guidance", [Guidance(), Guidance("partner"), Guidance(smooth=0.01), Guidance(stabilization_level=50)]
 )
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", few(registry.names(), 3))
 def test_a_batch_is_sampled_as_each_scene_alone(name, guidance):
     task = registry.get(name)()
     grid = Grid(

@@ -14,6 +14,7 @@ from magnet.metrics import penetration_depth
 from magnet.synthesis import COUPLINGS, CoupledScene, coupling_error, synthesize
 from magnet.synthesis.people import PALM
 from magnet.synthesis.ring import BOTH, LEFT, RIGHT
+from tests.cases import few
 
 GROUPS = [(name, people) for name, kind in COUPLINGS.items() for people in (2, 3, 4) if people >= kind.fewest]
 LIMITS = {  # what the closed form leaves to living bodies: sway, shapes, a frame's rounding
@@ -45,7 +46,7 @@ def palms(one: CoupledScene) -> Tensor:
     return (t[..., 20:22, :] + (R[..., 20:22, :, :] @ out[..., None])[..., 0])[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", few([0, 1, 2], 1))
 @pytest.mark.parametrize(("name", "people"), GROUPS)
 def test_a_scene_obeys_its_own_closed_form(name: str, people: int, seed: int) -> None:
     one, joints = made(name, people, seed)

@@ -26,13 +26,14 @@ from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
+from tests.cases import few
 
 NEEDS_NOTHING = ("generation",)
 
 # -- (a) an oracle gives the truth back --------------------------------------------------------
 
 
-@pytest.mark.parametrize("people", [2, 3, 4])
+@pytest.mark.parametrize("people", few([2, 3, 4], 1))
 @pytest.mark.parametrize("name", registry.names())
 def test_with_an_oracle_every_task_reconstructs_the_scene(name: str, people: int, generator):
     """The oracle returns the true clean tokens of the window that it is shown."""
@@ -232,18 +233,18 @@ def check(
     assert max(errors) < (ANCESTRAL_TOLERANCE if eta else TOLERANCE)
 
 
-@pytest.mark.parametrize("people", [2, 3, 4])
+@pytest.mark.parametrize("people", few([2, 3, 4]))
 def test_joint_future_samples_all_futures_given_all_pasts(people):
     check(JointFuture(), people)
 
 
-@pytest.mark.parametrize("people", [1, 2, 3])
+@pytest.mark.parametrize("people", few([1, 2, 3], 1))
 def test_rolling_samples_the_same_futures(people):
     """Levels that differ along time are still a diffusion of the whole, so its flow is exact."""
     check(JointFuture(), people, share=2)
 
 
-@pytest.mark.parametrize(("eta", "shift"), [(0.0, 3.0), (0.5, 1.0), (1.0, 1.0), (1.0, 2.0)])
+@pytest.mark.parametrize(("eta", "shift"), few([(0.0, 3.0), (0.5, 1.0), (1.0, 1.0), (1.0, 2.0)]))
 def test_new_noise_and_levels_nearer_to_noise_sample_the_same_futures(eta, shift):
     check(JointFuture(), 2, eta=eta, shift=shift)
 
@@ -254,7 +255,7 @@ def test_new_noise_samples_the_same_futures_when_rolling_and_in_turns():
     check(AgenticAsync(), 2, eta=1.0)
 
 
-@pytest.mark.parametrize("people", [1, 2, 3])
+@pytest.mark.parametrize("people", few([1, 2, 3], 1))
 def test_a_pyramid_inside_the_window_samples_the_same_futures(people):
     """Ten tokens would be half denoised at a time, of which the window holds five."""
     check(JointFuture(), people, share=10)
@@ -279,7 +280,7 @@ def test_levels_of_ones_own_sample_the_same_distributions_in_the_end(task):
     assert off[1] < 0.02 < off[0]
 
 
-@pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
+@pytest.mark.parametrize(("people", "target"), few([(2, (0,)), (3, (1,)), (4, (0, 3))], 1))
 def test_inpainting_with_the_targets_own_past_is_given_that_as_well(people, target):
     check(PartnerInpainting(target, own_past=True), people)
 
@@ -288,29 +289,29 @@ def test_rolling_prediction_still_integrates_the_partner_out():
     check(PartnerPrediction((0,)), 2, share=2)
 
 
-@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("people", few([1, 2, 3, 4]))
 def test_generation_samples_the_joint_distribution_of_everything(people):
     check(Generation(), people, context=0)
 
 
-@pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
+@pytest.mark.parametrize(("people", "target"), few([(2, (0,)), (3, (1,)), (4, (0, 3))], 1))
 def test_inpainting_samples_the_targets_given_the_others_whole_motion(people, target):
     check(PartnerInpainting(target), people)
 
 
-@pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
+@pytest.mark.parametrize(("people", "target"), few([(2, (0,)), (3, (1,)), (4, (0, 3))], 1))
 def test_prediction_samples_the_targets_future_given_all_pasts_whatever_the_others_will_do(people, target):
     """P(A_t:t+L | A_0:t-1, B_0:t-1): B's future is integrated out."""
     check(PartnerPrediction(target), people)
 
 
-@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("people", few([1, 2, 3, 4]))
 @pytest.mark.parametrize("task", [Inbetweening(keys=(-1,)), Inbetweening(keys=(3,), agents=(0,))], ids=["all", "one"])
 def test_inbetweening_samples_the_gaps_given_past_and_keyframes(task, people):
     check(task, people)
 
 
-@pytest.mark.parametrize(("people", "target"), [(2, (0,)), (3, (1,)), (4, (0, 3))])
+@pytest.mark.parametrize(("people", "target"), few([(2, (0,)), (3, (1,)), (4, (0, 3))]))
 def test_motion_control_samples_each_next_token_given_the_others_up_to_then(people, target):
     """prod_t P(A_t | A_0:t-1, B_0:t). Several targets are drawn jointly at each time step."""
 
@@ -329,7 +330,7 @@ def test_motion_control_samples_each_next_token_given_the_others_up_to_then(peop
     check(MotionControl(target), people, expected)
 
 
-@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("people", few([1, 2, 3, 4]))
 def test_agents_in_step_are_independent_given_the_past(people):
     """prod_t prod_agents P(A_t | everybody's 0:t-1)."""
 
@@ -344,15 +345,15 @@ def test_agents_in_step_are_independent_given_the_past(people):
     check(AgenticSync(), people, expected)
 
 
-@pytest.mark.parametrize("block", [1, 2])
-@pytest.mark.parametrize("offset", [0.0, 0.2, 0.5, 1.0])
+@pytest.mark.parametrize("block", few([1, 2], 1))
+@pytest.mark.parametrize("offset", few([0.0, 0.2, 0.5, 1.0]))
 @pytest.mark.parametrize(("people", "order"), [(1, ()), (2, ()), (2, (1, 0)), (3, (2, 0, 1))])
 def test_turn_taking_is_the_chain_rule_of_the_joint_future_at_every_offset(people, order, offset, block):
     """prod_t P(A_t | pasts) P(B_t | pasts, A_t) ... = P(all futures | all pasts), in any order of turns."""
     check(AgenticAsync(offset, order, block), people)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("offset", few([0.0, 0.5, 1.0], 1))
 def test_turns_and_joint_futures_are_the_same_to_a_solver_of_second_order(offset):
     """A hundred even steps, and nothing is extrapolated."""
     for people, order in ((2, (1, 0)), (3, (2, 0, 1))):
