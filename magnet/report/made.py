@@ -15,18 +15,18 @@ Done = Mapping[Cell, Mapping[str, Any]]
 """Cells that are done, with what their files hold."""
 
 
-def took(done: Done) -> dict[str, str]:
-    """What cells took together, as facts of the page: on the clock, and of a processor where that was kept."""
+def took(done: Done, wanted: int) -> dict[str, str]:
+    """How many of the wanted cells are there and what they took, on the clock and of a processor: facts of the page."""
     if not done:
         return {}
     kinds: dict[str, list[float]] = {}
     for cell, content in done.items():
         kinds.setdefault(cell.kind, []).append(float(content.get("seconds", 0)))
     parts = [f"{kind} {len(each)} in {clock(sum(each))}" for kind, each in sorted(kinds.items())]
-    whole = f"{len(done)} cells, one after another: {clock(sum(map(sum, kinds.values())))} ({', '.join(parts)})"
+    whole = f"{clock(sum(map(sum, kinds.values())))}, one cell after another ({', '.join(parts)})"
     worked = [float(content["processor_seconds"]) for content in done.values() if "processor_seconds" in content]
     kept = {"processor time": f"{clock(sum(worked))} of the {len(worked)} cells that kept it"} if worked else {}
-    return {"time on the clock": whole, **kept}
+    return {"cells": f"{len(done)} of {wanted}", "time on the clock": whole, **kept}
 
 
 def by_code(done: Done) -> list[str]:

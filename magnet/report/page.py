@@ -95,7 +95,7 @@ def page(
     lines: list[str] = []
     cells = cells_of(block for parts in blocks.values() for block in parts)
     done = {cell: found for cell in cells if (found := store.get(cell)) is not None}
-    facts = {**facts, **took(done)}
+    facts = {**facts, **took(done, len(cells))}
     content: dict[str, Any] = {"facts": facts, "tables": {}}
     for name, parts in blocks.items():
         titled = name[0] not in "A12345"

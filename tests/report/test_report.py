@@ -289,8 +289,9 @@ def test_the_page_says_what_its_cells_took_and_which_code_ran_them() -> None:
         {"seconds": 0.0, "code": ""},
     ]
     done = dict(zip(cells, found, strict=True))
-    assert took(done) == {
-        "time on the clock": "5 cells, one after another: 1:31 h (measure 4 in 0:31 h, train 1 in 1:00 h)",
+    assert took(done, 7) == {
+        "cells": "5 of 7",
+        "time on the clock": "1:31 h, one cell after another (measure 4 in 0:31 h, train 1 in 1:00 h)",
         "processor time": "0:06 h of the 2 cells that kept it",
     }
     assert by_code(done)[-4:-1] == [
@@ -298,7 +299,7 @@ def test_the_page_says_what_its_cells_took_and_which_code_ran_them() -> None:
         "- 1a2b3c4: 1 cells (train base 1)",
         "- code that was not kept: 2 cells (measure duet 1, measure floors 1)",
     ]
-    assert took({}) == {} and by_code({}) == []
+    assert took({}, 7) == {} and by_code({}) == []
 
 
 def test_a_cell_keeps_the_code_and_the_time_that_it_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
