@@ -20,6 +20,7 @@ from magnet.sampling.schedule import Grid
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.partner import PartnerInpainting
 from magnet.testing import random_scene, tiny_denoiser
+from tests.cases import few
 
 # What an untrained model says of pairs contradicts what it says of steps: it is trusted as little as steps allow.
 FAST = {
@@ -107,7 +108,7 @@ TASKS = {
 }
 
 
-@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("people", few([1, 2, 3, 4]))
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, options, generator, people, task):
     scene = random_scene(2, 48, people, generator)
@@ -123,7 +124,7 @@ def test_keyframes_come_back_bit_identical_and_nothing_jumps_there(model, option
         assert (most < 1.2 * inside[what]).all(), what
 
 
-@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.parametrize("task", few(TASKS.values(), 1), ids=TASKS)
 def test_nothing_jumps_at_the_keyframes_of_the_model_that_ships(task):
     """As it samples by default, but for the number of steps, on a scene that it made and on people it never saw."""
     model, options = Denoiser.load("duet"), SamplerOptions(steps=6)
@@ -152,7 +153,7 @@ def changes(scene: Scene, known: Tensor) -> tuple[dict[str, Tensor], dict[str, T
 
 
 @pytest.mark.parametrize("task", [*TASKS.values(), Inbetweening(keys=(-1,), agents=(1,))], ids=[*TASKS, "other's"])
-@pytest.mark.parametrize("tokens", [12, 26])
+@pytest.mark.parametrize("tokens", few([12, 26], 1))
 def test_tokens_agree_with_the_world_everywhere(model, options, generator, task, tokens):
     """Gaps shorter and longer than the window of 8; steps into keyframes too."""
     scene = random_scene(2, tokens * 4, 3, generator)
