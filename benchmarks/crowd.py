@@ -2,10 +2,11 @@
 
     python benchmarks/crowd.py --people 2 4 8 16 32 64 128 200 --plot docs/pictures/crowd_cost.png
     python benchmarks/crowd.py --people 200 --frames 900 --out crowd.npz
-    python benchmarks/crowd.py --people 24 --frames 1800 --memory docs/pictures/crowd_memory.png
+    python benchmarks/crowd.py --people 200 --frames 1800 --memory docs/pictures/crowd_memory.png
 
 Views a step are what the network looks at; time is that of the processor and of the clock, of sampling and of what is
-corrected after it, of whoever is more than the model has slots for. With --memory nothing of the crowd is kept.
+corrected after it, of whoever is more than the model has slots for. With --memory what is made is kept on the disk
+until the end, so that the memory drawn is that of making it.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import argparse
 import os
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import torch
@@ -50,10 +52,43 @@ def held_gb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e9
 
 
-def rolled(model: magnet.Model, start: Scene, frames: int, stats: SamplingStats, chunk: int = CHUNK) -> Iterator[Scene]:
+class Memory:
+    """What the process holds while a crowd is made, after each denoising step; chunks are kept on the disk.
+
+    Attributes:
+        held: gigabytes, step by step.
+        pieces: files of the chunks.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.held, self.pieces = folder, [held_gb()], list[Path]()
+
+    def step(self, steps: int) -> None:
+        self.held += [held_gb()] * steps
+
+    def keep(self, piece: Scene) -> None:
+        self.pieces.append(self.folder / f"{len(self.pieces)}.npz")
+        piece.save(self.pieces[-1])
+
+    def plot(self, people: int, frames: int, path: Path) -> None:
+        from matplotlib.figure import Figure
+
+        seconds = torch.linspace(0, frames / FPS, len(self.held)).tolist()
+        for number in range(0, len(self.held), max(len(self.held) // 20, 1)):
+            print(f"  {seconds[number]:.1f} s of the crowd, {self.held[number]:.3f} GB")
+        figure = Figure(figsize=(5, 2.6), layout="constrained")
+        axis = figure.subplots()
+        axis.plot(seconds, self.held)
+        axis.set(xlabel=f"seconds of {people} people", ylabel="memory, GB", ylim=(0, None))
+        figure.savefig(path, dpi=110)
+
+
+def rolled(
+    model: magnet.Model, start: Scene, frames: int, stats: SamplingStats, progress: Callable[[int], None] | None
+) -> Iterator[Scene]:
     """A crowd that goes on from a start, chunk by chunk."""
     generator = torch.Generator().manual_seed(1)
-    rest = model.sampler, generator, None, stats, chunk
+    rest = model.sampler, generator, progress, stats, CHUNK
     return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, *rest).chunks()
 
 
@@ -63,41 +98,31 @@ def couples(model: magnet.Model, people: int) -> list[Scene]:
     return [made.permute_agents(torch.arange(first, min(first + 2, people))) for first in range(0, people, 2)]
 
 
-def sampled(model: magnet.Model, groups: list[Scene], people: int, frames: int, spacing: float) -> tuple[Scene, Cost]:
+def sampled(
+    model: magnet.Model, groups: list[Scene], people: int, frames: int, spacing: float, memory: Memory | None = None
+) -> tuple[Scene, Cost]:
     """A crowd of couples that goes on for so many frames, and what that cost."""
     start = model.start_crowd(people, groups, spacing, seed=0).plain()
     stats, began, used = SamplingStats(), time.perf_counter(), time.process_time()
-    pieces = []
-    for piece in rolled(model, start, frames, stats):
-        pieces.append(piece)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        done = sum(each.frames for each in pieces)
-        print(f"  {people} people, {done} frames after {time.perf_counter() - began:.0f} s, {peak:.2f} GB", flush=True)
-    scene = cat_time(pieces)
+    pieces, done = [], 0
+    for piece in rolled(model, start, frames, stats, None if memory is None else memory.step):
+        done += piece.frames
+        if memory is None:
+            pieces.append(piece)
+        else:
+            memory.keep(piece)
+        took, cpu = time.perf_counter() - began, time.process_time() - used
+        print(
+            f"  {people} people, {done} frames after {took:.0f} s, {cpu:.0f} s of processor, {held_gb():.2f} GB",
+            flush=True,
+        )
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    scene = cat_time(pieces if memory is None else [Scene.load(path) for path in memory.pieces])
     scene = settled_moments(scene) if people > model.denoiser.layout.agents else scene
     took, cpu = time.perf_counter() - began, time.process_time() - used
     views = stats.windows / stats.calls
     cost = Cost(people, stats.calls, views, 1000 * cpu / stats.calls, frames / took, frames / cpu, peak)
     return scene, cost
-
-
-def remembered(model: magnet.Model, people: int, frames: int, spacing: float, path: Path) -> None:
-    """Memory of a crowd that goes on, after each two seconds of it, of which nothing is kept."""
-    from matplotlib.figure import Figure
-
-    start = model.start_crowd(people, couples(model, people), spacing, seed=0).plain()
-    began, used, done, line = time.perf_counter(), time.process_time(), 0, [(0.0, held_gb())]
-    for piece in rolled(model, start, frames, SamplingStats(), chunk=16):
-        done += piece.frames
-        line.append((done / FPS, held_gb()))
-        cpu = time.process_time() - used
-        print(f"  {done / FPS:.1f} s of the crowd, {line[-1][1]:.3f} GB, {cpu:.0f} s of processor", flush=True)
-    print(f"{people} people, {done} frames in {time.perf_counter() - began:.0f} s")
-    figure = Figure(figsize=(5, 2.6), layout="constrained")
-    axis = figure.subplots()
-    axis.plot(*zip(*line, strict=True))
-    axis.set(xlabel=f"seconds of {people} people", ylabel="memory, GB", ylim=(0, None))
-    figure.savefig(path, dpi=110)
 
 
 def company(scene: Scene) -> str:
@@ -171,17 +196,19 @@ def main() -> None:
     options.add_argument("--spacing", type=float, default=3.0)
     options.add_argument("--settle", choices=("off", "light", "firm", "hold"), help="(default: as the model says)")
     options.add_argument("--plot", type=Path)
-    options.add_argument("--memory", type=Path, help="plot memory over time, of the first number of people")
+    options.add_argument("--memory", type=Path, help="plot memory over time, of the last number of people")
     options.add_argument("--out", type=Path, help="where the last crowd goes")
     chosen = options.parse_args()
     settle = {} if chosen.settle is None else {"settle": chosen.settle}
     model = magnet.Model(magnet.load().denoiser, SamplerOptions.preset(chosen.sampler, steps=chosen.steps, **settle))
-    if chosen.memory:
-        return remembered(model, chosen.people[0], chosen.frames, chosen.spacing, chosen.memory)
     costs, groups = [], couples(model, max(chosen.people))
     for people in chosen.people:
-        scene, cost = sampled(model, groups, people, chosen.frames, chosen.spacing)
+        with TemporaryDirectory() as folder:
+            memory = Memory(Path(folder)) if chosen.memory else None
+            scene, cost = sampled(model, groups, people, chosen.frames, chosen.spacing, memory)
         costs.append(cost)
+        if memory is not None:
+            memory.plot(people, scene.frames, chosen.memory)
         print(
             f"{cost.people} people: {cost.views:.1f} views a step, {cost.cpu_ms:.0f} ms of processor a step, "
             f"{cost.fps:.2f} frames/s, {cost.cpu_fps:.2f} a second of processor; peak {cost.peak_gb:.2f} GB "
