@@ -158,12 +158,13 @@ def main() -> None:
     given = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     given.add_argument("--model", default="duet")
     given.add_argument("--steps", type=int, default=4)
+    given.add_argument("--settle", help="how poses are corrected (default: as the model is best sampled)")
     given.add_argument("--scenes", type=int, default=10)
     given.add_argument("--samples", type=int, default=8, help="how often each start is gone on from")
     given.add_argument("--frames", type=int, default=60)
     given.add_argument("--out", type=Path, default=Path("runs/results/agents"))
     asked = given.parse_args()
-    model, options = Denoiser.load(asked.model), SamplerOptions(steps=asked.steps, any_floor=True)
+    model, options = Denoiser.load(asked.model), SamplerOptions(steps=asked.steps, any_floor=True, settle=asked.settle)
     scenes, rows = starts(asked.frames, asked.scenes), []
     asked.out.mkdir(parents=True, exist_ok=True)
     print(

@@ -81,7 +81,7 @@ def started(folder: Path, name: str, where: dict[str, str], asked: argparse.Name
     """An agent's process."""
     words = [sys.executable, "-m", "magnet", "agent", "--name", name, "--scene", str(folder / "start.npz")]
     words += ["--model", asked.model, "--steps", str(asked.steps), "--meet", "300", "--listen", where[name]]
-    words += ["--speed", str(asked.speed)]
+    words += ["--speed", str(asked.speed), *([] if asked.settle is None else ["--settle", asked.settle])]
     for other in sorted(set(where) - {name}):
         words += ["--connect", f"{other}={where[other]}"]
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -129,6 +129,7 @@ def main() -> None:
     given.add_argument("--names", default="ABCD")
     given.add_argument("--steps", type=int, default=4)
     given.add_argument("--speed", type=float, default=1.0, help="of the scene's clock, see magnet agent")
+    given.add_argument("--settle", help="see magnet agent")
     given.add_argument("--minutes", type=float, default=10)
     given.add_argument("--every", type=float, default=120, help="seconds from one kill to the next")
     given.add_argument("--away", type=float, default=10, help="seconds until it is started again")

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
-from magnet.denoiser.options import Sampling
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.rollout import CHUNK, Rollout
+from magnet.generation.settling import PACE, carried_on
 from magnet.motion.frames import canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
@@ -43,7 +43,8 @@ class OwnRollout(Rollout):
     """The part of an agentic task that one agent computes, in its own view.
 
     What has not come of another agent is unknown, at level K, as what a view hides is; it is filled in when it comes
-    (`fill`). With everything there in time, the tokens are those of `AgenticAsync` or `AgenticSync` in one process.
+    (`fill`). With everything there in time, the tokens are those of `AgenticAsync` or `AgenticSync` in one process. Own
+    poses are corrected as there (`settle`), out of the bodies that the others have told; theirs stay as they are.
 
     Args:
         model: the trained denoiser.
@@ -55,7 +56,7 @@ class OwnRollout(Rollout):
         missing: (N, P) bool, token steps of the past that are not known.
 
     Raises:
-        ValueError: another offset or block, several scenes, no such agent, `settle`, or what `Rollout` refuses.
+        ValueError: another offset or block, several scenes, no such agent, `settle_blocks`, or what `Rollout` refuses.
     """
 
     def __init__(
@@ -74,12 +75,9 @@ class OwnRollout(Rollout):
             raise ValueError(
                 f"past: got {past.scenes} scenes of {past.agents} agents, expected one, agent {agent} in it"
             )
-        options = (options or SamplerOptions()).filled(Sampling(settle="off"))
-        if options.settle != "off" or options.settle_blocks:
-            raise ValueError(
-                f"settle: got {options.settle}, expected off: of the others an agent knows tokens and places, and no "
-                "bodies to make way for"
-            )
+        options = options or SamplerOptions()
+        if options.settle_blocks:
+            raise ValueError("settle_blocks: got true, expected false: tokens that are told stay as they were made")
         if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
             options = dataclasses.replace(options, placement="integrate")
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
@@ -87,6 +85,7 @@ class OwnRollout(Rollout):
         self.row = past.frames // TOKEN_FRAMES  # the next that is generated
         with torch.no_grad():
             self._bring_in(self.row)
+            self._finalize(self.row, self.row)
         if missing is not None:
             self._forget(missing)
 
@@ -120,6 +119,7 @@ class OwnRollout(Rollout):
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(row + 1)
         self._run(self._in_own_view(stage))
+        self._expect_others(row)
         self._finalize(row + 1, row + 1)
         local = row - self.first
         latent = self.tokens[0, local, self.agent, : self.model.layout.latent].clone()
@@ -138,9 +138,33 @@ class OwnRollout(Rollout):
         visibility = None if bool(visible.all()) else visible.expand(len(own), -1, -1)
         return dataclasses.replace(stage, levels=levels, visibility=visibility)
 
+    def _expect_others(self, row: int) -> None:
+        """Others who have not told their frames up to a token step go on as they went, as far as bodies matter."""
+        world, local = self.world, row - self.first
+        if world.settle is None:
+            return
+        for slot in (world.given.present[0].cpu() & (torch.arange(len(world.placed[0])) != self.agent)).nonzero():
+            told = world.placed[:local, slot[0]].nonzero()
+            stop = (int(told[-1]) + 1) * TOKEN_FRAMES if len(told) else 0
+            if stop and stop < local * TOKEN_FRAMES:
+                low = max(stop - 1 - PACE, 0)
+                one = world.given.slice(low, local * TOKEN_FRAMES).permute_agents(slot)
+                self._show(
+                    stop, slot, carried_on(one, torch.ones(1, dtype=torch.bool), stop - 1 - low).slice(stop - low)
+                )
+
+    def _show(self, frame: int, slot: Tensor, motion: Scene) -> None:
+        """Somebody's body is this from some frame on. slot (1,), motion (1, f, 1)"""
+        given, frames = self.world.given, slice(frame, frame + motion.frames)
+        given.body_rot[:, frames, slot] = motion.body_rot.to(given.body_rot)
+        given.T_world_root[:, frames, slot] = motion.T_world_root.to(given.T_world_root)
+
     @torch.no_grad()
-    def fill(self, row: int, slot: int, T_world_can: Tensor, latent: Tensor) -> bool:
-        """Enter a token of somebody else, as an `OwnToken` has it; whether it is of any use still. (4, 4, 4), (C,)"""
+    def fill(self, row: int, slot: int, motion: Scene, T_world_can: Tensor, latent: Tensor) -> bool:
+        """Enter a token of somebody else, as an `OwnToken` has it; whether it is of any use still.
+
+        motion (1, 4, 1), T_world_can (4, 4, 4), latent (C,)
+        """
         if slot == self.agent or row <= self.first or self.has(row, slot):
             return False
         with torch.autocast(self._autocast[0], enabled=False):
@@ -148,7 +172,8 @@ class OwnRollout(Rollout):
             local, world, layout = row - self.first, self.world, self.model.layout
             frames = slice(local * TOKEN_FRAMES, (local + 1) * TOKEN_FRAMES)
             world.T_world_can[0, frames, slot] = T_world_can.to(world.T_world_can)
-            world.placed[local, slot] = True
+            world.placed[local, slot] = world.known[local, slot] = True  # known: their bodies are as they are told
+            self._show(frames.start, torch.tensor([slot]), motion)
             stop = min(local + 2, len(world.placed))  # a token that came earlier begins where this one ends
             moved = torch.zeros_like(world.placed)
             moved[local:stop, slot] = world.placed[local:stop, slot]

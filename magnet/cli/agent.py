@@ -42,6 +42,11 @@ def parser() -> argparse.ArgumentParser:
     add("--task", choices=("agentic_sync", "agentic_async"), default="agentic_sync", help="in step, or in turns")
     add("--model", default=None, metavar="NAME", help="shipped model or checkpoint")
     add("--steps", type=int, default=4, help="denoising steps (default: %(default)s)")
+    add(
+        "--settle",
+        choices=("off", "light", "firm", "hold"),
+        help="correct poses (default: as the model is best sampled)",
+    )
     add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
     add("--seed", type=int, default=0, help="of the noise, the same for all (default: %(default)s)")
     add("--play", metavar="FILE", help="play the motion in this file instead of generating any")
@@ -123,8 +128,8 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
         if not 0 <= given.person < recording.agents:
             raise CommandError(f"--person {given.person}: {given.play} has people 0 to {recording.agents - 1}")
         return Player(recording.permute_agents(torch.tensor([given.person])), start, names, given.name)
-    precision = {} if given.precision is None else {"precision": given.precision}
-    options = SamplerOptions(steps=given.steps, **precision)
+    asked = {name: value for name in ("precision", "settle") if (value := getattr(given, name)) is not None}
+    options = SamplerOptions(steps=given.steps, **asked)
     task = AgenticSync() if given.task == "agentic_sync" else AgenticAsync()
     return Agent(Denoiser.load(given.model), start, names, given.name, task, options, given.seed)
 

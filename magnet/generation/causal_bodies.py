@@ -137,7 +137,7 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
-    unseen = world.known[rows].any(dim=0).to(new.device)
+    unseen = (world.known[rows] | ~world.placed[rows]).any(dim=0).to(new.device)
     made, offset = settled_on(made, before, new, unseen, how, world.correction, uncorrected)
     world.correction = offset[:, own - LEAD : own]
     return made.slice(0, own)

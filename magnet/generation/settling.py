@@ -232,7 +232,8 @@ def settled_on(
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        one = own_correction(seen, body, how, ~(new & who), known is not None, past, holding, last)
+        own = None if past is None else past * who[:, None]  # the others are seen as shown, corrected already
+        one = own_correction(seen, body, how, ~(new & who), known is not None, own, holding, last)
         offset[:, :, who] = one[:, :, who]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset

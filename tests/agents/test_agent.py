@@ -63,12 +63,12 @@ def together(members: Sequence, tokens: int, link: Lossy, order=(1, 0, 2)) -> li
 @pytest.mark.parametrize("posterior", [False, True])
 @pytest.mark.parametrize("kind", TASKS)
 def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind, posterior):
-    """Of a model, too, that is best sampled with corrections, which agents leave out, and with averaged paths."""
+    """Of a model, too, that is best sampled with averaged paths."""
     best = Sampling(settle="hold", smooth_path=True) if posterior else Sampling()
     denoiser = tiny_denoiser(max_agents=4, window=8, network={"pairwise_posterior": posterior}, sampling=best)
     task, frames, plain = TASKS[kind], 4 * 8, replace(REFERENCE, settle="off")
     whole = generate(denoiser, start, task, 24, frames, 1, plain, torch.Generator().manual_seed(1)).slice(24)
-    agents = group(denoiser, start, task)
+    agents = group(denoiser, start, task, plain)
     made = together(agents, 8, Lossy(delay=int(kind == "in step")))
     for slot, agent in enumerate(agents):
         told = poses_of(whole.permute_agents(torch.tensor([slot])))
@@ -78,6 +78,43 @@ def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind
             torch.from_numpy(told),
         )
         assert agent.gaps == 0
+
+
+def test_agents_correct_their_poses_as_one_process_does(start):
+    """To the rounding of what is told, which corrections of people who stand in each other magnify."""
+    denoiser = tiny_denoiser(max_agents=4, window=8, sampling=Sampling(settle="hold", smooth_path=True))
+    for kind, tokens in (("in step", 3), ("in turns", 2)):
+        made = [
+            generate(denoiser, start, TASKS[kind], 24, 4 * tokens, 1, options, torch.Generator().manual_seed(1)).slice(
+                24
+            )
+            for options in (REFERENCE, replace(REFERENCE, settle="off"))
+        ]
+        agents = group(denoiser, start, TASKS[kind])
+        told = [cat_time(each) for each in together(agents, tokens, Lossy(delay=int(kind == "in step")))]
+        for slot in range(len(NAMES)):
+            whole, plain = (poses_of(each.permute_agents(torch.tensor([slot]))) for each in made)
+            assert abs(poses_of(told[slot]) - whole).max() < 5e-3 < abs(plain - whole).max()
+
+
+def test_who_is_not_heard_is_expected_to_go_on_and_people_make_way_for_where_they_are(denoiser, start):
+    """B tells that it stands where A does: A's shown body goes out of B's way, and its token stays."""
+    options = replace(REFERENCE, settle="firm")
+    one = Agent(denoiser, start, NAMES, "A", AgenticSync(), options, seed=1)
+    two = Agent(denoiser, start, NAMES, "A", AgenticSync(), options, seed=1)
+    first = one.step(), two.step()
+    assert np.array_equal(first[0].poses, first[1].poses)
+    for agent, away in ((one, 0.05), (two, 5.0)):
+        poses = first[0].poses.copy()
+        poses[:, 0] += away
+        agent.hear(replace(first[0], agent="B", sender="B", poses=poses, token=None, model=""))
+    told = one.step(), two.step()
+    assert np.abs(told[0].poses[:, :3] - told[1].poses[:, :3]).max() > 0.01
+    one.step()
+    one.step()  # B's second and third token do not come
+    last, row = one.rollout.world.given.T_world_root[0, :, 1, :3, 3], 6 - one.rollout.first
+    steps = last[4 * row + 3 : 4 * (row + 3)].diff(dim=0)[:, [0, 2]].norm(dim=-1)
+    assert (steps > 0).all() and (steps.diff() < 0).all()  # it goes on, ever slower
 
 
 def test_what_is_missing_is_unknown_and_is_filled_in_when_it_comes(denoiser, start):
@@ -177,5 +214,5 @@ def test_what_cannot_be_is_named(denoiser, start):
         Agent(denoiser, start, ("A", "B"), "A", AgenticSync())
     with pytest.raises(ValueError, match="turns with offset 1"):
         Agent(denoiser, start, NAMES, "A", AgenticAsync(offset=0.5))
-    with pytest.raises(ValueError, match="settle"):
-        Agent(denoiser, start, NAMES, "A", AgenticSync(), SamplerOptions(settle="light"))
+    with pytest.raises(ValueError, match="settle_blocks"):
+        Agent(denoiser, start, NAMES, "A", AgenticSync(), SamplerOptions(settle="light", settle_blocks=True))
