@@ -249,8 +249,8 @@ class Agent(Notebook):
                     self._wanted.add((slot, index))
                     continue
                 piece = self.pieces[slot][index]
-                motion = motion_of(piece.poses, piece.betas)
-                if rollout.fill(row, slot, motion, *self._token(slot, index, piece)):
+                motion = None if rollout.world.settle is None else motion_of(piece.poses, piece.betas)
+                if rollout.fill(row, slot, *self._token(slot, index, piece), motion):
                     self.filled += (slot, index) in self._wanted
             placed = rollout.world.placed[max(rollout.row - rollout.model.window - rollout.first, 0) :, slot]
             rollout.be_there(slot, bool(self.start.present[0, slot]) and bool(placed.any()))

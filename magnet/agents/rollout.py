@@ -160,10 +160,10 @@ class OwnRollout(Rollout):
         given.T_world_root[:, frames, slot] = motion.T_world_root.to(given.T_world_root)
 
     @torch.no_grad()
-    def fill(self, row: int, slot: int, motion: Scene, T_world_can: Tensor, latent: Tensor) -> bool:
+    def fill(self, row: int, slot: int, T_world_can: Tensor, latent: Tensor, motion: Scene | None = None) -> bool:
         """Enter a token of somebody else, as an `OwnToken` has it; whether it is of any use still.
 
-        motion (1, 4, 1), T_world_can (4, 4, 4), latent (C,)
+        T_world_can (4, 4, 4), latent (C,), motion (1, 4, 1), which only corrections ask for
         """
         if slot == self.agent or row <= self.first or self.has(row, slot):
             return False
@@ -172,8 +172,10 @@ class OwnRollout(Rollout):
             local, world, layout = row - self.first, self.world, self.model.layout
             frames = slice(local * TOKEN_FRAMES, (local + 1) * TOKEN_FRAMES)
             world.T_world_can[0, frames, slot] = T_world_can.to(world.T_world_can)
-            world.placed[local, slot] = world.known[local, slot] = True  # known: their bodies are as they are told
-            self._show(frames.start, torch.tensor([slot]), motion)
+            world.placed[local, slot] = True
+            if motion is not None:
+                world.known[local, slot] = True  # so that the body stays as it is told
+                self._show(frames.start, torch.tensor([slot]), motion)
             stop = min(local + 2, len(world.placed))  # a token that came earlier begins where this one ends
             moved = torch.zeros_like(world.placed)
             moved[local:stop, slot] = world.placed[local:stop, slot]
