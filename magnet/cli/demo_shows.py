@@ -57,7 +57,7 @@ class Show:
         scene: coupling and number of people of the test scene it starts from; or a scene that comes with the model.
         context: frames of it that are given.
         frames: generated after them.
-        stabilization_level: noise level at which finished tokens are shown to the model.
+        stabilization_level: noise level at which finished tokens are shown to a model that names none itself.
     """
 
     name: str
@@ -101,8 +101,6 @@ def run(options: argparse.Namespace) -> int:
     facts = {"checkpoint": options.ckpt_path or "shipped"}
     outputs.show_results(results, out, facts)
     for show in SHOWS:
-        if options.sampler == "paper":  # what the shows themselves ask for suits our own way of sampling
-            show = replace(show, stabilization_level=sampler.guidance.stabilization_level)
         console.rule(show.name)
         for line in perform(show, model, data, sampler, out, options.minute):
             console.print(line)
@@ -133,7 +131,9 @@ def perform(
     truth = test_scene(data, *show.scene)
     generator = torch.Generator().manual_seed(data.seed)
     began = time.perf_counter()
-    sampler = replace(sampler, guidance=replace(sampler.guidance, stabilization_level=show.stabilization_level))
+    guidance = sampler.filled(model.sampling).guidance
+    if guidance.stabilization_level is None:
+        sampler = replace(sampler, guidance=replace(guidance, stabilization_level=show.stabilization_level))
     sampled = generate(model, truth, show.task, show.context, frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
     sampled.save(out / f"{show.name}.npz")

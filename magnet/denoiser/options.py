@@ -178,12 +178,14 @@ class Sampling:
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
+        stabilization_level: noise level at which it is shown what it has finished.
     """
 
     stride: int | None = None
     pyramid_offset: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
+    stabilization_level: int | None = None
 
     def __post_init__(self) -> None:
         SamplerOptions().filled(self)  # which refuses what no sampler takes

@@ -272,6 +272,7 @@ class Rollout:
                 self.first,
                 self.history,
                 self.body_guidance,
+                self.world.known,
             )
         self.reached = max(self.reached, stage.active[1])
         if self.world.causal and self.expected.most:

@@ -34,8 +34,9 @@ class Guidance:
             (`self`) or the others' (`partner`) history, so that they differ.
         smooth: lambda of smoothing guidance (paper A.8, Eq. 14, which gives no value); each denoising step then
             also runs the model backward. Known tokens are never moved.
-        stabilization_level: noise level at which the model is shown what is finished, for long scenes: small errors
-            then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
+        stabilization_level: noise level at which the model is shown what it has finished, but not what it was given:
+            small errors then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
+            None: as the model is best sampled, or 0.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """
@@ -44,7 +45,7 @@ class Guidance:
     weight: float = 1.0
     paper_average: bool = False
     smooth: float = 0.0
-    stabilization_level: int = 0
+    stabilization_level: int | None = None
     cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -52,7 +53,8 @@ class Guidance:
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
         require_number("cond_weight", self.cond_weight, least=0)
-        require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
+        if self.stabilization_level is not None:
+            require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
 
     def branches(self, there: Tensor) -> Tensor:
         """Whose history each branch sees, the unguided one first. Slots that are free in all scenes are left out.
@@ -82,19 +84,19 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
+        given: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The noisy tokens that the next step starts from where it denoises, and the guided prediction.
 
-        Smoothing changes the former. tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P) ->
-        (B, W, P, D) twice
+        Smoothing changes the former. Arguments as for `predict` -> (B, W, P, D) twice
         """
         if not self.smooth:
-            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout)
+            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout, given)
         # Lightning tests in inference mode, whose tensors no gradient may pass.
         with torch.inference_mode(False), torch.enable_grad():
             noisy = tokens.clone().requires_grad_()
             still = levels.clone(), present.clone(), mask_noise.clone()
-            clean = self.predict(denoise, noisy, *still, layout)
+            clean = self.predict(denoise, noisy, *still, layout, given)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
         return tokens - self.smooth * slope, clean.detach()
 
@@ -106,11 +108,23 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
+        given: Tensor | None = None,
     ) -> Tensor:
         """Guided prediction; all branches run as one batch.
 
         Clean tokens are history. A branch that must not see someone's history has it at level K, as noise.
-        tokens, mask_noise (B, W, P, D), levels (B, W, P) int, present (B, P) -> (B, W, P, D)
+
+        Args:
+            denoise: the model.
+            tokens: (B, W, P, D).
+            levels: (B, W, P) int.
+            present: (B, P) bool.
+            mask_noise: (B, W, P, D).
+            layout: which numbers of a token share a level.
+            given: (W, P) bool, tokens that were given, which `stabilization_level` leaves clean; None: none.
+
+        Returns:
+            (B, W, P, D).
         """
         if self.kind == "none" and not self.stabilization_level:
             return denoise(tokens, levels, present)
@@ -119,7 +133,8 @@ class Guidance:
         sees = self.branches(there)  # (K, P)
         clean = levels == 0
         if self.stabilization_level:
-            told = torch.where(clean, self.stabilization_level, levels)
+            made = clean if given is None else clean & ~given
+            told = torch.where(made, self.stabilization_level, levels)
             tokens = noisier(tokens, mask_noise, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
             levels = told
         if len(sees) == 1:

@@ -134,7 +134,11 @@ class SamplerOptions:
     def filled(self, best: Any) -> SamplerOptions:
         """These options where they say something; what they leave open from another object's fields of that name."""
         left_open = [each.name for each in fields(self) if getattr(self, each.name) is None]
-        return replace(self, **{name: getattr(best, name) for name in left_open if hasattr(best, name)})
+        guidance = self.guidance
+        if guidance.stabilization_level is None:
+            guidance = replace(guidance, stabilization_level=getattr(best, "stabilization_level", None))
+        named = {name: getattr(best, name) for name in left_open if hasattr(best, name)}
+        return replace(self, guidance=guidance, **named)
 
     @classmethod
     def preset(cls, name: str, **said: Any) -> SamplerOptions:

@@ -72,6 +72,7 @@ def sample(
         guidance,
         noise,
         history=history,
+        known=schedule.known,
     )
 
 
@@ -96,12 +97,13 @@ def run_stages(
     offset: int = 0,
     history: History | None = None,
     correct: Correct | None = None,
+    known: Tensor | None = None,
 ) -> Tensor:
     """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
     `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
-    `correct` changes what each step predicts.
+    `correct` changes what each step predicts; `known` (N, P) bool are tokens that were given.
     """
     tokens, guidance = tokens.clone(), guidance or Guidance()
     for stage in stages:
@@ -119,6 +121,7 @@ def run_stages(
             offset + stage.start,
             None if history is None else history.window(window),
             correct,
+            None if known is None else known[window].to(tokens.device),
         )
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)

@@ -2,9 +2,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from magnet.denoiser.options import Sampling
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance, roughness
 from magnet.sampling.noise import LEVELS, add_noise
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.planned_stage import run_planned_stage
 from magnet.sampling.schedule import Stage
 
@@ -127,6 +129,32 @@ def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(g
         Guidance("histry")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="stabilization_level: got 1000"):
         Guidance(stabilization_level=1000)
+
+
+def test_given_tokens_are_shown_clean_beside_finished_ones_that_are_not(given):
+    """Agent 0's first two tokens were given; a model that is told less of what is sure would go on from it worse."""
+    tokens, levels, present, mask_noise = given
+    sure = torch.zeros(levels.shape[1:], dtype=torch.bool)
+    sure[:2, 0] = True
+    seen = []
+
+    def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
+        seen.append((noisy, shown))
+        return model(noisy, shown, present)
+
+    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT, sure)
+    (noisy, shown), own = seen[0], LAYOUT.groups() == 0
+    assert (shown[:, :2, 0] == 0).all() and torch.equal(noisy[:, :2, 0, own], tokens[:, :2, 0, own])
+    assert (shown[:, 2:4, 0] == 40).all() and (shown[:, :4, 1] == 40).all()
+
+
+def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
+    model, plain = Sampling(stride=8, stabilization_level=60), Sampling()
+    assert SamplerOptions().filled(model).guidance == Guidance(stabilization_level=60)
+    assert SamplerOptions(guidance=Guidance("self")).filled(model).guidance == Guidance("self", stabilization_level=60)
+    assert SamplerOptions(guidance=Guidance(stabilization_level=0)).filled(model).guidance.stabilization_level == 0
+    assert SamplerOptions().filled(plain).guidance.stabilization_level is None
+    assert SamplerOptions.preset("paper").filled(model).guidance.stabilization_level == 0
 
 
 def test_a_forgotten_history_is_pure_noise_at_any_context_level(given):
