@@ -123,7 +123,7 @@ def main() -> None:
     )
     parser.add_argument("--guidance", type=float, default=0.0, help="weight of history guidance")
     parser.add_argument(
-        "--stabilization_level", type=int, default=0, help="noise level at which finished tokens are shown"
+        "--stabilization_level", type=int, help="noise level at which made tokens are shown; default: the model's"
     )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="fp32")
     given = parser.parse_args()
