@@ -281,21 +281,6 @@ def test_no_stage_changes_rows_before_those_that_it_may_change(model, recording,
     assert next(low, None) is None
 
 
-def test_a_recorded_past_is_shown_clean_and_only_what_is_made_is_not(model, recording):
-    """Blocks of 4 token steps after two that are given; decoded frames depend on a few behind them as well."""
-    short = recording.slice(0, 8).select([0])
-
-    def made(level: int | None) -> Scene:
-        options = SamplerOptions(3, 4, pyramid_offset=0, guidance=Guidance(stabilization_level=level))
-        generator = torch.Generator().manual_seed(0)
-        return generate(model, short, JointFuture(), 8, 32, 1, options, generator)
-
-    clean, shaken = made(0), made(300)
-    same = (clean.T_world_root == shaken.T_world_root).flatten(3).all(dim=-1)[0].all(dim=-1)
-    assert bool(same[:16].all()) and not bool(same[28:].any())
-    assert torch.equal(made(None).T_world_root, clean.T_world_root)
-
-
 # -- without end -------------------------------------------------------------------------------
 
 GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partner_prediction")
