@@ -178,7 +178,8 @@ class Sampling:
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
-        stabilization_level: noise level at which it is shown what it has finished.
+        stabilization_level: noise level at which it is shown what it has made.
+        stabilization_after: token steps after the last given one that are shown clean too.
     """
 
     stride: int | None = None
@@ -186,6 +187,7 @@ class Sampling:
     settle: Settling | None = None
     smooth_path: bool | None = None
     stabilization_level: int | None = None
+    stabilization_after: int = 0
 
     def __post_init__(self) -> None:
         SamplerOptions().filled(self)  # which refuses what no sampler takes

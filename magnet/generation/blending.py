@@ -20,6 +20,9 @@ put elsewhere slide for longer. With `blend` 20 a difference is halved in 7 fram
 GAINS = 2.0
 """Frames within which people who go on stop to gain or lose speed as they did (docs/training.md)."""
 
+GOES_ON = 18
+"""Frames in which people who were given come from the speed they had to the one predicted (docs/training.md)."""
+
 QUICK = 0.03
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
 
@@ -178,7 +181,7 @@ def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left
     return blended.with_poses(keep, given.body_rot, given.T_world_root)
 
 
-def gone_on(before: Tensor, path: Tensor, blend: int) -> Tensor:
+def gone_on(before: Tensor, path: Tensor, blend: int = GOES_ON) -> Tensor:
     """A path that goes on as the one before it went; its own speed takes over within `blend` frames.
 
     Networks predict the first deltas after what is given too coarsely: how fast people go and turn would jump. What

@@ -32,6 +32,7 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import dtype_of
 from magnet.sampling.grid import planning_grid
+from magnet.sampling.guidance import shown_clean
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
@@ -272,7 +273,7 @@ class Rollout:
                 self.first,
                 self.history,
                 self.body_guidance,
-                self.world.known,
+                shown_clean(self.world.known, self.options.guidance.stabilization_after, self.world.since),
             )
         self.reached = max(self.reached, stage.active[1])
         if self.world.causal and self.expected.most:

@@ -35,12 +35,10 @@ from magnet.motion.frames import (
 from magnet.motion.placement import Placement, place
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
+from magnet.sampling.guidance import steps_since
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
-
-GOES_ON = 18
-"""Frames in which people who were given come from the speed they had to the one predicted (docs/training.md)."""
 
 
 class WorldState:
@@ -78,6 +76,7 @@ class WorldState:
         self.placed = self.known.clone()
         # Steps across the border of two known tokens are recorded; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
+        self.since: Tensor | None = None  # token steps to the first row from each one's last given one before it
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
         self.correction: Tensor | None = None  # of the last two frames shown, in causal plans
@@ -101,6 +100,7 @@ class WorldState:
         What is left is a view of what was, which goes when rows are added.
         """
         frames = rows * TOKEN_FRAMES
+        self.since = steps_since(self.known[:rows], self.since)
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:], self.placed[rows:]
@@ -290,7 +290,7 @@ class WorldState:
             return placed
         onward = self.known[first - 1] & ~self.known[stop] if stop < len(self.known) else self.known[first - 1]
         before = self.T_world_can[:, (first - 1) * TOKEN_FRAMES : first * TOKEN_FRAMES]
-        return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed, GOES_ON), placed)
+        return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed), placed)
 
     def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`; see `magnet.generation.entering.starts`."""

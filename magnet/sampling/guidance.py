@@ -12,6 +12,9 @@ from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
+NEVER = 10**9
+"""Token steps since somebody was given who never was."""
+
 Kind = Literal["none", "history", "self", "partner"]
 
 
@@ -34,9 +37,11 @@ class Guidance:
             (`self`) or the others' (`partner`) history, so that they differ.
         smooth: lambda of smoothing guidance (paper A.8, Eq. 14, which gives no value); each denoising step then
             also runs the model backward. Known tokens are never moved.
-        stabilization_level: noise level at which the model is shown what it has finished, but not what it was given:
-            small errors then drown in the noise instead of being taken for motion (stabilisation of diffusion forcing).
-            None: as the model is best sampled, or 0.
+        stabilization_level: noise level at which the model is shown what it has made: small errors then drown in the
+            noise instead of being taken for motion (stabilisation of diffusion forcing). What it was given is shown
+            clean. None: as the model is best sampled, or 0.
+        stabilization_after: token steps after the last given one of the same person that are shown clean too. Read
+            where `stabilization_level` is said.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """
@@ -46,6 +51,7 @@ class Guidance:
     paper_average: bool = False
     smooth: float = 0.0
     stabilization_level: int | None = None
+    stabilization_after: int = 0
     cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -55,6 +61,7 @@ class Guidance:
         require_number("cond_weight", self.cond_weight, least=0)
         if self.stabilization_level is not None:
             require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
+        require_whole("stabilization_after", self.stabilization_after, 0)
 
     def branches(self, there: Tensor) -> Tensor:
         """Whose history each branch sees, the unguided one first. Slots that are free in all scenes are left out.
@@ -84,19 +91,19 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
-        given: Tensor | None = None,
+        sure: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The noisy tokens that the next step starts from where it denoises, and the guided prediction.
 
         Smoothing changes the former. Arguments as for `predict` -> (B, W, P, D) twice
         """
         if not self.smooth:
-            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout, given)
+            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout, sure)
         # Lightning tests in inference mode, whose tensors no gradient may pass.
         with torch.inference_mode(False), torch.enable_grad():
             noisy = tokens.clone().requires_grad_()
             still = levels.clone(), present.clone(), mask_noise.clone()
-            clean = self.predict(denoise, noisy, *still, layout, given)
+            clean = self.predict(denoise, noisy, *still, layout, sure)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
         return tokens - self.smooth * slope, clean.detach()
 
@@ -108,7 +115,7 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
-        given: Tensor | None = None,
+        sure: Tensor | None = None,
     ) -> Tensor:
         """Guided prediction; all branches run as one batch.
 
@@ -121,7 +128,7 @@ class Guidance:
             present: (B, P) bool.
             mask_noise: (B, W, P, D).
             layout: which numbers of a token share a level.
-            given: (W, P) bool, tokens that were given, which `stabilization_level` leaves clean; None: none.
+            sure: (W, P) bool, tokens that `stabilization_level` leaves clean (`shown_clean`); None: none.
 
         Returns:
             (B, W, P, D).
@@ -133,8 +140,8 @@ class Guidance:
         sees = self.branches(there)  # (K, P)
         clean = levels == 0
         if self.stabilization_level:
-            made = clean if given is None else clean & ~given
-            told = torch.where(made, self.stabilization_level, levels)
+            unsure = clean if sure is None else clean & ~sure
+            told = torch.where(unsure, self.stabilization_level, levels)
             tokens = noisier(tokens, mask_noise, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
             levels = told
         if len(sees) == 1:
@@ -165,6 +172,25 @@ class Guidance:
                 agent = torch.arange(P, device=tokens.device)
                 special = each[agent, :, :, agent].permute(1, 2, 0, 3)
         return cond + self.weight * (special - uncond)
+
+
+def shown_clean(known: Tensor, after: int, since: Tensor | None = None) -> Tensor:
+    """Tokens that were given, or come within `after` token steps of one. (N, P) bool -> (N, P) bool
+
+    since (P,) int of `steps_since`, of the rows before; None: there are none.
+    """
+    row = torch.arange(len(known))[:, None]
+    last = torch.where(known, row, -NEVER if since is None else -since).cummax(dim=0).values
+    return row - last <= after
+
+
+def steps_since(known: Tensor, since: Tensor | None = None) -> Tensor:
+    """Token steps from the last given one of each person to the row after these. known (N, P) bool -> (P,) int
+
+    since (P,) the same for the rows before; None: there are none.
+    """
+    row = torch.arange(len(known))[:, None]
+    return len(known) - torch.where(known, row, -NEVER if since is None else -since).amax(dim=0)
 
 
 def noisier(tokens: Tensor, noise: Tensor, now: Tensor, wanted: Tensor) -> Tensor:

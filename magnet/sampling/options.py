@@ -136,7 +136,8 @@ class SamplerOptions:
         left_open = [each.name for each in fields(self) if getattr(self, each.name) is None]
         guidance = self.guidance
         if guidance.stabilization_level is None:
-            guidance = replace(guidance, stabilization_level=getattr(best, "stabilization_level", None))
+            names = ("stabilization_level", "stabilization_after")
+            guidance = replace(guidance, **{name: getattr(best, name) for name in names if hasattr(best, name)})
         named = {name: getattr(best, name) for name in left_open if hasattr(best, name)}
         return replace(self, guidance=guidance, **named)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import DenoiseFn, Guidance
+from magnet.sampling.guidance import DenoiseFn, Guidance, shown_clean
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.planned_stage import Correct, run_planned_stage
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
@@ -72,7 +72,7 @@ def sample(
         guidance,
         noise,
         history=history,
-        known=schedule.known,
+        sure=shown_clean(schedule.known, guidance.stabilization_after) if guidance else None,
     )
 
 
@@ -97,13 +97,13 @@ def run_stages(
     offset: int = 0,
     history: History | None = None,
     correct: Correct | None = None,
-    known: Tensor | None = None,
+    sure: Tensor | None = None,
 ) -> Tensor:
     """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
     `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
-    `correct` changes what each step predicts; `known` (N, P) bool are tokens that were given.
+    `correct` changes what each step predicts; `sure` (N, P) bool are tokens that are shown clean whatever the guidance.
     """
     tokens, guidance = tokens.clone(), guidance or Guidance()
     for stage in stages:
@@ -121,7 +121,7 @@ def run_stages(
             offset + stage.start,
             None if history is None else history.window(window),
             correct,
-            None if known is None else known[window].to(tokens.device),
+            None if sure is None else sure[window].to(tokens.device),
         )
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)
