@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -11,11 +9,9 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
-from magnet.body.fit import clearance
 from magnet.body.holding import holds
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
-from magnet.body.settle_wishes import floating
 from magnet.generation.separation import Decode, open_body_on
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene, cat_time
@@ -34,17 +30,11 @@ rather than by moving people about (docs/tasks.md)."""
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
-FINISHED_ANEW = (replace(FINISHED, hard=4.0),)
-"""How a finished chunk is corrected that is `wrong` still."""
+PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, stand=16.0, hard=20.0)
+"""How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
 
-SHOWN_ANEW = (
-    replace(SHOWN, iterations=12, inner=40, bend=800.0, hard=20.0),
-    replace(SHOWN, iterations=12, inner=40, bend=200.0, hard=40.0),
-)
-"""How a causal plan's next frames are, each where the one before leaves something wrong: with a jerk if need be."""
-
-LEFT = (Apart(body=0.07, arms=0.07), Apart(body=0.085, arms=0.085))
-"""Metres of depth that the first correction may leave, and those after it."""
+LEFT = Apart(body=0.07, arms=0.07)
+"""Metres of depth that `SHOWN` may leave."""
 
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
@@ -159,7 +149,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
     offset, holding = (None, None) if past is None else past[:2]
     still = fixed[..., there.to(fixed.device)]
-    offset = corrected_anew(shaped, body, how, still, (FINISHED, *FINISHED_ANEW), begun, offset, holding)
+    offset = settling(shaped, body, how, still, FINISHED, begun, offset, holding=holding)
     made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
@@ -172,44 +162,36 @@ def hands_held(scene: Scene, body: Body) -> Tensor:
     return holds(body.joints(scene.slice(scene.frames - 1)), scene.present)[0][:, -1]
 
 
-def corrected_anew(
+def own_correction(
     seen: Scene,
     body: Body,
     how: str,
     fixed: Tensor,
-    ways: Sequence[Settle],
     begun: bool,
     past: Tensor | None,
     holding: Tensor | None,
-    last: tuple[Tensor, Tensor] | None = None,
+    last: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """The correction of the first of `ways`; of the next for scenes in which something is `wrong` still, and so on.
+    """How one person's next frames are corrected (`SHOWN`), and anew where that leaves people deep in each other.
 
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
-    offset = settling(seen, body, how, fixed, ways[0], begun, past, holding=holding, last=last)
-    for i, way in enumerate(ways[1:]):
-        again = wrong(corrected(seen, offset), body, fixed, LEFT[min(i, 1)], begun)
-        if not bool(again.any()):
-            break
-        before, hold = (None if each is None else each[again] for each in (past, holding))
-        ends = None if last is None else (last[0][again], last[1][again])
-        still = fixed[again] if fixed.ndim == 3 and len(fixed) == len(again) else fixed
-        few = seen.select(again.nonzero()[:, 0])
-        offset[again] = settling(few, body, how, still, way, begun, before, holding=hold, last=ends)
+    offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
+    deep = left_deep(corrected(seen, offset), body)
+    if bool(deep.any()):
+        before, hold = (None if each is None else each[deep] for each in (past, holding))
+        ends = None if last is None else (last[0][deep], last[1][deep])
+        few = seen.select(deep.nonzero()[:, 0])
+        offset[deep] = settling(few, body, how, fixed, PRESSED, begun, before, holding=hold, last=ends)
     return offset
 
 
-def wrong(scene: Scene, body: Body, fixed: Tensor, left: Apart, begun: bool) -> Tensor:
-    """In which scenes somebody who is not `fixed` is deeper than `left` in another, or floats. -> (B,) bool"""
-    joints, there = body.joints(scene), scene.present[:, None]
-    free = ~fixed & there
+def left_deep(scene: Scene, body: Body) -> Tensor:
+    """In which scenes two people are deeper in each other than `LEFT` in some frame. -> (B,) bool"""
+    joints = body.joints(scene)
     first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
-    both = there[..., first] & there[..., second] & (free[..., first] | free[..., second])
-    deep = (excess_depth(joints[:, :, first], joints[:, :, second], left) > 0) & both
-    above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
-    off = floating(joints, above, scene.fps, begun) & free
-    return deep.flatten(1).any(dim=1) | off.flatten(1).any(dim=1)
+    both = (scene.present[:, first] & scene.present[:, second])[:, None]
+    return ((excess_depth(joints[:, :, first], joints[:, :, second], LEFT) > 0) & both).flatten(1).any(dim=1)
 
 
 def settled_on(
@@ -244,7 +226,6 @@ def settled_on(
     holding = None if known is None or how != "hold" else hands_held(known, body)
     plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
     last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
-    ways = SHOWN, *SHOWN_ANEW
     for who in [agents == agent for agent in agents[moving]]:
         hidden = unseen | (moving & ~who)
         if known is None:
@@ -252,7 +233,7 @@ def settled_on(
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
         own = None if past is None else past * who[:, None]  # the others are seen as shown, corrected already
-        one = corrected_anew(seen, body, how, ~(new & who), ways, known is not None, own, holding, last)
+        one = own_correction(seen, body, how, ~(new & who), known is not None, own, holding, last)
         offset[:, :, who] = one[:, :, who]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset

@@ -9,16 +9,14 @@ import pytest
 import torch
 
 import magnet
-from magnet import checkpoints
 from magnet.bench.speed import standing
 from magnet.body import load_body
-from magnet.body.apart import Apart
 from magnet.body.energy import CONTACT
 from magnet.body.joints import TOES
 from magnet.body.settle_wishes import FIRM
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
-from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk, settled_on, wrong
+from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk, settled_on
 from magnet.metrics import hand_distance
 from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene, cat_time
@@ -240,23 +238,3 @@ def test_nobody_makes_way_for_whom_nothing_is_known_of(model) -> None:
     assert not torch.equal(expected.T_world_root[:, :, 0], both.T_world_root[:, :, 0])
     assert torch.equal(made.T_world_root[:, :, 0], expected.T_world_root[:, :, 0])
     assert torch.equal(made.T_world_root[:, :, 1], plain.T_world_root[:, :, 1])
-
-
-def test_what_is_corrected_anew_is_who_is_deep_in_another_or_floats() -> None:
-    """The scenes in the package are neither; whoever is not to be moved is nobody's fault."""
-    body, left = load_body(), Apart(body=0.07, arms=0.07)
-    scene = Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 30)
-    nobody = torch.zeros(30, scene.agents, dtype=torch.bool)
-    everybody, first = ~nobody, torch.arange(scene.agents) == 0
-
-    def judged(root: torch.Tensor, fixed: torch.Tensor) -> bool:
-        moved = scene.replace(T_world_root=root, body=body.id, valid=None, given=None)
-        return bool(wrong(moved, body, fixed, left, True)[0])
-
-    there, lifted, merged = (scene.T_world_root.clone() for _ in range(3))
-    lifted[:, :, 0, 1, 3] += 0.08
-    merged[:, :, 0, [0, 2], 3] = merged[:, :, 1, [0, 2], 3] + 0.1
-    assert not judged(there, nobody)
-    for bad in (lifted, merged):
-        assert judged(bad, nobody) and not judged(bad, everybody)
-    assert not judged(lifted, nobody | first) and judged(merged, nobody | first)
