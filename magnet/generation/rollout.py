@@ -257,6 +257,7 @@ class Rollout:
     def _run(self, stage: Stage) -> None:
         self._ahead, self.begins = stage.ahead, stage.start
         self._ask_for(stage)
+        guidance = self.options.guidance
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
@@ -268,12 +269,14 @@ class Rollout:
                 self.model.layout,
                 self.world.make_consistent,
                 self.progress,
-                self.options.guidance,
+                guidance,
                 self.noise,
                 self.first,
                 self.history,
                 self.body_guidance,
-                shown_clean(self.world.known, self.options.guidance.stabilization_after, self.world.since),
+                shown_clean(self.world.known, guidance.stabilization_after, self.world.since)
+                if guidance.stabilization_level
+                else None,
             )
         self.reached = max(self.reached, stage.active[1])
         if self.world.causal and self.expected.most:

@@ -100,7 +100,8 @@ class WorldState:
         What is left is a view of what was, which goes when rows are added.
         """
         frames = rows * TOKEN_FRAMES
-        self.since = steps_since(self.known[:rows], self.since)
+        if self.options.guidance.stabilization_level:
+            self.since = steps_since(self.known[:rows], self.since)
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:], self.placed[rows:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -106,8 +107,10 @@ def run_stages(
     `correct` changes what each step predicts; `sure` (N, P) bool are tokens that are shown clean whatever the guidance.
     """
     tokens, guidance = tokens.clone(), guidance or Guidance()
+    plain = replace(guidance, stabilization_level=0)
     for stage in stages:
         window = slice(stage.start, stage.stop)
+        kept = None if sure is None or not guidance.stabilization_level else sure[window]
         tokens[:, window] = run_planned_stage(
             denoise,
             stage,
@@ -116,12 +119,12 @@ def run_stages(
             present,
             layout,
             progress,
-            guidance,
+            plain if kept is not None and bool(kept.all()) else guidance,
             noise,
             offset + stage.start,
             None if history is None else history.window(window),
             correct,
-            None if sure is None else sure[window].to(tokens.device),
+            None if kept is None else kept.to(tokens.device),
         )
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)
