@@ -12,9 +12,6 @@ from magnet.checks import require_choice, require_number, require_whole
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
-NEVER = 10**9
-"""Token steps since somebody was given who never was."""
-
 Kind = Literal["none", "history", "self", "partner"]
 
 
@@ -40,8 +37,8 @@ class Guidance:
         stabilization_level: noise level at which the model is shown what it has made: small errors then drown in the
             noise instead of being taken for motion (stabilisation of diffusion forcing). What it was given is shown
             clean. None: as the model is best sampled, or 0.
-        stabilization_after: token steps after the last given one of the same person that are shown clean too. Read
-            where `stabilization_level` is said.
+        stabilization_after: token steps after the last given one of the same person, or the beginning, that are shown
+            clean too. Read where `stabilization_level` is said.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """
@@ -175,22 +172,22 @@ class Guidance:
 
 
 def shown_clean(known: Tensor, after: int, since: Tensor | None = None) -> Tensor:
-    """Tokens that were given, or come within `after` token steps of one. (N, P) bool -> (N, P) bool
+    """Tokens that were given, or come within `after` token steps of one or of the beginning. (N, P) bool -> same
 
     since (P,) int of `steps_since`, of the rows before; None: there are none.
     """
     row = torch.arange(len(known))[:, None]
-    last = torch.where(known, row, -NEVER if since is None else -since).cummax(dim=0).values
+    last = torch.where(known, row, -1 if since is None else -since).cummax(dim=0).values
     return row - last <= after
 
 
 def steps_since(known: Tensor, since: Tensor | None = None) -> Tensor:
-    """Token steps from the last given one of each person to the row after these. known (N, P) bool -> (P,) int
+    """Token steps from each one's last given one, or the beginning, to the row after these. (N, P) bool -> (P,) int
 
     since (P,) the same for the rows before; None: there are none.
     """
     row = torch.arange(len(known))[:, None]
-    return len(known) - torch.where(known, row, -NEVER if since is None else -since).amax(dim=0)
+    return len(known) - torch.where(known, row, -1 if since is None else -since).amax(dim=0)
 
 
 def noisier(tokens: Tensor, noise: Tensor, now: Tensor, wanted: Tensor) -> Tensor:
