@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
 from torch import Tensor
+from torchmetrics import MetricCollection
 
 from magnet import checkpoints
+from magnet.baselines import Windows
 from magnet.baselines.predictor import Predictor
 from magnet.datamodules import registry
 from magnet.datamodules.base import MotionDataModule
@@ -21,8 +23,8 @@ from magnet.datamodules.synthetic import Synthetic
 from magnet.evaluation.benchmark import Benchmark, BenchmarkTakes
 from magnet.evaluation.evaluator import Evaluator
 from magnet.evaluation.methods import sight_of
-from magnet.evaluation.scoring import generators_of
-from magnet.metrics import FrechetDistance, frechet_distance
+from magnet.evaluation.scoring import TRAINING, TRUTH, generators_of
+from magnet.metrics import FrechetDistance, Interpenetration, MotionInteraction, frechet_distance
 from magnet.metrics.frechet import moments
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.tokens import TokenLayout
@@ -37,6 +39,8 @@ OURS = "ours"
 CONTEXT, PIECE = 4, 150
 """Frames that a long generation is given (paper 4.2), and those of which each stretch is compared."""
 SPEED_FRAMES = 60
+STRIDE = 15
+"""Frames between training windows that stand for a long generation."""
 
 
 def data_of(cell: Cell) -> MotionDataModule:
@@ -159,35 +163,72 @@ def _rates(seconds: Mapping[str, Sequence[float]], left_out: int | None = None) 
     return {"fps": SPEED_FRAMES / ours, "times_shipped": shipped / ours}
 
 
-def long(cell: Cell, checkpoint: str) -> dict[str, Any]:
-    """FD of all that was generated so far against recorded stretches, as it grows; scene by scene left out."""
+def long(cell: Cell, checkpoint: str | None) -> dict[str, Any]:
+    """What was generated for long, piece by piece against recorded stretches; scene by scene left out.
+
+    FD of all that was generated so far, as it grows; MI and IP of all of it. Without a model: training windows in place
+    of what is generated, and IP of the recorded stretches.
+
+    Raises:
+        ValueError: no training windows of as many people.
+    """
     data = data_of(cell)
     data.test = HeldOutScenes(context_frames=CONTEXT, horizon_frames=PIECE, limit=cell.scenes)
     data.prepare_data()
-    method = predictor(cell, data, checkpoint, cell.frames)
+    method = None if checkpoint is None else predictor(cell, data, checkpoint, cell.frames)
+    length = min(PIECE, cell.frames)
     parts: list[Tensor] = []
     recorded: list[Tensor] = []
     done = 0
     for batch in data.test_dataloader():
-        numbers = list(range(done, done + batch.scenes))
-        generators = generators_of(cell.seed, numbers, cell.samples)
-        parts.append(method(batch.slice(0, CONTEXT), cell.samples, generators))  # without the future
+        generators = generators_of(cell.seed, list(range(done, done + batch.scenes)), cell.samples)
+        if method is not None:
+            parts.append(method(batch.slice(0, CONTEXT), cell.samples, generators))  # without the future
         recorded.append(data.body.joints(batch.slice(CONTEXT)))
         done += batch.scenes
-    made, real = torch.cat(parts, dim=1), torch.cat(recorded)
-    length = min(PIECE, cell.frames)
-    curve: dict[str, float] = {}
-    folds: dict[str, dict[str, float]] = {str(b): {} for b in range(done if done > 1 else 0)}
-    for end in range(length, cell.frames + 1, length):
-        pieces = torch.stack([_placed(made[:, :, k : k + length]) for k in range(0, end, length)])  # (K, S, B, T, ...)
-        name = f"fd@{end}"
-        curve[name] = _distance(pieces, _placed(real[:, :length]))
-        for b, row in folds.items():
-            kept = [other for other in range(done) if other != int(b)]
-            row[name] = _distance(pieces[:, :, kept], _placed(real[kept, :length]))
-    last = {"fd": curve[f"fd@{cell.frames // length * length}"]}
-    without = {b: {**row, "fd": row[f"fd@{cell.frames // length * length}"]} for b, row in folds.items()}
-    return {"rows": {OURS: {"value": {**curve, **last}, "without": without}}, "scenes": done}
+    real = torch.cat(recorded)[:, :length]
+    made = torch.cat(parts, dim=1) if parts else _recorded_elsewhere(data, real, cell.frames // length)
+    starts = range(0, cell.frames - length + 1, length)
+    pieces, real = torch.stack([_placed(made[:, :, k : k + length]) for k in starts]), _placed(real)
+    everything = slice(None)
+    others = {str(b): [other for other in range(done) if other != b] for b in range(done if done > 1 else 0)}
+
+    def row(measured: Callable[[Any], dict[str, float]]) -> dict[str, Any]:
+        return {"value": measured(everything), "without": {b: measured(kept) for b, kept in others.items()}}
+
+    rows = {TRAINING if method is None else OURS: row(lambda kept: _of_pieces(pieces[:, :, kept], real[kept]))}
+    if method is None:
+        rows[TRUTH] = row(lambda kept: _together(real[None, kept], real[kept], "ip_ratio"))
+    return {"rows": rows, "scenes": done}
+
+
+def _recorded_elsewhere(data: MotionDataModule, real: Tensor, pieces: int) -> Tensor:
+    """Training windows, evenly spread, as if they had been generated one after another. real (B, T, P, 22, 3)
+
+    -> (1, B, pieces * T, P, 22, 3)
+    """
+    scenes, length, people = real.shape[:3]
+    windows = Windows.of(data.train_windows(length, STRIDE), data.body, 0)
+    among = windows.of_people(people)
+    if not len(among):
+        raise ValueError(f"no training windows of {people} people")
+    chosen = among[torch.arange(scenes * pieces) * len(among) // (scenes * pieces)]
+    joints = windows.joints_of(chosen, people, torch.arange(length)).transpose(1, 2)
+    return joints.reshape(1, scenes, pieces * length, *joints.shape[2:])
+
+
+def _of_pieces(pieces: Tensor, real: Tensor) -> dict[str, float]:
+    """Numbers of a long generation. pieces (K, S, B, T, P, 22, 3), real (B, T, P, 22, 3)"""
+    length = real.shape[1]
+    curve = {f"fd@{k * length}": _distance(pieces[:k], real) for k in range(1, len(pieces) + 1)}
+    return {**curve, "fd": curve[f"fd@{len(pieces) * length}"], **_together(pieces.flatten(0, 1), real)}
+
+
+def _together(made: Tensor, real: Tensor, *names: str) -> dict[str, float]:
+    """How people are with each other: MI and IP, or those that are named. (S, B, T, P, 22, 3), (B, T, P, 22, 3)"""
+    metrics = MetricCollection({"MI": MotionInteraction(), "IP": Interpenetration()}, compute_groups=False)
+    metrics.update(made, real)
+    return {name: float(value) for name, value in metrics.compute().items() if name in (names or ("mi", "ip_ratio"))}
 
 
 def _placed(joints: Tensor) -> Tensor:
@@ -213,5 +254,7 @@ def run(cell: Cell, checkpoint: str | None, shipped: str, rounds: int, films: Pa
     """What a cell other than a training gives."""
     if cell.kind == "measure":
         return measure(cell, checkpoint, films)
+    if cell.kind == "long":
+        return long(cell, checkpoint)
     assert checkpoint is not None
-    return speed(cell, checkpoint, shipped, rounds) if cell.kind == "speed" else long(cell, checkpoint)
+    return speed(cell, checkpoint, shipped, rounds)

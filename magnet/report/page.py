@@ -15,7 +15,7 @@ from magnet.report.cells import Cell, Store
 from magnet.report.film import Joints, film, kept
 from magnet.report.made import by_code, took
 from magnet.report.plan import FLOORS, PAPER, Block, Claim, Row
-from magnet.report.plot import curves, dots
+from magnet.report.plot import curves, dots, is_end
 from magnet.report.statistics import Estimate, difference, estimate, verdict
 from magnet.report.summary import missing, summary
 from magnet.report.tables import cells_of
@@ -69,7 +69,7 @@ def runs_of(row: Row, store: Store) -> Runs:
 def title(metric: str) -> str:
     """Of a column, with its arrow."""
     shown = column(metric, {**own_columns(), **SHOWN})
-    name = f"to {metric.partition('@')[2]}" if metric.startswith("fd@") else shown.title
+    name = f"FD to {metric.partition('@')[2]}" if is_end(metric) else shown.title
     return name + ARROWS[shown.better]
 
 
@@ -144,10 +144,9 @@ def _block(block: Block, store: Store, failed: Mapping[Cell, str], lines: list[s
     picture = store.folder / "pictures" / f"{name}.svg"
     drawn = {row: values for row, values in found.items() if values}
     if drawn:
-        ends = [int(metric[3:]) for metric in block.columns if metric.startswith("fd@")]
         columns = {metric: title(metric) for metric in block.columns}
-        text = curves(drawn, ends) if ends else dots(drawn, columns, FLOORS)
-        _write(picture, text)
+        floors = [row.title for row in block.rows if row.inside in FLOORS]
+        _write(picture, curves(drawn) if any(map(is_end, columns)) else dots(drawn, columns, floors))
         lines += [f"![{block.title}](pictures/{picture.name})", ""]
     lines += _film(block, store, name)
     judged = [_judged(claim, runs) for claim in block.claims]

@@ -115,9 +115,9 @@ class ReportOptions:
         """Of sampling or training."""
         return self.own_seeds or tuple(range(self.budget.seeds))
 
-    def floors(self, task: str, among: Iterable[str] = FLOORS, **options: Any) -> list[Row]:
+    def floors(self, task: str, among: Iterable[str] = FLOORS, kind: Kind = "measure", **options: Any) -> list[Row]:
         """Rows without a model; all but RS are the same for every seed, so one is enough."""
-        cell = self._cell("measure", self.seeds[0], None, task, **options)
+        cell = self._cell(kind, self.seeds[0], None, task, **options)
         return [Row(name, (cell,), name) for name in among]
 
     def _cell(self, kind: Kind, seed: int, model: Weights | None, task: str, **options: Any) -> Cell:

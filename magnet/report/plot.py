@@ -56,8 +56,19 @@ def dots(rows: Mapping[str, Mapping[str, Estimate]], columns: Mapping[str, str],
     return _svg(left + min(len(columns), ACROSS) * (PANEL + GAP) + 12, height, parts)
 
 
-def curves(rows: Mapping[str, Mapping[str, Estimate]], frames: Sequence[int]) -> str:
-    """SVG of `fd@FRAMES` over frames, a line a row; by powers of ten where they differ much."""
+def is_end(metric: str) -> bool:
+    """Whether it is a number of all that was generated up to a frame, which its name ends with."""
+    return metric.startswith("fd@")
+
+
+def curves(measured: Mapping[str, Mapping[str, Estimate]]) -> str:
+    """SVG of `fd@FRAMES` over frames, a line a row; by powers of ten where they differ much. Rows without are left out.
+
+    measured: title -> metric -> estimate
+    """
+    rows = {title: {name: each for name, each in row.items() if is_end(name)} for title, row in measured.items()}
+    rows = {title: row for title, row in rows.items() if row}
+    frames = sorted({int(name[3:]) for row in rows.values() for name in row})
     values = [each.value for row in rows.values() for each in row.values()]
     least, most = min(values, default=0.0), max(values, default=1.0)
     tens = least > 0 and most > 10 * least
@@ -78,7 +89,7 @@ def curves(rows: Mapping[str, Mapping[str, Estimate]], frames: Sequence[int]) ->
         parts.append(f'<line x1="{LEFT}" x2="{LEFT + wide}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{mark:g}</text>')
     at = {frame: LEFT + wide * frame / max(frames) for frame in frames}
-    for frame in sorted(frames)[:: -(-len(frames) // 12)]:
+    for frame in frames[:: max(1, -(-len(frames) // 12))]:
         parts.append(f'<text x="{at[frame]:.1f}" y="{bottom + 18}" text-anchor="middle">{frame}</text>')
     parts.append(f'<text x="{LEFT}" y="{HEIGHT - 10}">FD, over frames generated; lines: 95 % intervals</text>')
     head = LEFT

@@ -77,7 +77,7 @@ def test_a_curve_has_the_colour_that_stands_beside_its_name() -> None:
     rows = {
         name: {f"fd@{k}": Estimate(f * k, 0.1, 7) for k in (150, 300)} for name, f in (("R2R", 1.0), ("Ours", 0.01))
     }
-    picture = ElementTree.fromstring(curves(rows, [150, 300]))
+    picture = ElementTree.fromstring(curves(rows))
     lines = [line.get("stroke") for line in picture.iter(f"{SVG}polyline")]
     assert len(set(lines)) == 2
     children = list(picture)
@@ -90,8 +90,16 @@ def test_a_curve_has_the_colour_that_stands_beside_its_name() -> None:
 def test_curves_that_differ_much_stand_over_powers_of_ten(factor: float, marks: list[str]) -> None:
     """1.5 beside 300: on a scale from 0 the lower one would lie on the axis."""
     rows = {"a": grown(1.0), "b": grown(factor)}
-    picture = ElementTree.fromstring(curves(rows, [150, 300]))
+    picture = ElementTree.fromstring(curves(rows))
     said = [text.text for text in picture.iter(f"{SVG}text") if text.get("text-anchor") == "end"]
     assert said[: len(marks)] == marks
     heights = [float(circle.get("cy", 0)) for circle in picture.iter(f"{SVG}circle")]
     assert all(0 < height < float(picture.get("height", 0)) for height in heights)
+
+
+def test_a_row_without_a_number_of_some_end_has_no_curve_and_other_numbers_are_not_drawn() -> None:
+    rows = {"recorded": {"ip_ratio": Estimate(9e9, 0.1, 7)}, "a": {**grown(1.0), "mi": Estimate(9e9, 0.1, 7)}}
+    picture = ElementTree.fromstring(curves(rows))
+    assert len(list(picture.iter(f"{SVG}polyline"))) == 1
+    assert len(list(picture.iter(f"{SVG}circle"))) == 2 + 1, "two ends, and one beside the name"
+    assert "recorded" not in [text.text for text in picture.iter(f"{SVG}text")]
