@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field
-from magnet.generation.settling import PACE, settled_on
+from magnet.generation.settling import PACE, Corrected, settled_on
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -27,6 +27,10 @@ LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
 
 
+RECALLED = 30
+"""Frames before the first block that tell which hands hold."""
+
+
 class World(Protocol):
     """What bodies are made from: where everybody has been placed so far, see `WorldState`."""
 
@@ -37,7 +41,7 @@ class World(Protocol):
     placed: Tensor
     T_world_can: Tensor
     finalized: int
-    correction: Tensor | None
+    correction: Corrected | None
     uncorrected: Scene | None
     there: Tensor
     released: int
@@ -135,11 +139,12 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     new = world.by_frame(world.placed[rows] & ~world.known[rows])
     after = new[-1:] if told is None else new[-1:] & told.to(new.device)
     new = torch.cat([new, after.expand(made.frames - own, -1)])
-    before = world.given.slice(max(first - 1 - PACE, 0), first) if first else None
+    seen = 1 + PACE if world.correction is not None else RECALLED
+    before = world.given.slice(max(first - seen, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     unseen = (world.known[rows] | ~world.placed[rows]).any(dim=0).to(new.device)
-    made, offset = settled_on(made, before, new, unseen, how, world.correction, uncorrected)
-    world.correction = offset[:, own - LEAD : own]
+    made, correction = settled_on(made, before, new, unseen, how, world.correction, uncorrected)
+    world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
     return made.slice(0, own)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
-from magnet.body.holding import holds
+from magnet.body.holding import holds, lasting_holds
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
 from magnet.generation.separation import Decode, open_body_on
@@ -27,10 +27,10 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/tasks.md)."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0, hard=5.0)
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
-PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, stand=16.0, hard=20.0)
+PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, stand=16.0, hold=2.0, hard=20.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
 
 LEFT = Apart(body=0.07, arms=0.07)
@@ -122,11 +122,13 @@ def settled_block(
 
 
 class Corrected(NamedTuple):
-    """How the last frames of a chunk were corrected, for the next one."""
+    """How the last frames of a chunk or block were corrected, for the next one."""
 
     offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
-    holding: Tensor | None  # (B, Q, 2, 2) bool, hands that hold in the last; None: nobody asks
-    who: tuple[int, ...]  # the P slots
+    holding: (
+        Tensor | None
+    )  # (B, Q, 2, 2) bool, hands that held in the last of a chunk, or before a block; None: nobody asks
+    who: tuple[int, ...]  # the slots of these hands, and of a chunk's P people
 
 
 @torch.no_grad()
@@ -200,9 +202,9 @@ def settled_on(
     new: Tensor,
     unseen: Tensor,
     how: str,
-    past: Tensor | None,
+    past: Corrected | None,
     uncorrected: Scene | None = None,
-) -> tuple[Scene, Tensor]:
+) -> tuple[Scene, Corrected]:
     """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
 
     Args:
@@ -211,31 +213,42 @@ def settled_on(
         new: (T, P) bool, who may be moved.
         unseen: (P,) bool, of whom nobody knows more than `before`.
         how: `light`, `firm` or `hold`.
-        past: (B, 2, P, DOFS) corrections of the two frames before; None: none.
+        past: what the last call returned, its corrections those of the two frames before; None: nothing.
         uncorrected: the same two frames without them; None: as shown.
 
     Returns:
-        The scene, and its corrections (B, T, P, DOFS).
+        The scene, and how all of its T frames were corrected.
     """
     there = scene.present.any(dim=0).nonzero()[:, 0]  # empty slots would only cost time
     body, agents = open_body_on(scene.device), torch.arange(len(there), device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None).permute_agents(there)
     known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
-    new, unseen, past = new[:, there], unseen[there], None if past is None else past[:, :, there]
+    new, unseen, who = new[:, there], unseen[there], tuple(there.tolist())
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    holding = None if known is None or how != "hold" else hands_held(known, body)
+    holding = None if known is None or how != "hold" else held_on(known, body, past, who)
     plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
     last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
-    for who in [agents == agent for agent in agents[moving]]:
-        hidden = unseen | (moving & ~who)
+    for one in [agents == agent for agent in agents[moving]]:
+        hidden = unseen | (moving & ~one)
         if known is None:
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        own = None if past is None else past * who[:, None]  # the others are seen as shown, corrected already
-        one = own_correction(seen, body, how, ~(new & who), known is not None, own, holding, last)
-        offset[:, :, who] = one[:, :, who]
+        # The others are seen as shown, corrected already.
+        own = None if past is None else past.offset[:, :, there] * one[:, None]
+        offset[:, :, one] = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)[
+            :, :, one
+        ]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset
     made = corrected(scene, whole)
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), whole
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, holding, who)
+
+
+def held_on(known: Scene, body: Body, past: Corrected | None, who: tuple[int, ...]) -> Tensor:
+    """Which hands hold at the end of the last known frames: those that met there, or held before and have not parted.
+
+    So hands that a block does not bring together at once are brought nearer by the next. -> (B, Q, 2, 2) bool
+    """
+    before = past.holding if past is not None and past.who == who else None
+    return lasting_holds(body.joints(known), known.present, known.fps, before)[0][:, -1]

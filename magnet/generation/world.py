@@ -79,7 +79,7 @@ class WorldState:
         self.since: Tensor | None = None  # token steps to the first row from each one's last given one before it
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
-        self.correction: Tensor | None = None  # of the last two frames shown, in causal plans
+        self.correction: Corrected | None = None  # of the last two frames shown, in causal plans
         self.chunk: Corrected | None = None  # and in others
         self.uncorrected: Scene | None = None  # those frames of a causal plan without it
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on

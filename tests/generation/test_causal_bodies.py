@@ -94,7 +94,7 @@ def test_corrections_go_on_to_what_is_expected_of_those_who_told(model, scene):
         generator = torch.Generator().manual_seed(1)
         behind = tokens[:, 7:8] + lift * torch.randn(tokens[:, 7:8].shape, generator=generator)
         finalize_bodies(world, tokens, 7, 7, (behind, torch.tensor([told, True, True])))
-        assert world.correction is not None and world.correction.shape[1] == 2
+        assert world.correction is not None and world.correction.offset.shape[1] == 2
         return world.given.slice(24, 28)
 
     made = shown(0.0, True)

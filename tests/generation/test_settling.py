@@ -13,10 +13,20 @@ from magnet.bench.speed import standing
 from magnet.body import load_body
 from magnet.body.energy import CONTACT
 from magnet.body.joints import TOES
+from magnet.body.settle import DOFS
 from magnet.body.settle_wishes import FIRM
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
-from magnet.generation.settling import GLIDE, PACE, carried_on, hands_held, settled_chunk, settled_on
+from magnet.generation.settling import (
+    GLIDE,
+    PACE,
+    Corrected,
+    carried_on,
+    hands_held,
+    held_on,
+    settled_chunk,
+    settled_on,
+)
 from magnet.metrics import hand_distance
 from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene, cat_time
@@ -139,6 +149,24 @@ def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
     assert together(settled_chunk(apart, nobody, "firm", past)[0]) < 3
 
 
+def test_hands_that_held_and_have_not_parted_hold_before_the_next_block() -> None:
+    body = load_body()
+    shake = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(56, 60)
+    away = (shake.T_world_root[:, :, 1, :3, 3] - shake.T_world_root[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
+
+    def moved(metres: float) -> Scene:
+        root = shake.T_world_root.clone()
+        root[:, :, 1, :3, 3] += metres * away / away.norm(dim=-1, keepdim=True)
+        return shake.replace(T_world_root=root)
+
+    met = Corrected(torch.zeros(1, 2, 2, DOFS), hands_held(shake, body), (0, 1))
+    assert torch.equal(held_on(shake, body, None, (0, 1)), met.holding)
+    assert torch.equal(held_on(moved(0.3), body, met, (0, 1)), met.holding)
+    assert not held_on(moved(0.3), body, None, (0, 1)).any()  # nobody remembers that they met
+    assert not held_on(moved(0.3), body, met, (0, 2)).any()  # others met
+    assert not held_on(moved(0.8), body, met, (0, 1)).any()
+
+
 def test_feet_shown_standing_stay_there_block_after_block() -> None:
     """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
     frames, block = 32, 4
@@ -150,9 +178,9 @@ def test_feet_shown_standing_stay_there_block_after_block() -> None:
     shown, past, plain = [sliding.slice(0, block)], None, None
     for start in range(block, frames - block, block):
         ahead = sliding.slice(start, start + 2 * block)
-        made, offset = settled_on(ahead, shown[-1], new, unseen, "firm", past, plain)
+        made, now = settled_on(ahead, shown[-1], new, unseen, "firm", past, plain)
         shown.append(made.slice(0, block))
-        past, plain = offset[:, block - 2 : block], ahead.slice(block - 2, block)
+        past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
     toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (cat_time(shown), sliding))
     last = frames - 2 * block
     assert float((slid[last] - slid[0]).mean()) > 0.09
@@ -171,9 +199,9 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
     shown, past, plain = [walking.slice(0, block)], None, None
     for start in range(block, frames - block, block):
         ahead = walking.slice(start, start + 2 * block)
-        made, offset = settled_on(ahead, shown[-1], new, ~new[0], "firm", past, plain)
+        made, now = settled_on(ahead, shown[-1], new, ~new[0], "firm", past, plain)
         shown.append(made.slice(0, block))
-        past, plain = offset[:, block - 2 : block], ahead.slice(block - 2, block)
+        past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
     return cat_time(shown).replace(body=body.id)
 
 
