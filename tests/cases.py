@@ -15,6 +15,13 @@ def some_slow(cases: Iterable[Any], *slow: Any) -> list[Any]:
     return [slow_case(case) if case in slow else case for case in every]
 
 
+def some_quick(cases: Iterable[Any], *quick: Any) -> list[Any]:
+    """All cases for `parametrize`, of which all but some run with the slow tests alone."""
+    every = list(cases)
+    assert all(case in every for case in quick), f"no cases {[case for case in quick if case not in every]}"
+    return [case if case in quick else slow_case(case) for case in every]
+
+
 def few(cases: Iterable[Any], quick: int = 2) -> list[Any]:
     """All cases for `parametrize`, of which so many, spread evenly, run with the quick tests; the others are slow."""
     every = list(cases)

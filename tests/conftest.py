@@ -1,5 +1,6 @@
 """Fixtures that several rooms share."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -11,6 +12,16 @@ from magnet.testing import random_scene
 
 # Everything here is tiny: a second thread only waits for the first, and badly so on a busy machine.
 torch.set_num_threads(1)
+
+# What the tests' modules are made of stays to the end: to look for garbage in it again and again takes a tenth
+# of the time of all tests.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import copy
 import functools
 import io
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,15 @@ from magnet.cli.checkpoint_config import LINKS, OWN_WAY
 from magnet.cli.config_files import merged, read_layers
 from magnet.datamodules import registry
 from magnet.sampling.presets import PRESETS
+from tests.cases import few, some_quick
 from tests.options import DATA, MODELS, own
 
 ROOT = Path(__file__).parents[1] / "configs"
 PAPER = ROOT / "paper"
 FILES = sorted(ROOT.rglob("*.yaml"))
+QUICK = {"duobox_tokenizer", "duobox_denoiser", "embody3d_denoiser", "sampling", "no_pairwise", "gpu_round"}
+QUICK |= {"duet_denoiser", "duet_posterior", "duet_tokenizer"}
+"""Of which all is asked by the quick tests; to read one as the command does takes half a second."""
 SETS = {"duobox": "DuoBox", "dd100": "DD100", "remocap": "ReMoCap", "interx": "InterX", "embody3d": "Embody3D"}
 
 ROWS: dict[str, dict[str, dict[str, Any] | None]] = {
@@ -52,9 +56,14 @@ def relative(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
+@functools.cache
+def written(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text())
+
+
 def said(path: Path) -> dict[str, Any]:
     """What a file and those it extends say, merged by hand."""
-    options = yaml.safe_load(path.read_text())
+    options = copy.deepcopy(written(path))
     below: dict[str, Any] = {}
     names = options.pop("extends", [])
     for name in [names] if isinstance(names, str) else names:
@@ -86,6 +95,11 @@ def is_sampling(options: dict[str, Any]) -> bool:
     return "sampler" in options
 
 
+def quickly(paths: Iterable[Path]) -> list[Any]:
+    every = list(paths)
+    return some_quick(every, *(path for path in every if path.stem in QUICK))
+
+
 def is_part(options: dict[str, Any]) -> bool:
     """Whether a file is only there to be extended."""
     return not is_sampling(options) and not ("model" in options and "data" in options)
@@ -105,7 +119,7 @@ def resolved(path: Path) -> dict[str, Any]:
     return dict(leaves(printed(path)))
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if not is_part(said(p))], ids=relative)
+@pytest.mark.parametrize("path", quickly(p for p in FILES if not is_part(said(p))), ids=relative)
 def test_what_a_configuration_says_is_what_would_run(path: Path) -> None:
     run = resolved(path)
     for place, value in leaves(said(path)):
@@ -128,7 +142,9 @@ def taken_over(name: str | None) -> dict[str, Any]:
     return {key: value for key, value in stored.items() if not key.startswith("_") and key not in OWN_WAY}
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if not is_part(said(p)) and not is_sampling(said(p))], ids=relative)
+@pytest.mark.parametrize(
+    "path", quickly(p for p in FILES if not is_part(said(p)) and not is_sampling(said(p))), ids=relative
+)
 def test_what_a_configuration_does_not_say_is_the_classes_own_default(path: Path) -> None:
     options, got = told(path), printed(path)
     fields, name = options["model"].get("init_args", {}), options["model"]["class_path"]
@@ -168,7 +184,7 @@ def test_a_configuration_of_the_paper_says_what_it_needs_and_costs(path: Path) -
 # -- the paper's runs ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", some_quick(SETS, "duobox", "embody3d"))
 def test_the_papers_five_data_sets_are_trained_as_it_says(name: str) -> None:
     """Paper 3, 4, A.3, A.4 and Table A.2; 64 frames are the released code's."""
     tokenizer, denoiser = (resolved(PAPER / f"{name}_{what}.yaml") for what in ("tokenizer", "denoiser"))
@@ -195,7 +211,7 @@ def test_the_papers_five_data_sets_are_trained_as_it_says(name: str) -> None:
     assert denoiser["model.init_args.tokenizer"] == f"runs/{name}_tokenizer/latest/checkpoints/best.ckpt"
 
 
-@pytest.mark.parametrize(("table", "row"), [(table, row) for table, rows in ROWS.items() for row in rows])
+@pytest.mark.parametrize(("table", "row"), few([(table, row) for table, rows in ROWS.items() for row in rows], 4))
 def test_a_row_of_a_table_changes_only_what_it_is_about(table: str, row: str) -> None:
     path = PAPER / "ablations" / f"{row}.yaml"
     base = PAPER / ("sampling.yaml" if table == "Table A.6" else "duobox_denoiser.yaml")

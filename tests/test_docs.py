@@ -54,7 +54,9 @@ def files(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", some_slow([page for page in PAGES if blocks(page)], ROOT / "docs/viewer.md"), ids=lambda page: page.stem
+    "page",
+    some_slow([page for page in PAGES if blocks(page)], ROOT / "docs/viewer.md", ROOT / "docs/export.md"),
+    ids=lambda page: page.stem,
 )
 def test_the_python_of_a_page_runs(page: Path, model, files: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(magnet, "load", lambda *_, **__: model)

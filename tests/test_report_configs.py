@@ -14,6 +14,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import JointFuture
 from magnet.testing import random_scene, tiny_tokenizer
 from magnet.tokenizer.raw import RawPose
+from tests.cases import few
 from tests.datamodules.fakes import FakeData, random_clip
 from tests.test_configs import PAPER, ROOT, TINY, leaves, said
 
@@ -49,7 +50,7 @@ def shrunk(init_args: dict[str, Any]) -> dict[str, Any]:
     return {**init_args, **groups, "window": 4, "tokenizer": None}
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("row", few(ROWS, 4))
 def test_a_row_of_the_report_changes_what_it_says_trains_and_samples(row: str) -> None:
     options = said(REPORT / f"{row}.yaml")
     base = dict(leaves(said(REPORT / "base.yaml")))
@@ -70,7 +71,7 @@ def test_a_row_of_the_report_changes_what_it_says_trains_and_samples(row: str) -
         assert made.frames == 16 and made.T_world_root.isfinite().all() and made.body_rot.isfinite().all()
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("row", few(ROWS, 4))
 def test_a_row_of_the_report_at_the_papers_size_changes_the_same(row: str) -> None:
     options = said(PAPER / "ablations" / f"{row}.yaml")
     base = dict(leaves(said(PAPER / "duobox_denoiser.yaml")))

@@ -19,6 +19,7 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.testing import random_scene, tiny_denoiser
+from tests.cases import some_slow
 from tests.scripts import module_at
 
 Lossy = module_at(Path(__file__).parents[2] / "benchmarks" / "agents.py").Lossy
@@ -60,7 +61,7 @@ def together(members: Sequence, tokens: int, link: Lossy, order=(1, 0, 2)) -> li
     return made
 
 
-@pytest.mark.parametrize("posterior", [False, True])
+@pytest.mark.parametrize("posterior", some_slow([False, True], False))
 @pytest.mark.parametrize("kind", TASKS)
 def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind, posterior):
     """Of a model, too, that is best sampled with averaged paths, and what it made shown faintly."""

@@ -64,7 +64,7 @@ def in_turn(names: Iterable[str], commands: Iterable[str], part: slice) -> list[
 # -- each class ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "command"), in_turn(DATA, TRAINER_COMMANDS, slice(0, None, 2)))
+@pytest.mark.parametrize(("name", "command"), in_turn(DATA, TRAINER_COMMANDS, slice(0, None, 4)))
 def test_models_and_data_named_by_a_flag_have_their_own_defaults(
     name: str, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,7 +75,7 @@ def test_models_and_data_named_by_a_flag_have_their_own_defaults(
     assert got["model"]["init_args"] == {k: value for k, value in own(MODELS[model]).items() if k not in linked}
 
 
-@pytest.mark.parametrize(("name", "named_by"), in_turn(DATA, ["file", "flag"], slice(1, None, 2)))
+@pytest.mark.parametrize(("name", "named_by"), in_turn(DATA, ["file", "flag"], slice(1, None, 4)))
 def test_data_named_by_a_file_or_a_flag_have_their_own_defaults_over_any_other_file(
     name: str, named_by: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -155,7 +155,7 @@ COMMANDS = sorted(
 )
 
 
-@pytest.mark.parametrize("line", few(COMMANDS, 4))
+@pytest.mark.parametrize("line", few(COMMANDS, 2))
 def test_a_command_that_a_page_shows_for_a_data_set_runs_what_it_says(
     line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ from magnet import cli
 from magnet.cli import config_files, demo, train, view
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
+from tests.cases import some_slow
 from tests.toys import ToyEvaluator, ToyModel
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
@@ -39,7 +40,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 # -- samplers by name ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["test", "predict"])
+@pytest.mark.parametrize("command", some_slow(["test", "predict"], "predict"))
 def test_one_word_samples_as_the_paper_does(toy: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     assert sampler(capsys, command, "--sampler", "paper") == PAPER
     assert sampler(capsys, command, "--sampler=paper") == PAPER
@@ -179,7 +180,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", some_slow(FORMS, "a name"))
 def test_a_file_names_its_task_in_any_of_these_forms(toy: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     """Flags beat it option by option, and another task leaves its options out and says so."""
     (toy / "mine.yaml").write_text(FORMS[form] + "\n")

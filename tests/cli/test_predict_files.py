@@ -12,7 +12,7 @@ from magnet.export import save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
-from tests.cases import few, some_slow
+from tests.cases import few, some_quick, some_slow
 
 QUICK = ["--sampler.steps", "2"]
 
@@ -35,7 +35,7 @@ def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("task", some_slow(registry.names(), "agentic_async", "agentic_sync"))
+@pytest.mark.parametrize("task", some_quick(registry.names(), "joint_future", "inbetweening"))
 def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> None:
     out = tmp_path / "out.npz"
     said(capsys, *duet["bvh"], "--task", task, "--frames", "16", "--out", str(out), *QUICK)
@@ -49,7 +49,7 @@ def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> N
     assert (joints - truth)[0][given].abs().max() < 1e-3 if given.any() else True
 
 
-@pytest.mark.parametrize("kind", ["ours", "smplx", "bvh"])
+@pytest.mark.parametrize("kind", some_slow(["ours", "smplx", "bvh"], "smplx"))
 def test_whoever_wrote_the_files_the_given_people_are_as_recorded(kind, duet, tmp_path, capsys) -> None:
     out = tmp_path / "out.npz"
     said(capsys, *duet[kind], "--task", "partner_inpainting", "--context", "0", "--out", str(out), *QUICK)

@@ -18,7 +18,7 @@ from magnet.cli.data_shown import SKIPPED_SHOWN
 from magnet.datamodules import registry
 from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.reading.recording import Take
-from tests.cases import few
+from tests.cases import some_quick
 from tests.datamodules.readers import Foreign, cut, fake_of
 
 Damage = Callable[[Take], Any]
@@ -244,7 +244,7 @@ def test_every_kind_of_bad_input_is_tried_on_every_data_set() -> None:
     assert lacking == LACKING
 
 
-@pytest.mark.parametrize("form", few(DAMAGES, 4))
+@pytest.mark.parametrize("form", some_quick(DAMAGES, "duobox", "interhuman", "remocap, ready fits"))
 def test_bad_takes_are_listed_with_why_and_the_others_are_there(
     form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

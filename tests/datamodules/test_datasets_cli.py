@@ -24,7 +24,7 @@ SMALL = {
 }  # fmt: skip
 FRAMES = {"remocap": 40, "bvh": 40, "cmu": 40}
 """Of a fake's takes, where fitting 150 takes too long."""
-QUICK = ("interx", "scenes")
+QUICK = ("interx",)
 """One that needs a body and one that brings its own; the others' files are read in test_readers.py."""
 TAKES = {"duobox": 1}
 """Of a fake, where one has several splits."""

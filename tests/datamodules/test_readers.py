@@ -26,7 +26,7 @@ from magnet.datamodules.preparing.prepare import prepare, select_takes
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.store.windows import recorded_windows
 from magnet.motion.resample import times
-from tests.cases import few
+from tests.cases import few, some_quick
 from tests.datamodules.made_scenes import (
     FITTED,
     FORMS,
@@ -87,7 +87,7 @@ def test_a_fakes_takes_have_as_many_frames_as_asked_for_at_30_fps(name: str, tmp
     assert set(lengths) == {20}
 
 
-@pytest.mark.parametrize("form", few(FORMS, 4))
+@pytest.mark.parametrize("form", some_quick(FORMS, "duobox", "interx", "aioz"))
 def test_prepared_and_read_back_joints_are_those_that_were_written(form: str) -> None:
     fitted = FORMS[form][2] == FITTED
 
@@ -200,7 +200,7 @@ SAID = {
 """Where it is said otherwise."""
 
 
-@pytest.mark.parametrize("form", few(FORMS, 4))
+@pytest.mark.parametrize("form", some_quick(FORMS, "duobox", "interx", "aioz"))
 def test_a_wrong_axis_unit_or_rate_in_the_files_is_named(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ from magnet.datamodules import registry
 from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.reading.recording import DataError, Reader, Recording
-from tests.cases import few, some_slow
+from tests.cases import few, some_quick, some_slow
 from tests.datamodules.readers import DO, named_and_told, told_what_to_do
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
@@ -138,7 +138,7 @@ def sample(root: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("turn", some_slow(range(ROUNDS), *range(1, ROUNDS)))
-@pytest.mark.parametrize("name", few(known(), 4))
+@pytest.mark.parametrize("name", some_quick(known(), "cmu", "chi3d"))
 def test_damaged_files_are_read_or_refused(name: str, turn: int, fakes: Callable[[str], Path]) -> None:
     root, reader = fakes(name), registry.reader(name)
     assert read(reader, root) > 0

@@ -114,7 +114,7 @@ def test_nothing_that_a_task_does_not_give_reaches_the_samples(name):
     assert torch.equal(plain.T_world_root, replaced.T_world_root)
 
 
-QUICK = ("generation", "joint_future", "motion_control")
+QUICK = ("generation", "joint_future")
 
 
 @pytest.mark.parametrize("name", some_slow(registry.names(), *(set(registry.names()) - set(QUICK))))

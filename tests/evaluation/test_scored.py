@@ -153,7 +153,7 @@ def test_free_slots_of_the_data_change_no_number(narrow: dict[str, dict[str, flo
         assert wide[method] == pytest.approx(narrow[method], rel=1e-3, abs=1e-5, nan_ok=True), method
 
 
-@pytest.mark.parametrize("slots", [3, 9, 12])
+@pytest.mark.parametrize("slots", some_slow([3, 9, 12], 9))
 def test_a_model_of_any_number_of_slots_is_tested(narrow: dict[str, dict[str, float]], slots: int) -> None:
     """Another number of slots is another network, so its numbers are others; of recordings they are the same."""
     wide = rows(slots, 2 if slots == 3 else slots, baselines=False)

@@ -16,7 +16,7 @@ from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
 from magnet.tasks.partner import MotionControl, PartnerInpainting
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
-from tests.cases import some_slow
+from tests.cases import some_quick, some_slow
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS, PAST = 24, 3
@@ -121,7 +121,7 @@ def test_codes_are_those_of_a_recording_that_ends_where_they_look_to(model, reco
 
 @pytest.mark.parametrize(
     ("causal", "block"),
-    some_slow(itertools.product([False, True], [1, 2, 3, 8]), (False, 1), (False, 2), (True, 2), (True, 3)),
+    some_slow(itertools.product([False, True], [1, 2, 3, 8]), (False, 1), (False, 2), (True, 1), (True, 2), (True, 3)),
 )
 def test_what_the_given_do_after_a_block_changes_nothing_in_it(recording, block, causal):
     """P(A_t | A_0:t-1, B_0:t): tokens and places of A, tokens of B, bit for bit."""
@@ -142,9 +142,7 @@ def test_without_sight_the_encoder_would_leak(model, recording):
     assert not torch.equal(a[:, :10, 1, : model.layout.latent], b[:, :10, 1, : model.layout.latent])
 
 
-@pytest.mark.parametrize(
-    ("chunk", "block"), some_slow(itertools.product([5, 64], [1, 2, 4]), (5, 2), (5, 4), (64, 1), (64, 2))
-)
+@pytest.mark.parametrize(("chunk", "block"), some_quick(itertools.product([5, 64], [1, 2, 4]), (64, 4)))
 def test_streams_do_not_leak_either(model, recording, block, chunk):
     end = PAST + 2 * block
     other = replaced(recording, end, 1)

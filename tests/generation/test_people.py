@@ -68,7 +68,7 @@ def test_two_people_among_four_slots_cost_and_move_as_in_a_plan_for_two(model, n
         assert close(world.scene(out), made)
 
 
-@pytest.mark.parametrize("task", [AgenticAsync(), AgenticAsync(offset=0.5, order=(1,)), AgenticSync()], ids=str)
+@pytest.mark.parametrize("task", few([AgenticAsync(), AgenticAsync(offset=0.5, order=(1,)), AgenticSync()]), ids=str)
 def test_nobody_waits_for_free_slots(model, task):
     costs = []
     for slots in (2, 3, 4):

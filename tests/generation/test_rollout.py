@@ -28,7 +28,7 @@ from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from magnet.testing.poses import blocks_of
-from tests.cases import few, some_slow
+from tests.cases import few, some_quick, some_slow
 
 FAST = SamplerOptions(steps=2, stride=2)
 TOKENS = 36
@@ -94,7 +94,7 @@ CAUSAL = ("motion_control", "agentic_sync", "agentic_async", "blocks", "turns")
 WHOLE = [*((name, 3) for name in TASKS if name not in CAUSAL), ("joint_future", 8), ("some end", 64)]
 
 
-@pytest.mark.parametrize(("name", "chunk"), few(WHOLE, 4))
+@pytest.mark.parametrize(("name", "chunk"), few(WHOLE, 2))
 def test_pieces_make_up_the_scene_made_at_once(model, recording, name, chunk):
     context = context_of(name)
     frames = 4 * TOKENS - context - 3
@@ -126,21 +126,21 @@ def test_people_who_make_way_do_not_depend_on_the_pieces_either(made, name):
     assert not same(whole, made(name))
 
 
-@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async", "turns"))
+@pytest.mark.parametrize("name", some_quick(CAUSAL, "motion_control"))
 def test_bodies_of_causal_plans_do_not_depend_on_the_pieces_bit_for_bit(made, name):
     """Nor on when rows are let go: one chunk holds them all."""
     whole, chunks, rows = (made(name, LONG, chunk) for chunk in (64, 5, 1))
     assert same(whole, chunks) and same(whole, rows)
 
 
-@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async", "turns"))
+@pytest.mark.parametrize("name", some_quick(CAUSAL, "motion_control", "blocks"))
 def test_the_same_happens_however_long_a_causal_scene_goes_on(made, name):
     """Live, nobody knows where it ends."""
     long, short = made(name), made(name, SHORT)
     assert same(long.slice(0, short.frames), short)
 
 
-@pytest.mark.parametrize("name", some_slow(CAUSAL, "agentic_async"))
+@pytest.mark.parametrize("name", some_quick(CAUSAL, "blocks", "turns"))
 def test_each_piece_of_a_causal_scene_comes_before_the_next_block_is_begun(model, recording, name):
     done: list[int] = []
     chunks = stream(model, recording, TASKS[name], 8, 96, 1, FAST, progress=done.append, chunk=1)
@@ -170,7 +170,7 @@ SLOW_HOWS = [
 ]
 
 
-@pytest.mark.parametrize("options", [*HOWS, *(pytest.param(how, marks=pytest.mark.slow) for how in SLOW_HOWS)], ids=str)
+@pytest.mark.parametrize("options", some_quick([*HOWS, *SLOW_HOWS], *HOWS[1::2]), ids=str)
 def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, options):
     for task in (JointFuture(), PartnerInpainting((1,))):
         chunks = list(streamed(model, recording, task, 8, 77, 5, options))
@@ -219,7 +219,7 @@ def test_whoever_ends_stands_still_across_pieces(model, recording):
 # -- memory and time ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", few(registry.names()[::-1], 3))
+@pytest.mark.parametrize("name", some_quick(registry.names(), "generation", "partner_prediction"))
 def test_no_more_rows_are_held_for_a_longer_scene(model, name):
     scene = random_scene(1, 160, 3, torch.Generator().manual_seed(6))
 
@@ -288,7 +288,7 @@ GOES_ON = ("joint_future", "generation", "agentic_sync", "agentic_async", "partn
 
 @pytest.mark.parametrize(
     ("name", "pyramid_offset"),
-    some_slow([*((name, 0) for name in GOES_ON), ("joint_future", 2)], ("agentic_async", 0)),
+    some_quick([*((name, 0) for name in GOES_ON), ("joint_future", 2)], ("generation", 0), ("joint_future", 2)),
 )
 def test_a_scene_without_end_begins_like_one_with_an_end(model, recording, name, pyramid_offset):
     context = context_of(name)
@@ -335,9 +335,7 @@ SOLVED = [(name, solver, eta) for solver, eta in (("dpmpp_2m", 0.0), ("ddim", 1.
 
 @pytest.mark.parametrize(
     ("name", "solver", "eta"),
-    some_slow(
-        SOLVED, *(case for case in SOLVED if "agentic_async" in case or ("ddim" in case and "joint_future" not in case))
-    ),
+    some_quick(SOLVED, *(case for case in SOLVED if "joint_future" in case), ("inbetweening", "dpmpp_2m", 0.0)),
 )
 def test_a_batch_of_scenes_equals_single_runs_when_each_has_its_own_noise(model, recording, name, solver, eta):
     context, options = context_of(name), SamplerOptions(steps=3, stride=2, eta=eta, solver=solver)

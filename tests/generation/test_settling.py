@@ -37,7 +37,7 @@ from magnet.synthesis import synthesize
 from magnet.tasks import registry
 from magnet.testing import random_scene
 from magnet.testing.poses import pose_law
-from tests.cases import few, some_slow
+from tests.cases import few, some_quick, some_slow
 
 BOTH = SamplerOptions(
     steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="hold", settle_blocks=True, smooth_path=True
@@ -57,7 +57,7 @@ def test_every_choice_but_off_has_its_sizes() -> None:
     assert SamplerOptions().settle is None and SamplerOptions().body_guidance == "off"
 
 
-@pytest.mark.parametrize("name", some_slow(registry.names(), "agentic_async", "agentic_sync", "motion_control"))
+@pytest.mark.parametrize("name", some_quick(registry.names(), "partner_inpainting", "inbetweening"))
 def test_whoever_is_given_stays_bit_identical_in_every_task(model, name) -> None:
     scene = random_scene(1, 40, 3, torch.Generator().manual_seed(2))
     plain = run(model, scene, name, replace(BOTH, body_guidance="off", settle="off"))

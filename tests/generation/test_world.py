@@ -19,6 +19,7 @@ from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
 from magnet.testing import without_absent
+from tests.cases import few, some_slow
 
 OPTIONS = SamplerOptions(steps=2, stride=2)
 
@@ -121,7 +122,7 @@ def off(world: WorldState, scene: Scene, free: bool) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", few(TASKS, 6))
 def test_with_the_true_tokens_everybody_is_where_they_were(model, scene, name, placement):
     context = 0 if name == "generation" else 3
     world, _ = told(model, scene, TASKS[name], placement, context)
@@ -144,8 +145,11 @@ def test_nobody_is_hung_off_an_absent_agent(model, scene, task, placement):
 # -- agents who do not see each other -------------------------------------------------------------
 
 
+TURNS = (AgenticSync(), AgenticSync(block=2), AgenticAsync(), AgenticAsync(block=2))
+
+
 @pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("task", [AgenticSync(), AgenticSync(block=2), AgenticAsync(), AgenticAsync(block=2)], ids=str)
+@pytest.mark.parametrize("task", some_slow(TURNS, *TURNS[1:3]), ids=str)
 def test_what_an_unseen_agent_does_moves_nobody(model, scene, task, placement):
     """Agent 0 sees nothing of what agent 1 does now, so whatever that is, agent 0 stands where it stood.
 

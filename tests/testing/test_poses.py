@@ -30,7 +30,7 @@ CAUSAL = [
 ]
 
 
-@pytest.mark.parametrize("task", few(CAUSAL, 3), ids=str)
+@pytest.mark.parametrize("task", few(CAUSAL, 2), ids=str)
 def test_no_pose_depends_on_what_is_not_known_yet(task):
     assert pose_law(task, GRID)
 
@@ -41,13 +41,15 @@ def test_among_three_each_knows_what_it_may():
 
 @pytest.mark.parametrize(
     "options",
-    [
-        SamplerOptions(keep_given=False),
-        SamplerOptions(requantize=False, placement="anchor", blend=0, eta=0.0),
-        SamplerOptions(guidance=Guidance("partner")),
-        SamplerOptions(guidance=Guidance(smooth=0.01)),
-        SamplerOptions(guidance=Guidance("history", stabilization_level=50)),
-    ],
+    few(
+        [
+            SamplerOptions(keep_given=False),
+            SamplerOptions(requantize=False, placement="anchor", blend=0, eta=0.0),
+            SamplerOptions(guidance=Guidance("partner")),
+            SamplerOptions(guidance=Guidance(smooth=0.01)),
+            SamplerOptions(guidance=Guidance("history", stabilization_level=50)),
+        ]
+    ),
     ids=["bare", "anchor", "partner", "smooth", "history"],
 )
 @pytest.mark.parametrize("task", few([MotionControl(), AgenticSync()], 1), ids=str)

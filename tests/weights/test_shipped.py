@@ -14,6 +14,7 @@ from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.synthesis import coupling_error
 from magnet.tasks.joint import Generation, JointFuture
+from tests.cases import some_slow
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_it_says_what_it_was_trained_on_and_names_no_machine():
     assert not re.search(r"[\" =]/\w", text), "an absolute path"
 
 
-@pytest.mark.parametrize("people", [1, 2, 3, 4])
+@pytest.mark.parametrize("people", some_slow([1, 2, 3, 4], 2, 3))
 def test_it_generates_groups_of_one_to_four(model, people):
     scene = Synthetic(people=[max(people, 2)], test_clips=1).clips("test")[0].scene.slice(0, 32)
     scene = scene.permute_agents(torch.arange(people))

@@ -24,7 +24,7 @@ from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, conv
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.datamodules.store.reader import StoreReader
-from tests.cases import few
+from tests.cases import some_quick
 from tests.datamodules import made
 from tests.datamodules.made_scenes import FITTED, FORMS, random_scene, with_positions, written
 from tests.datamodules.readers import fake_of
@@ -168,7 +168,7 @@ def check_left_out(part: ConvertedTake, said: str) -> None:
     assert all(stop - 1 < begin + 1.1 or start > end - 1.1 for begin, end in spans for start, stop in clips)
 
 
-@pytest.mark.parametrize("form", few(FORMS, 4))
+@pytest.mark.parametrize("form", some_quick(FORMS, "duobox", "interx", "bvh"))
 def test_what_is_wrong_with_one_person_is_said_with_frames_and_cut_out_or_refused(form: str, tmp_path: Path) -> None:
     check_spoiled(form, tmp_path, slow=False)
 

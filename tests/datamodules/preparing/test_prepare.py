@@ -19,7 +19,7 @@ from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare, read_splits
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.store.reader import STATE, StoreReader
-from tests.cases import some_slow
+from tests.cases import few, some_slow
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
@@ -122,7 +122,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp
     assert content(out) == undisturbed
 
 
-@pytest.mark.parametrize("dies_at", ["first shard", "second shard", "index", "manifest"])
+@pytest.mark.parametrize("dies_at", few(["first shard", "second shard", "index", "manifest"]))
 def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, whole, tmp_path, monkeypatch, dies_at):
     prepare(order, tmp_path / "store", limit=1, shard_rows=700)
     before = content(tmp_path / "store")

@@ -21,7 +21,7 @@ from magnet.datamodules.preparing.check import check_store
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
-from tests.cases import few
+from tests.cases import few, some_slow
 from tests.datamodules import made
 
 pytestmark = pytest.mark.usefixtures("known")
@@ -87,7 +87,7 @@ def test_a_second_prepare_says_that_another_works_there_and_the_first_ends_well(
     assert content(out) == alone and prepare(order, out, shard_rows=700).made == 0
 
 
-@pytest.mark.parametrize("there", ["nothing", "a store", "another store"])
+@pytest.mark.parametrize("there", some_slow(["nothing", "a store", "another store"], "nothing", "a store"))
 def test_prepares_that_race_leave_the_store_of_one(
     order: PrepareJob, alone: dict[str, bytes], tmp_path: Path, there: str
 ) -> None:
