@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from magnet.body.capsules import capsule_segments, nearest_points
-from magnet.body.joints import PELVIS, TOES, WRISTS
+from magnet.body.joints import PELVIS, TOES
 from magnet.export.drawing import SHADOW
-from magnet.export.page.palette import COLLIDES, FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
+from magnet.export.page.marks import BALL, DISC, HAND, depth_colours, penetrations, standing, touching
+from magnet.export.page.palette import FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.export.page.rig import Array, Index, capsule
-from magnet.metrics.body_depth import DEEP
-from magnet.metrics.penetration import TOUCH, penetration_depth
-from magnet.metrics.skating import PRESETS, toe_steps
 
 AWAY, NO_SIZE = -50.0, 1e-6
 """Height in metres and size of unused marks, which keep them invisible."""
@@ -139,25 +133,25 @@ class Marks:
 
     def __init__(self, server: Any, name: str, people: int, fps: float) -> None:
         self.fps = fps
-        self.feet = Spots(server, f"{name}/feet", disc(0.11), 2 * people, 0.9)
-        self.hands = Spots(server, f"{name}/hands", ball(0.085), 2 * people, 0.6)
+        self.feet = Spots(server, f"{name}/feet", disc(DISC), 2 * people, 0.9)
+        self.hands = Spots(server, f"{name}/hands", ball(HAND), 2 * people, 0.6)
         self.hits = Spots(server, f"{name}/hits", ball(1.0), 24, 0.75)
 
     def contacts(self, before: Array, now: Array) -> tuple[int, int]:
         """Joints of the frame before and of this one, (P, 22, 3). -> feet that stand, hands that touch"""
-        stands, slides = standing(before, now, self.fps)
+        stands, slides = (each[0] for each in standing(np.stack([before, now]), self.fps))
         feet = now[:, TOES][stands] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.008, 0.0])
         colours = np.where(slides[stands][:, None], np.array(SLIDES), np.array(STANDS))
         self.feet.show(feet, colours)
-        hands = touching(now)
+        _, hands = touching(now[None])
         self.hands.show(hands, np.array(TOUCHES))
         return len(feet), len(hands)
 
     def collisions(self, now: Array) -> float:
         """Joints (P, 22, 3). -> metres that the deepest collision is deep"""
-        places, radii, depths = penetrations(now)
+        _, places, radii, depths = penetrations(now[None])
         deepest = np.argsort(-depths)
-        self.hits.show(places[deepest], depth_colours(depths[deepest]), radii[deepest] + 0.03)
+        self.hits.show(places[deepest], depth_colours(depths[deepest]), radii[deepest] + BALL)
         return float(depths.max(initial=0.0))
 
     def clear(self, contacts: bool, collisions: bool) -> None:
@@ -184,49 +178,3 @@ def ball(radius: float, rings: int = 8, sectors: int = 14) -> tuple[Array, Index
     """A ball: vertices, faces."""
     points, faces, _ = capsule(0.0, radius, radius, sectors, rings // 2)
     return points, faces
-
-
-Mask = NDArray[np.bool_]
-
-HANDS_TOUCH = 0.2
-"""Metres between two people's wrists under which their hands count as touching."""
-
-
-def standing(before: Array, now: Array, fps: float) -> tuple[Mask, Mask]:
-    """Which toes stand, and which of these slide, as the metric FS counts them. (P, 22, 3) x 2 -> (P, 2) bool x 2"""
-    height, fast = PRESETS["default"]
-    speed, low = toe_steps(torch.from_numpy(np.stack([before, now])), fps, height)
-    return low[0].numpy(), (low & (speed > fast))[0].numpy()
-
-
-def touching(joints: Array) -> Array:
-    """Places between hands of different people that touch. (P, 22, 3) -> (M, 3)"""
-    wrists = joints[:, WRISTS]  # (P, 2, 3)
-    apart = np.linalg.norm(wrists[:, :, None, None] - wrists[None, None], axis=-1)  # (P, 2, P, 2)
-    p, hand, q, other = np.nonzero(apart < HANDS_TOUCH)
-    once = p < q
-    return (wrists[p[once], hand[once]] + wrists[q[once], other[once]]) / 2
-
-
-def penetrations(joints: Array) -> tuple[Array, Array, Array]:
-    """Where capsules of different people overlap, as the metric IP counts them.
-
-    (P, 22, 3) -> places (M, 3), radii of the thicker capsule (M,), depths (M,), metres
-    """
-    pairs = list(itertools.combinations(range(len(joints)), 2))
-    if not pairs:
-        return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
-    people = torch.from_numpy(np.ascontiguousarray(joints)).float()
-    one, other = people[[p for p, _ in pairs]], people[[q for _, q in pairs]]
-    depth = penetration_depth(one, other)
-    n, i, j = depth.nonzero(as_tuple=True)
-    a, b, radius = capsule_segments(one)
-    c, d, _ = capsule_segments(other)
-    first, second = nearest_points(a[n, i], b[n, i], c[n, j], d[n, j])
-    return ((first + second) / 2).numpy(), torch.maximum(radius[i], radius[j]).numpy(), depth[n, i, j].numpy()
-
-
-def depth_colours(depths: Array) -> Array:
-    """Amber at 5 cm, where bodies begin to count as overlapping, to red from 10 cm on. (M,) metres -> (M, 3)"""
-    share = np.clip((depths - TOUCH) / (DEEP - TOUCH), 0.0, 1.0)[:, None]
-    return (1 - share) * np.array(SLIDES, dtype=float) + share * np.array(COLLIDES, dtype=float)

@@ -8,6 +8,7 @@ import torch
 
 from magnet.export.page.html import save_html
 from magnet.export.page.light import light
+from magnet.metrics.body_depth import deepest
 from magnet.testing import random_scene
 from tests.viewer.browser import blue, orange, pale_orange, shot, upright
 
@@ -113,16 +114,19 @@ def test_each_vertex_of_a_crowd_is_drawn_where_the_body_has_it(page, body, tmp_p
         np.testing.assert_allclose(places, truth[frame], atol=1e-3)
 
 
-def test_any_number_of_people_are_drawn_in_three_calls_and_each_ghost_in_two(page, body, tmp_path) -> None:
+def test_any_number_of_people_are_drawn_in_three_calls_each_ghost_in_two_and_marks_in_one(page, body, tmp_path) -> None:
     page.add_init_script(COUNTED)
     for people, ghosts in ((2, 0), (40, 0), (3, 2)):
         crowd = random_scene(1, 6, people, torch.Generator().manual_seed(3))
         truth = random_scene(1, 6, ghosts, torch.Generator().manual_seed(4)) if ghosts else None
         page.goto(save_html(crowd, tmp_path / "a.html", body, truth=truth, styles=("light", "skeleton")).as_uri())
         page.wait_for_function("window.player && player.drawn > 0")
-        for style in ("light", "skeleton"):
-            draw = f"view.style = '{style}'; calls = 0; picture.draw(player.motion, 2.5, view); return calls;"
-            assert page.evaluate(f"(() => {{ const {{ picture, view }} = player; {draw} }})()") == 3 + 2 * ghosts
+        marked = page.evaluate("player.picture.marks.at(2, -1).length") > 0
+        for style, marks in (("light", "false"), ("skeleton", "false"), ("light", "true")):
+            look = f"view.style = '{style}'; view.marks = {marks};"
+            draw = f"{look} calls = 0; picture.draw(player.motion, 2.5, view); return calls;"
+            expected = 3 + 2 * ghosts + (marked and marks == "true")
+            assert page.evaluate(f"(() => {{ const {{ picture, view }} = player; {draw} }})()") == expected
 
 
 def test_the_page_shows_takes_side_by_side_and_each_alone(page, handshake, body, tmp_path) -> None:
@@ -163,3 +167,52 @@ def test_the_page_marks_a_given_partner_and_keyframes(page, handshake, body, tmp
     image = shot(page, "page_given_partner")[40:380]
     assert blue(image).sum() > 300 and pale_orange(image).sum() > 300
     assert orange(image, least=130).sum() < pale_orange(image).sum() / 10
+
+
+def reddish(image: np.ndarray) -> np.ndarray:
+    """Pixels of marks of people who are 10 cm and more in each other."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return (red > 150) & (green < 80) & (blue < 100)
+
+
+def test_the_page_marks_how_deep_people_are_in_each_other_until_marks_are_off(page, handshake, body, tmp_path) -> None:
+    near = handshake.T_world_root.clone()
+    near[:, 40:, 1, :3, 3] = near[:, 40:, 0, :3, 3] + torch.tensor([0.05, 0.0, 0.05])
+    path = save_html(handshake.replace(T_world_root=near), tmp_path / "a.html", body, title="Too near")
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 2")
+    joints = body.joints(handshake.replace(T_world_root=near))[0, 60]
+    depth = round(100 * deepest(joints[:1], joints[1:])[0, 0].item())
+    assert depth >= 10
+
+    def looked_at(name: str, said: str) -> np.ndarray:
+        page.locator("#time").fill("60")
+        page.wait_for_function(f"document.getElementById('state').textContent === '{said}'")
+        drawn = page.evaluate("player.drawn")
+        page.wait_for_function(f"player.drawn > {drawn + 1}")
+        return shot(page, name)
+
+    before = looked_at("page_marks", f"{depth} cm in each other")
+    assert reddish(before)[40:380].sum() > 100
+    rows = reddish(before)[400:].sum(axis=1)  # of the timeline, red from frame 40 of 128 on
+    assert (rows > 0.6 * 88 / 128 * 772).sum() >= 4
+    page.locator("#marks").click()
+    after = looked_at("page_marks_off", "")
+    assert reddish(after)[40:380].sum() < 10 and reddish(after)[400:].sum(axis=1).max() < 40
+
+
+@pytest.mark.parametrize("camera", ["front", "side", "above"])
+def test_labels_of_takes_stay_on_the_page(page, handshake, body, tmp_path, camera) -> None:
+    path = save_html(handshake.repeat(2).replace(names=()), tmp_path / "a.html", body, styles=("skeleton",), title="A")
+    page.goto(path.as_uri())
+    page.wait_for_function("window.player && player.drawn > 2")
+    page.select_option("#from", camera)
+    page.evaluate("player.view.zoom(0.4)")  # so near that heads are beyond the edge
+    drawn = page.evaluate("player.drawn")
+    page.wait_for_function(f"player.drawn > {drawn + 1}")
+    for k in range(2):
+        label = page.locator("#labels div").nth(k)
+        if label.is_visible():
+            box = label.bounding_box()
+            assert box["x"] >= -1 and box["y"] >= 0 and box["x"] + box["width"] <= 801
+    assert page.locator("#labels div").nth(0).is_visible() or page.locator("#labels div").nth(1).is_visible()

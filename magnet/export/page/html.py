@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from magnet.body.base import Body
 from magnet.body.joints import PARENTS
-from magnet.export.page.palette import GHOST, agent_colours, pale
+from magnet.export.page.marks import marked
+from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes
+from magnet.metrics.body_depth import DEEP
+from magnet.metrics.penetration import TOUCH
 from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
 FULL = 32767
-SCRIPTS = ("motion.js", "picture.js", "player.js")
+SCRIPTS = ("motion.js", "marks.js", "picture.js", "player.js")
 CHUNK = 512
 """Frames posed at a time."""
 
@@ -130,6 +133,7 @@ def _contents(
         "roots": np.concatenate(roots, axis=1),
         "known": torch.cat(known, dim=2)[0].numpy().astype(np.uint8),
     }
+    arrays |= marked(body, [same_length(each, longest) for each in shown], offsets)
     looks = {style: rigs(body, shapes, style) for style in styles}
     reach = max(float(np.abs(rig.skin.vertices).max()) for bodies in looks.values() for rig in bodies)
     arrays["rest"] = np.stack([rig.rest for rig in looks[styles[0]]]).astype(np.float32)
@@ -143,6 +147,7 @@ def _contents(
         "parents": list(PARENTS),
         "styles": list(styles),
         "unit": reach / FULL,
+        "marks": {"from": TOUCH, "to": DEEP, "amber": SLIDES, "red": COLLIDES, "hands": TOUCHES},
     }
     return meta, arrays
 

@@ -121,6 +121,7 @@ class Picture {
     this.about = new Float32Array(meta.people.length * ABOUT);
     this.aboutBuffer = gl.createBuffer();
     this.poses = this.texture(ROWS, meta.people.length, this.rows);
+    this.marks = new Marks(this, meta, arrays);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     gl.clearColor(0.98, 0.98, 0.988, 1);
@@ -222,6 +223,8 @@ class Picture {
     this.pose(motion, time, view);
     this.shadows(view.shown.length, view.style);
     this.figures(0, view.shown.length, view.style, 1);
+    if (view.marks) this.marks.draw(this.camera, eye, Math.min(Math.floor(time), this.meta.frames - 1), view.take);
+    if (view.ghosts && view.behind.length) gl.useProgram(program);
     if (view.ghosts) for (let i = 0; i < view.behind.length; i++) this.ghost(view.shown.length + i, view.style);
   }
 

@@ -3,7 +3,19 @@
 const PRESETS = { "three quarters": [0.65, 0.3], front: [0, 0.12], side: [Math.PI / 2, 0.12], above: [0, 1.45] };
 const ALL = -1; // takes, side by side
 const HEAD_HIGH = 2.3; // metres, where a take's label is
+const DEPTHS = 5; // pixels of the timeline's stripe of depths
 const MOMENTS = 21; // at which is measured how much room people take
+
+// A stripe of the timeline: a background of CSS with a colour for each frame.
+function stripe(frames, colour, top, height) {
+  const stops = [];
+  for (let from = 0, to; from < frames; from = to) {
+    const ink = colour(from);
+    for (to = from + 1; to < frames && colour(to) === ink; ) to++;
+    stops.push(`${ink} ${(100 * from) / frames}% ${(100 * to) / frames}%`);
+  }
+  return `linear-gradient(90deg, ${stops.join(", ")}) 0 ${top}px / 100% ${height}px no-repeat`;
+}
 
 // -- camera -------------------------------------------------------------------------------------
 
@@ -14,6 +26,7 @@ class View {
     this.people = meta.people.map((person, index) => ({ ...person, index }));
     this.style = meta.styles[0];
     this.ghosts = true;
+    this.marks = true;
     this.follow = true;
     this.target = [0, 0.85, 0];
     this.preset(meta.takes.length > 1 ? "front" : "three quarters");
@@ -41,21 +54,20 @@ class View {
     return those.length ? `given: ${those.map((person) => person.name).join(", ")}` : "generated";
   }
 
-  // A stripe a person for the timeline, pale where the motion was given: backgrounds of CSS, and their height.
-  ribbon(frames) {
-    const height = Math.min(24, Math.max(6, 4 * this.shown.length));
+  // A stripe a person for the timeline, pale where the motion was given, and below them one of how deep people are in
+  // each other, if they are: backgrounds of CSS, and their height.
+  ribbon(frames, marks) {
+    const people = Math.min(24, Math.max(6, 4 * this.shown.length));
+    const each = people / this.shown.length;
     const stripes = this.shown.map((person, row) => {
-      const stops = [];
-      for (let from = 0, to; from < frames; from = to) {
-        const given = this.given(from, person.index);
-        for (to = from + 1; to < frames && this.given(to, person.index) === given; ) to++;
-        const colour = `rgb(${given ? person.pale : person.colour})`;
-        stops.push(`${colour} ${(100 * from) / frames}% ${(100 * to) / frames}%`);
-      }
-      const each = height / this.shown.length;
-      return `linear-gradient(90deg, ${stops.join(", ")}) 0 ${row * each}px / 100% ${each}px no-repeat`;
+      const colour = (frame) => `rgb(${this.given(frame, person.index) ? person.pale : person.colour})`;
+      return stripe(frames, colour, row * each, each);
     });
-    return [stripes.join(", "), `${height}px`];
+    const depths = Array.from({ length: frames }, (_, frame) => (this.marks ? marks.deepest(frame, this.take) : 0));
+    if (!depths.some((depth) => depth > 0)) return [stripes.join(", "), `${people}px`];
+    const deep = (frame) => (depths[frame] ? `rgb(${marks.depthColour(depths[frame])})` : "#e8ebf1");
+    stripes.push(stripe(frames, deep, people + 1, DEPTHS));
+    return [stripes.join(", "), `${people + 1 + DEPTHS}px`];
   }
 
   preset(name) {
@@ -171,8 +183,12 @@ class Player {
     const wide = widths.sort((a, b) => a - b)[Math.floor(0.8 * (MOMENTS - 1))];
     view.distance = Math.max(3.6, 2.2 * (wide / 2 + 0.7));
     view.goTo(this.centre(), 1);
+    this.ribbon();
+  }
+
+  ribbon() {
     const { style } = document.getElementById("time");
-    [style.background, style.height] = view.ribbon(meta.frames);
+    [style.background, style.height] = this.view.ribbon(this.meta.frames, this.picture.marks);
   }
 
   advance(seconds) {
@@ -209,15 +225,25 @@ class Player {
     if (document.activeElement !== get("time") || this.playing) get("time").value = frame;
     get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
     const alone = meta.takes.length === 1 || this.view.take !== ALL;
-    get("state").textContent = alone ? this.view.said(frame, this.view.shown) : "";
+    get("state").textContent = alone ? this.said(this.view.shown, this.view.take) : "";
     for (const [take, label] of this.labels.entries()) {
       const people = alone ? [] : this.view.shown.filter((person) => person.take === take);
       const place = people.length && this.overhead(people);
       label.hidden = !place;
       if (!place) continue;
-      [label.style.left, label.style.top] = place.map((x) => `${x}px`);
-      label.textContent = [meta.takes[take], this.view.said(frame, people)].filter((text) => text).join(": ");
+      label.textContent = [meta.takes[take], this.said(people, take)].filter((text) => text).join(": ");
+      const { offsetWidth: wide, offsetHeight: tall } = label;
+      const right = this.picture.canvas.clientWidth - wide / 2;
+      label.style.left = `${Math.max(Math.min(place[0], right), wide / 2)}px`;
+      label.style.top = `${Math.max(place[1], tall + 4)}px`; // people taller than the page are named inside it
     }
+  }
+
+  // What was given in this frame, and how deep people are in each other.
+  said(people, take) {
+    const depth = this.view.marks ? this.picture.marks.deepest(this.frame, take) : 0;
+    const deep = depth > 0 ? `${Math.round(100 * depth)} cm in each other` : "";
+    return [this.view.said(this.frame, people), deep].filter((text) => text).join(" \u00b7 ");
   }
 
   // Where on the page a take's label is.
@@ -244,6 +270,11 @@ class Player {
     get("style").addEventListener("change", (event) => (view.style = event.target.value));
     get("ghosts").hidden = !meta.people.some((person) => person.ghost);
     get("truth").addEventListener("change", (event) => (view.ghosts = event.target.checked));
+    get("marked").hidden = !this.picture.marks.any;
+    get("marks").addEventListener("change", (event) => {
+      view.marks = event.target.checked;
+      this.ribbon();
+    });
     get("follow").addEventListener("change", (event) => (view.follow = event.target.checked));
     get("from").addEventListener("change", (event) => view.preset(event.target.value));
     document.addEventListener("keydown", (event) => {
