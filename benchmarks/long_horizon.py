@@ -5,8 +5,11 @@
 Continues recorded test takes from 4 context frames for `--frames` frames. Every 5 seconds of what is generated are
 placed like recorded 5 seconds (one world a window, at its first frame) and compared with all recorded test windows:
 FD of each window, and of all windows so far (cumulative, as paper Fig. 7). Beside it: distance of the partners, speed
-of the joints, height of head and feet, which tell frozen, folded and floating bodies. Written: curve.png, strips,
-results.json, two scenes as npz.
+of the joints, height of head and feet, which tell frozen, folded and floating bodies. Who bows, lunges or is dipped is
+low, too, and recorded dancers do all three: so each pose is compared with the nearest recorded one of the training
+takes, and low ones by themselves. Couples may leave the dance for another kind of scene that the model was trained on:
+so each frame of both is compared with all kinds. Written: curve.png, strips, results.json, two scenes as npz, and low.png, the lowest
+moments of all scenes.
 """
 
 from __future__ import annotations
@@ -35,13 +38,18 @@ from magnet.generation.rollout import generate
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
 from magnet.metrics.body_depth import deepest
 from magnet.metrics.frechet import Features, moments
+from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.scene import Scene, concatenate
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
+from magnet.synthesis import synthesize
 from magnet.tasks.joint import JointFuture
 
 CONTEXT, WINDOW = 4, 150
 HEAD, FEET = 15, (10, 11)
+COUPLINGS = ("mirror", "follow", "handshake", "circle", "patty_cake")
+LOW = 1.1
+"""A head under this height, in metres, is low: a bow, a lunge, a dip, or somebody who has folded up."""
 
 
 def windows(data: CMU, split: str, stride: int = 30) -> Scene:
@@ -66,6 +74,17 @@ def distance(a: FrechetDistance, b: FrechetDistance) -> float:
     )
 
 
+def drawn(joints: Tensor, present: Tensor, reference: FrechetDistance, features: Features, count: int) -> list[float]:
+    """5, 50 and 95 % of the distances of `count` recorded windows, drawn 60 times: what chance gives so few.
+
+    joints (M, T, P, 22, 3)
+    """
+    generator = torch.Generator().manual_seed(1)
+    draws = (torch.randperm(len(joints), generator=generator)[:count] for _ in range(60))
+    distances = torch.tensor([distance(pooled(joints[rows], present[rows], features), reference) for rows in draws])
+    return [float(part) for part in distances.quantile(torch.tensor([0.05, 0.5, 0.95]))]
+
+
 def describe(joints: Tensor, present: Tensor) -> dict[str, float]:
     """What a window looks like. joints (B, T, P, 22, 3)"""
     there = joints.transpose(1, 2)[present]
@@ -82,14 +101,67 @@ def describe(joints: Tensor, present: Tensor) -> dict[str, float]:
     }
 
 
+def nearest(joints: Tensor, recorded: Tensor) -> Tensor:
+    """How far each pose is from the nearest recorded one in its own frame, root mean square of the joints, in metres.
+
+    (..., 22, 3), (M, 22, 3) -> (...,)
+    """
+    own, known = (seen_from(joint_canonical_frame(poses), poses).flatten(-2) for poses in (joints, recorded))
+    flat = own.flatten(0, -2).split(2048)
+    near = torch.cat([torch.cdist(part, known).amin(dim=1) for part in flat])
+    return (near / joints.shape[-2] ** 0.5).view(own.shape[:-1])
+
+
+def couples(joints: Tensor) -> Tensor:
+    """Both bodies as the first sees them, and as the second does. (M, 2, 22, 3) -> (2 M, 132)"""
+    both = [seen_from(joint_canonical_frame(joints[:, own])[:, None], joints).flatten(1) for own in (0, 1)]
+    return torch.cat([both[0], torch.cat(both[1].chunk(2, dim=1)[::-1], dim=1)])
+
+
+def kinds(joints: Tensor, known: dict[str, Tensor]) -> dict[str, float]:
+    """Share of frames whose two bodies together are nearest to each kind of training scene. joints (B, T, P, 22, 3)"""
+    frames = joints[:, ::5, :2].flatten(0, 1)
+    near = torch.stack([torch.cdist(couples(frames)[: len(frames)], each).amin(dim=1) for each in known.values()])
+    return {f"like {name}": float((near.argmin(dim=0) == i).float().mean()) for i, name in enumerate(known)}
+
+
+def training_kinds(data: CMU, body: Body) -> dict[str, Tensor]:
+    """`couples` of the recorded takes, and of synthetic scenes of two by coupling, 30 of 5 s each."""
+    found = {"salsa": torch.cat([couples(body.joints(clip.scene)[0, ::2, :2]) for clip in data.clips("train")])}
+    for coupling in COUPLINGS:
+        scenes = [synthesize(coupling, 2, 150, torch.Generator().manual_seed(k), body).scene for k in range(30)]
+        found[coupling] = torch.cat([couples(body.joints(scene)[0, ::3, :2]) for scene in scenes])
+    return found
+
+
+def lows(joints: Tensor, present: Tensor, recorded: Tensor) -> dict[str, float]:
+    """How often a head is low, and how far poses are from recorded ones. joints (B, T, P, 22, 3)"""
+    there = joints.transpose(1, 2)[present]
+    low, far = there[..., HEAD, 1] < LOW, nearest(there, recorded)
+    return {
+        "head low, share": float(low.float().mean()),
+        "from a recorded pose m, median": float(far.median()),
+        "from a recorded pose m, 99 %": float(far.flatten().quantile(0.99)),
+        "low poses from one m, median": float(far[low].median()) if low.any() else 0.0,
+        "low poses from one m, most": float(far[low].max()) if low.any() else 0.0,
+    }
+
+
 def slowest(people: Tensor) -> Tensor:
     """Mean speed of the joints in the stillest second of anybody: near 0 is frozen. (M, T, 22, 3)"""
     speed = 30 * people.diff(dim=1).norm(dim=-1).mean(dim=-1)
     return speed.unfold(1, 29, 15).mean(dim=-1).min()
 
 
-def measured(long: Scene, body: Body, reference: FrechetDistance, pairs: FrechetDistance) -> list[dict[str, Any]]:
-    """What each 5 seconds after the context are like, beside the recorded ones (as placed, and as pairs)."""
+def measured(
+    long: Scene,
+    body: Body,
+    reference: FrechetDistance,
+    pairs: FrechetDistance,
+    recorded: Tensor,
+    known: dict[str, Tensor],
+) -> list[dict[str, Any]]:
+    """What each 5 seconds after the context are like, beside the recorded ones (placed, as pairs, pose by pose)."""
     curve: list[dict[str, Any]] = []
     so_far: list[Tensor] = []
     for start in range(CONTEXT, long.frames - WINDOW + 1, WINDOW):
@@ -104,7 +176,10 @@ def measured(long: Scene, body: Body, reference: FrechetDistance, pairs: Frechet
                 "fd": distance(pooled(joints, window.present), reference),
                 "fd pair": distance(pooled(joints, window.present, "pair"), pairs),
                 "cumulative fd": distance(pooled(cumulative, there), reference),
+                "cumulative fd pair": distance(pooled(cumulative, there, "pair"), pairs),
                 **describe(joints, window.present),
+                **lows(joints, window.present, recorded),
+                **kinds(joints, known),
             }
         )
     return curve
@@ -150,11 +225,16 @@ def main() -> None:
     reference = pooled(real_joints, real.present)
     pairs, others = pooled(real_joints, real.present, "pair"), body.joints(training)
     floor = distance(pooled(others, training.present), reference)
-    curve = measured(long, body, reference, pairs)
+    poses = others.transpose(1, 2)[training.present].flatten(0, 1)
+    curve = measured(long, body, reference, pairs, poses, training_kinds(data, body))
     facts = {
         "floor: training windows against test windows": floor,
         "floor of FD pair": distance(pooled(others, training.present, "pair"), pairs),
-        "recorded": describe(real_joints, real.present),
+        "FD of as many training windows": drawn(others, training.present, reference, "world_joints", len(chosen)),
+        "FD pair of as many training windows": drawn(others, training.present, pairs, "pair", len(chosen)),
+        "recorded": describe(real_joints, real.present) | lows(real_joints, real.present, poses),
+        "recorded, training takes": describe(others, training.present),
+        "head low in training takes, share": float((poses[:, HEAD, 1] < LOW).float().mean()),
         "finite": all(bool(value.isfinite().all()) for value in long.tensors().values()),
         "seconds": round(seconds, 1),
         "frames a second": round(given.frames * len(chosen) / seconds, 1),
@@ -171,9 +251,20 @@ def main() -> None:
             [("", one)], given.out / f"strip_{b}.png", frames=moments_shown, context_frames=CONTEXT, body=body
         )
         one.save(given.out / f"scene_{b}.npz")
+    draw_lows(long, body, given.out / "low.png")
     print(json.dumps(facts, indent=1))
     for row in curve:
         print({key: round(value, 3) for key, value in row.items()})
+
+
+def draw_lows(long: Scene, body: Body, path: Path) -> None:
+    """The scenes in which a head is lowest, a second and a half before and after."""
+    heads = body.joints(long)[..., HEAD, 1].masked_fill(~long.present[:, None], torch.inf).amin(dim=-1)
+    rows = []
+    for b in heads.amin(dim=1).argsort()[:6].tolist():
+        begins = max(0, min(int(heads[b].argmin()) - 45, long.frames - 91))
+        rows.append((f"{(begins - CONTEXT) / 30:.0f} s", long.select([b]).slice(begins, begins + 91)))
+    contact_sheet(rows, path, frames=list(range(0, 91, 10)), context_frames=0, body=body)
 
 
 def draw(curve: list[dict[str, Any]], floor: float, path: Path) -> None:
