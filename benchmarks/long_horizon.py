@@ -8,8 +8,8 @@ FD of each window, and of all windows so far (cumulative, as paper Fig. 7). Besi
 of the joints, height of head and feet, which tell frozen, folded and floating bodies. Who bows, lunges or is dipped is
 low, too, and recorded dancers do all three: so each pose is compared with the nearest recorded one of the training
 takes, and low ones by themselves. Couples may leave the dance for another kind of scene that the model was trained on:
-so each frame of both is compared with all kinds. Written: curve.png, strips, results.json, two scenes as npz, and low.png, the lowest
-moments of all scenes.
+so each frame of both is compared with all kinds. Written: curve.png, strips, results.json, two scenes as npz, and
+low.png, the lowest moments of all scenes.
 """
 
 from __future__ import annotations
