@@ -26,6 +26,7 @@ def run(source: str, space: dict[str, Any]) -> Any:
     return None if last is None else eval(compile(ast.Expression(last.value), str(TOUR), "eval"), space)
 
 
+@pytest.mark.slow
 def test_the_tour_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.chdir(tmp_path)
     space: dict[str, Any] = {}

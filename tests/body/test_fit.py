@@ -165,6 +165,7 @@ def test_bad_arguments_are_named(body: Body, moving: Scene) -> None:
 # -- a real couple -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_real_couple_fits_within_the_bars(cmu_root: Path, body: Body) -> None:
     people = []
     for subject in (60, 61):

@@ -108,6 +108,7 @@ def test_tasks_have_their_own_defaults(name: str, command: str, capsys: pytest.C
     assert asked == {"name": name, **plain(expected)}
 
 
+@pytest.mark.slow
 def test_every_data_set_inside_mixed_has_its_own_defaults_over_any_other_list(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -73,6 +73,7 @@ def test_every_suffix_is_written_by_the_command(suffix: str, stored: Path, capsy
     assert len(written) == (2 if suffix == "bvh" else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("naming", "metres", "up"), some_slow([("biped", 0.0254, "z"), ("mixamo", 0.01, "y")], ("mixamo", 0.01, "y"))
 )

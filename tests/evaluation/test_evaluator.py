@@ -136,6 +136,7 @@ def test_scores_follow_the_seed():
     assert run(data(), baselines=False, seed=4).results.rows[MODEL] != same[0]
 
 
+@pytest.mark.slow
 def test_samples_do_not_depend_on_the_batch_that_they_are_drawn_in(measured, answered):
     """Random retrieval draws, too: a scene's noise is its own."""
     one_by_one = run(data(batch_size=1)).results
@@ -191,6 +192,7 @@ def test_where_nothing_went_before_scenes_are_placed_at_their_first_frame():
     assert yaw[:, 0].abs().max() < 1e-5
 
 
+@pytest.mark.slow
 def test_composed_scenes_have_baselines_of_their_size(monkeypatch):
     monkeypatch.setattr("magnet.evaluation.scoring.BASELINE_COMPOSED", 8)
     clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in (1, 2)]

@@ -145,6 +145,7 @@ def narrow() -> dict[str, dict[str, float]]:
     return rows(2, 2, baselines=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slots", some_slow([3, 9], 9))
 def test_free_slots_of_the_data_change_no_number(narrow: dict[str, dict[str, float]], slots: int) -> None:
     wide = rows(2, slots, baselines=True)

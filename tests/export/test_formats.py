@@ -38,6 +38,7 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
+@pytest.mark.slow
 def test_a_page_and_a_film_can_be_light_and_a_film_is_of_the_size_asked_for(duet: Scene, body: Body, tmp_path: Path):
     (page,) = formats.write(duet, tmp_path / "a.html", body, style="light")
     assert '"styles":["light"]' in page.read_text()

@@ -150,6 +150,7 @@ def test_other_proportions_keep_limbs_pointing_the_same_way(legs, arms, truth: T
     assert angle[LIMBS].max() < 16
 
 
+@pytest.mark.slow
 def test_people_keep_their_places_and_stand_on_the_floor(truth: Truth, body: Body, tmp_path: Path):
     raised = truth.scene.T_world_root.clone()
     raised[..., :3, 3] += torch.tensor([1.5, 0.3, -1.0])
@@ -254,6 +255,7 @@ def as_bvh(recording: AmcRecording, path: Path) -> Path:
     return strangers.write(path, names, skeleton.parents, offsets, root, recording.local, recording.fps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("take", some_slow(["60_08", "61_03"], "61_03"))
 def test_recorded_dancers_as_bvh_fit_as_well_as_their_own_reader_does(take, cmu_root: Path, body: Body, tmp_path: Path):
     """The BVH way knows names alone; the reader of the recordings knows CMU's rest pose, its glitches and the floor."""

@@ -18,6 +18,7 @@ from magnet.export.drawing import AGENTS, CONTEXT, Canvas, plan_views, strokes
 from magnet.export.video import Film
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
+from tests.cases import some_slow
 
 Count = Callable[[Image.Image, tuple[int, int, int]], int]
 SMALL = (160, 120)
@@ -57,7 +58,7 @@ def test_a_file_holds_the_scenes_seconds_at_the_fps_asked_for(
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("style", some_slow(STYLES, "light"))
 def test_known_frames_are_pink_and_generated_ones_are_not(
     style: Style, duet: Scene, body: Body, pixels_like: Count
 ) -> None:

@@ -126,6 +126,7 @@ def test_two_who_are_known_are_shown_where_they_stand_to_whoever_is_not(model: D
     assert sum(seen) > 0, "some egos are not known"
 
 
+@pytest.mark.slow
 def test_bodies_are_kept_apart_as_they_are_shown_in_the_end() -> None:
     """A block decoded alone is of other poses than in the middle of its scene; those would be kept apart in vain."""
     model, options = magnet.load("duet1").denoiser, SamplerOptions.preset("steady", steps=3)  # which rolls
@@ -174,6 +175,7 @@ def test_how_far_people_see_each_other_is_an_option(model: Denoiser) -> None:
         SamplerOptions(crowd_enter=2.0, crowd_leave=1.0)
 
 
+@pytest.mark.slow
 def test_pairs_of_a_crowd_are_corrected_where_a_scene_of_two_is() -> None:
     model = tiny_denoiser(max_agents=4, window=8, sampling=Sampling(settle="hold"))
     scene, task = crowd(6), registry.get("joint_future")()
@@ -237,6 +239,7 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
     assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
 
 
+@pytest.mark.slow
 @each_model("frames", [16, 40], (False, 16))
 def test_a_crowd_is_made_from_nothing_in_its_slots_and_of_its_shapes(model: Denoiser, frames: int) -> None:
     scene = crowd(5, 4)

@@ -186,6 +186,7 @@ class Counting(torch.utils._python_dispatch.TorchDispatchMode):
         return made
 
 
+@pytest.mark.slow
 def test_an_answer_takes_the_same_work_however_long_the_past():
     model = tiny_denoiser(max_agents=2, window=8)
     scene = random_scene(1, 240, 2, torch.Generator().manual_seed(0))

@@ -116,6 +116,7 @@ def made(model, recording) -> Callable[..., Scene]:
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some_slow(CAUSAL, *CAUSAL[1:]))
 def test_people_who_make_way_do_not_depend_on_the_pieces_either(made, name):
     """Nor, in causal plans, on when the scene ends: nobody makes way for what has not been seen."""
@@ -177,6 +178,7 @@ def test_pieces_make_up_the_scene_however_it_is_sampled(model, recording, option
         assert close(at_once(model, recording, task, 8, 77, options), cat_time(chunks))
 
 
+@pytest.mark.slow
 def test_generate_returns_the_pieces_of_a_stream_bit_for_bit(model, recording):
     long, plain = random_scene(2, 300, 3, torch.Generator().manual_seed(4)), replace(FAST, precision="reference")
     for task in (JointFuture(), PartnerInpainting()):

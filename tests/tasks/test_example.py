@@ -72,15 +72,18 @@ def said(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return json.loads(run("commands", json.dumps(COMMANDS), installed=installed, cwd=where))
 
 
+@pytest.mark.slow
 def test_an_installed_task_is_listed_with_where_it_comes_from(said: dict[str, str]):
     assert "magnet-duel 0.1.0" in said["tasks"]
     assert "--task.ending" in said["tasks"] and "P(A_t:L-1 | A_0:t-1, A_L, B_0:L, ...)" in said["tasks"]
 
 
+@pytest.mark.slow
 def test_its_fields_are_options_as_ours_are(said: dict[str, str]):
     assert "target: 1" in said["test"] and "ending: 2" in said["test"]
 
 
+@pytest.mark.slow
 def test_its_data_set_is_listed_and_its_fields_are_options(said: dict[str, str]):
     assert "Strolls  of magnet-duel 0.1.0" in said["data list"] and "--data Strolls" in said["data list"]
     assert "magnet_duel.strolls.Strolls" in said["fit"] and "takes: 3" in said["fit"]

@@ -35,6 +35,7 @@ def test_no_pose_depends_on_what_is_not_known_yet(task):
     assert pose_law(task, GRID)
 
 
+@pytest.mark.slow
 def test_among_three_each_knows_what_it_may():
     assert pose_law(MotionControl((0, 2)), THREE) and pose_law(AgenticAsync(0.5, order=(2, 0)), THREE)
 

@@ -46,6 +46,7 @@ def test_resumed_training_ends_bit_identical(
     assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
 
 
+@pytest.mark.slow
 def test_codes_start_after_the_steps_without_them_also_where_training_was_stopped(tmp_path: Path, scene: Scene) -> None:
     waiting = {"quantizer": {"continuous_steps": 6, "num_quantizers": 2}}
     first, keep = tiny(**waiting), ModelCheckpoint(tmp_path, filename="{epoch}", save_top_k=-1)

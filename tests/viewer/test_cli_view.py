@@ -12,6 +12,7 @@ from magnet.export.page.rig import VIEWS
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.viewer import server
+from tests.cases import some_slow
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -112,7 +113,7 @@ def test_a_page_holds_all_files_and_samples(tmp_path: Path, duet: Scene) -> None
     assert '"takes":["a \\u00b7 1","a \\u00b7 2","b"]' in (tmp_path / "a.html").read_text()
 
 
-@pytest.mark.parametrize("style", VIEWS)
+@pytest.mark.parametrize("style", some_slow(VIEWS, "light"))
 def test_a_page_of_any_style_is_written_without_viser_or_a_server(
     tmp_path: Path, duet: Scene, monkeypatch, capsys, style
 ) -> None:
