@@ -9,7 +9,7 @@ PY := $(VENV)/bin/python
 PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile
 READY := $(VENV)/.ready
 SHELL := /bin/sh
-# What one process of the tests has compiled the next need not: some start a dozen.
+# Python keeps what it compiles: the tests start many processes, which would each compile everything again.
 unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .PHONY: help setup demo train-duet test test-slow test-browser test-blender test-all check lint type format docs wheel clean distclean

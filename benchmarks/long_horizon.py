@@ -121,7 +121,8 @@ def couples(joints: Tensor) -> Tensor:
 def kinds(joints: Tensor, known: dict[str, Tensor]) -> dict[str, float]:
     """Share of frames whose two bodies together are nearest to each kind of training scene. joints (B, T, P, 22, 3)"""
     frames = joints[:, ::5, :2].flatten(0, 1)
-    near = torch.stack([torch.cdist(couples(frames)[: len(frames)], each).amin(dim=1) for each in known.values()])
+    shown = couples(frames)[: len(frames)]  # as the first sees both: `known` has each couple both ways
+    near = torch.stack([torch.cdist(shown, each).amin(dim=1) for each in known.values()])
     return {f"like {name}": float((near.argmin(dim=0) == i).float().mean()) for i, name in enumerate(known)}
 
 

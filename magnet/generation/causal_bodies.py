@@ -26,7 +26,6 @@ EXPECTED = 1
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
 
-
 RECALLED = 30
 """Frames before the first block that tell which hands hold."""
 

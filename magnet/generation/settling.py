@@ -122,12 +122,13 @@ def settled_block(
 
 
 class Corrected(NamedTuple):
-    """How the last frames of a chunk or block were corrected, for the next one."""
+    """How the last frames of a chunk or block were corrected, for the next one.
+
+    `holding` are hands that held in the last frame of a chunk, or in the last before a block; None: nobody asks.
+    """
 
     offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
-    holding: (
-        Tensor | None
-    )  # (B, Q, 2, 2) bool, hands that held in the last of a chunk, or before a block; None: nobody asks
+    holding: Tensor | None  # (B, Q, 2, 2) bool
     who: tuple[int, ...]  # the slots of these hands, and of a chunk's P people
 
 
@@ -224,6 +225,7 @@ def settled_on(
     shaped = scene.replace(body=body.id, valid=None, given=None).permute_agents(there)
     known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
     new, unseen, who = new[:, there], unseen[there], tuple(there.tolist())
+    earlier = None if past is None else past.offset[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
     holding = None if known is None or how != "hold" else held_on(known, body, past, who)
     plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
@@ -234,11 +236,9 @@ def settled_on(
             seen = shaped.replace(present=shaped.present & ~hidden)
         else:
             seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
-        # The others are seen as shown, corrected already.
-        own = None if past is None else past.offset[:, :, there] * one[:, None]
-        offset[:, :, one] = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)[
-            :, :, one
-        ]
+        own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
+        changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
+        offset[:, :, one] = changes[:, :, one]
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset
     made = corrected(scene, whole)

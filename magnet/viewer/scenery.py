@@ -8,7 +8,7 @@ import numpy as np
 
 from magnet.body.joints import PELVIS, TOES
 from magnet.export.drawing import SHADOW
-from magnet.export.page.marks import BALL, DISC, HAND, depth_colours, penetrations, standing, touching
+from magnet.export.page.marks import BALL, DISC, HAND, MOST, depth_colours, penetrations, standing, touching
 from magnet.export.page.palette import FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
 from magnet.export.page.rig import Array, Index, capsule
 
@@ -135,7 +135,7 @@ class Marks:
         self.fps = fps
         self.feet = Spots(server, f"{name}/feet", disc(DISC), 2 * people, 0.9)
         self.hands = Spots(server, f"{name}/hands", ball(HAND), 2 * people, 0.6)
-        self.hits = Spots(server, f"{name}/hits", ball(1.0), 24, 0.75)
+        self.hits = Spots(server, f"{name}/hits", ball(1.0), MOST, 0.75)
 
     def contacts(self, before: Array, now: Array) -> tuple[int, int]:
         """Joints of the frame before and of this one, (P, 22, 3). -> feet that stand, hands that touch"""

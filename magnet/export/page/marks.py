@@ -29,6 +29,8 @@ BALL = 0.03
 """Metres by which the ball of a collision is thicker than the thicker limb, so that it comes out of the skin."""
 MOST = 24
 """Collisions that are marked in a frame, the deepest."""
+AT_ONCE = 512
+"""Frames in which collisions are looked for at a time, for memory's sake."""
 DEPTH, TOUCHING, SLIDING = range(3)
 """Kinds of marks."""
 
@@ -60,6 +62,12 @@ def penetrations(joints: Array) -> tuple[Index, Array, Array, Array]:
     pairs = list(itertools.combinations(range(joints.shape[1]), 2))
     if not pairs:
         return np.zeros(0, dtype=int), np.zeros((0, 3)), np.zeros(0), np.zeros(0)
+    if len(joints) > AT_ONCE:
+        begins = range(0, len(joints), AT_ONCE)
+        found = [penetrations(joints[begin : begin + AT_ONCE]) for begin in begins]
+        frames = np.concatenate([begin + part[0] for begin, part in zip(begins, found, strict=True)])
+        places, radii, depths = (np.concatenate(each) for each in list(zip(*found, strict=True))[1:])
+        return frames, places, radii, depths
     people = torch.from_numpy(np.ascontiguousarray(joints)).float()
     one, other = (people[:, list(side)].flatten(0, 1) for side in zip(*pairs, strict=True))  # (T * pairs, 22, 3)
     depth = penetration_depth(one, other)

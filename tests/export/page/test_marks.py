@@ -8,6 +8,7 @@ import torch
 
 from magnet.body import Body
 from magnet.export.page.marks import (
+    AT_ONCE,
     DEPTH,
     HANDS_TOUCH,
     MOST,
@@ -64,6 +65,16 @@ def test_collisions_are_as_deep_as_the_metric_says_and_lie_in_both_bodies(embrac
         for place, radius in zip(places[frames == t], radii[frames == t], strict=True):
             for person in now.numpy():
                 assert np.linalg.norm(person - place, axis=1).min() < radius + 0.35
+
+
+def test_collisions_of_a_long_motion_are_those_of_its_frames(embrace: Scene, body: Body) -> None:
+    joints = body.joints(embrace)[0].numpy()
+    times = AT_ONCE // len(joints) + 2  # more than are looked at together
+    frames, *found = penetrations(joints)
+    longer, *again = penetrations(np.concatenate([joints] * times))
+    assert (longer == np.concatenate([frames + k * len(joints) for k in range(times)])).all()
+    for once, often in zip(found, again, strict=True):
+        np.testing.assert_allclose(often, np.concatenate([once] * times), atol=1e-6)
 
 
 def test_one_person_alone_collides_with_nobody(duet: Scene, body: Body) -> None:
