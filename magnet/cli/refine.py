@@ -153,7 +153,7 @@ def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float)
     parts = []
     for row, title in enumerate(before):
         top = GAP + row * (HEIGHT + GAP)
-        most = max(float(before[title].max()), float(after[title].max()), 1e-3)
+        most = max(float(before[title].max()), float(after[title].max())) or 1.0  # of nothing at all, a line at 0
         parts.append(f'<text x="{LEFT}" y="{top - 8}">{title}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + 10}" text-anchor="end">{most:.3g}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + HEIGHT}" text-anchor="end">0</text>')
