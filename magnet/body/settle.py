@@ -59,6 +59,7 @@ class Settle:
         speed: cost of its squared change from frame to frame.
         bend: cost of its squared second difference.
         root: factor of these costs for moving the whole body.
+        lift: further factor for moving it up or down: where hands are to meet, arms reach and feet stay on the floor.
         tilt: factor for turning the whole body or the back.
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
@@ -72,6 +73,7 @@ class Settle:
     speed: float = 0.3
     bend: float = 1000.0
     root: float = 3.0
+    lift: float = 1.0
     tilt: float = 3.0
     most: float = 0.15
     stand: float = 1.0
@@ -152,6 +154,7 @@ class Smoothness:
         self.start = torch.zeros_like(like)  # corrections that cost nothing
         self.scale = torch.ones(DOFS, dtype=like.dtype, device=like.device)
         self.scale[:3], self.scale[3:9] = settle.root, settle.tilt
+        self.scale[1] *= settle.lift
         whole = stiffness(settle, self.lead + free.shape[1])
         self.cost = whole.to(like)[self.lead :]  # (T, L + T)
         keep = free.transpose(1, 2)  # (B, P, T)

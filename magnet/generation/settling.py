@@ -27,10 +27,10 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/tasks.md)."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, stand=16.0, hold=2.0, hard=5.0)
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
-PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, stand=16.0, hold=2.0, hard=20.0)
+PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, lift=10.0, stand=16.0, hold=2.0, hard=20.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
 
 LEFT = Apart(body=0.07, arms=0.07)

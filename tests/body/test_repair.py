@@ -15,7 +15,7 @@ from magnet.body.energy import hand_points
 from magnet.body.fit import clearance
 from magnet.body.joints import FEET, TOES
 from magnet.body.repair import repaired
-from magnet.body.settle import DOFS, Settle, corrected, jacobian
+from magnet.body.settle import DOFS, Settle, corrected, correction, jacobian
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
 from magnet.metrics import hand_distance
@@ -161,6 +161,18 @@ def test_hands_that_hold_hold_on_while_bodies_leave_each_other(handshake: Scene)
     made = BODY.joints(repaired(moved(handshake, 0, up), BODY))
     hands = [hand_points(made[0, :, agent]) for agent in range(2)]
     assert float((hands[0][:, :, None] - hands[1][:, None]).norm(dim=-1).amin(dim=(1, 2))[holds].max()) < 0.2
+
+
+def test_whoever_is_costly_to_lift_reaches_for_hands_and_stays_on_the_floor(handshake: Scene) -> None:
+    """One of two who hold hands is drawn up with a raised hand; the other, who is free, is not lifted after it."""
+    still = torch.tensor([True, False])
+    scene, wishes, rises = moved(handshake, 0, torch.tensor([0.0, 0.25, 0.0])), Wishes.of(handshake, BODY), []
+    for lift in (1.0, 10.0):
+        offset = correction(scene, BODY, wishes, still, Settle(hold=4.0, lift=lift))
+        rises.append(float(offset[0, :, 1, 1].abs().max()))
+        apart = hand_distance(*BODY.joints(corrected(scene, offset)).unbind(dim=2))[0]
+        assert float(apart[wishes.held[0].flatten(1).any(dim=1)].max()) < 0.2
+    assert rises[1] < 0.75 * rises[0]
 
 
 def test_fixed_people_and_frames_stay_bit_identical(handshake: Scene) -> None:
