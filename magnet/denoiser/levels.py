@@ -30,7 +30,13 @@ ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
 
-def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
+FAINT = 300
+"""Highest level at which a past is shown faintly."""
+
+
+def draw_levels(
+    kind: Distribution, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0
+) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
@@ -43,6 +49,7 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
         B, N, P: scenes, token steps, agents.
         generator: source of all randomness.
         shift: over 1 draws high levels more often, see `shifted`.
+        faint: share of the roll-outs whose past is shown a little noisy.
     """
     device = generator.device
 
@@ -62,15 +69,20 @@ def draw_levels(kind: Distribution, B: int, N: int, P: int, generator: torch.Gen
     which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator, shift), levels)
+    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator, shift, faint), levels)
 
 
-def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0) -> Tensor:
+def rollout_levels(
+    B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0
+) -> Tensor:
     """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
     In some scenes every agent is generated. In the others each agent draws a role (`ROLES`): generated, given up to
     the end of the block (motion control), given to the end (inpainting), or unknown from the block on (partner
     prediction).
+
+    In a share `faint` of the scenes the past of those who are generated or hidden is at one level up to `FAINT`, in
+    half of these from a random token on: as samplers show what was made some seconds ago (`stabilization_level`).
     """
     device = generator.device
 
@@ -93,9 +105,14 @@ def rollout_levels(B: int, N: int, P: int, generator: torch.Generator, shift: fl
     ramp = ((time - past + begun) / in_flight).clamp(0, 1) * LEVELS
     level = torch.where(ramped, shifted(ramp.long().clamp_min(1), shift), level)
     stop = torch.where(ramped, past + in_flight.long().clamp_min(1), stop).clamp_max(N)
-    generated = torch.where(time < past, 0, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
+    behind = zero
+    if faint:
+        shown, whole, since = torch.rand(3, B, 1, 1, generator=generator, device=device)
+        since = torch.where(whole < 0.5, 0, since * past)
+        behind = torch.where((shown < faint) & (time >= since), integers(zero + 1, zero + FAINT), 0)
+    generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
-    hidden = torch.where(time < past, 0, LEVELS).expand(B, N, P)
+    hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
     shares = torch.tensor(ROLES, device=device)
     role = torch.multinomial(shares, B * P, replacement=True, generator=generator).view(B, 1, P)
     role = torch.where(mixed, role, 0)

@@ -25,15 +25,21 @@ def snr_weights(levels: Tensor, gamma: float) -> Tensor:
 
 
 def token_losses(
-    clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, weights: Tensor | None = None
+    clean: Tensor,
+    truth: Tensor,
+    layout: TokenLayout,
+    there: Tensor,
+    weights: Tensor | None = None,
+    huber: float = 1.0,
 ) -> dict[str, Tensor]:
     """Huber loss of each part of a token, each part averaged by itself (Eq. 9, 10).
 
     clean, truth (B, N, P, D) normalized; there (B, N, P, 1 + slots) bool, which groups speak of people
-    who are there in valid frames; weights (B, N, P, 1 + slots) of each group's error, None: all 1. 512 latent numbers
-    against 36 P transforms: in one common mean the transforms would hardly count.
+    who are there in valid frames; weights (B, N, P, 1 + slots) of each group's error, None: all 1; an error over
+    `huber` counts by its length, others by their square. 512 latent numbers against 36 P transforms: in one common mean
+    the transforms would hardly count.
     """
-    error = F.smooth_l1_loss(clean, truth, reduction="none")
+    error = F.huber_loss(clean, truth, reduction="none", delta=huber)
     if weights is not None:
         error = error * layout.spread(weights)
     latent, deltas, pairs = layout.unpack(error)
@@ -99,13 +105,14 @@ SHAKE_GROUND, SHAKE_YAW = 0.002, 0.01
 """Metres and radians a frame by which deltas of recordings change from one frame to the next, roughly."""
 
 
-def shake_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor) -> Tensor:
+def shake_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor, levels: Tensor) -> Tensor:
     """Error of how deltas change from frame to frame, also from token to token (ours).
 
     A millimetre of noise in a delta is little beside what deltas differ by, and makes people tremble: beside what they
-    change by from frame to frame it is much. Huber loss in units of `SHAKE_GROUND` and `SHAKE_YAW`.
+    change by from frame to frame it is much. Huber loss in units of `SHAKE_GROUND` and `SHAKE_YAW`, weighted by the
+    share of signal that was shown: where noise hides all, such a loss has its least for people who keep still.
 
-    clean, truth (B, N, P, D) in real units, there as in `token_losses` -> ()
+    clean, truth (B, N, P, D) in real units, there as in `token_losses`, levels (B, N, P, 1 + slots) of the groups -> ()
     """
     turn, shift = unit_ground(by_frame(layout.unpack(clean)[1]))  # (B, T, P, 2) each
     true_turn, true_shift = unit_ground(by_frame(layout.unpack(truth)[1]))
@@ -114,7 +121,8 @@ def shake_loss(clean: Tensor, truth: Tensor, layout: TokenLayout, there: Tensor)
     counts = there[..., 0].repeat_interleave(TOKEN_FRAMES, dim=1)[:, 1:]
     change = error[:, 1:] - error[:, :-1]
     huber = F.smooth_l1_loss(change, torch.zeros_like(change), reduction="none").mean(-1)
-    return masked_mean(huber, counts[:, 1:] & counts[:, :-1])
+    signal = alpha_bar(levels[..., 0]).repeat_interleave(TOKEN_FRAMES, dim=1)[:, 2:]
+    return masked_mean(signal * huber, counts[:, 1:] & counts[:, :-1])
 
 
 def _soft_length(square: Tensor, fine: float) -> Tensor:

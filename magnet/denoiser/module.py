@@ -13,7 +13,7 @@ from magnet import checkpoints
 from magnet.checks import require_choice
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
-from magnet.denoiser.levels import draw_levels
+from magnet.denoiser.levels import FAINT, draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, Sampling, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
@@ -229,7 +229,7 @@ class Denoiser(TokenModel):
             scene = scene.pad_agents(layout.agents)
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
-            levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift)
+            levels = draw_levels(self.noise.distribution, B, N, P, generator, self.noise.shift, self.noise.faint_past)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
@@ -240,11 +240,11 @@ class Denoiser(TokenModel):
         own = self.predict_tokens(noisy, levels, scene.present, cond)
         clean = self.fused(own, noisy, levels, scene.present).float()
         snr = snr_weights(group_levels, weight.snr_gamma) if weight.weighting == "min_snr" else None
-        losses = token_losses(clean, truth, layout, there, snr)
+        losses = token_losses(clean, truth, layout, there, snr, weight.huber)
         total = weight.latent * losses["latent"] + weight.delta * losses["delta"]
         predicted = self.normalizer.denormalize(clean)
         if weight.shake:
-            losses["shake"] = shake_loss(predicted, tokens, layout, there)
+            losses["shake"] = shake_loss(predicted, tokens, layout, there, group_levels)
             total = total + weight.shake * losses["shake"]
         if layout.slots:
             rotation, translation = consistency_losses(predicted, layout, there)
@@ -269,7 +269,8 @@ class Denoiser(TokenModel):
         self, own: Tensor, tokens: Tensor, truth: Tensor, there: Tensor, levels: Tensor, snr: Tensor | None
     ) -> Tensor:
         """Errors of the network's own deltas and pairwise transforms, weighted as those of their posterior."""
-        weight, losses = self.loss, token_losses(own, truth, self.layout, there, snr)
+        weight = self.loss
+        losses = token_losses(own, truth, self.layout, there, snr, weight.huber)
         near = near_loss(self.normalizer.denormalize(own), tokens, self.layout, there, levels)
         return weight.delta * losses["delta"] + weight.pairwise * losses["pairwise"] + weight.near * near
 
@@ -288,7 +289,9 @@ class Denoiser(TokenModel):
             return truth
         requantize = self.tokenizer.requantize if self.quantized else None
         parts = (self.denoise, requantize, self.normalizer, self.layout)
-        shown = with_self_forcing(*parts, truth, levels, scene, self.self_forcing, generator, self.noise.shift, cond)
+        faint = FAINT if self.noise.faint_past else 0
+        how = (self.self_forcing, generator, self.noise.shift, cond, faint)
+        shown = with_self_forcing(*parts, truth, levels, scene, *how)
         if shown is truth and is_sharded(self.transformer):  # nobody ran it; processes must run shards equally often
             self.denoise(truth[:1], levels[:1], scene.present[:1], None if cond is None else cond[:1])
         return shown

@@ -81,18 +81,22 @@ class NoiseOptions:
             token as the paper reads literally, which leaks where unknown agents are.
         pairwise_metres: metres in a pairwise transform that count as one when tokens are normalized (ours): the
             smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
+        faint_past: share of the roll-outs in `mixture` whose past is shown a little noisy, as samplers show what was
+            made some seconds ago (ours); see `magnet.denoiser.levels.rollout_levels`.
     """
 
     distribution: Distribution = "per_token"
     shift: float = 1.0
     pairwise: PairwiseNoise = "noisier_end"
     pairwise_metres: float = 0.0
+    faint_past: float = 0.0
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
+        require_number("faint_past", self.faint_past, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,8 @@ class DenoiserLoss:
         latent: lambda_0 of paper Eq. 10.
         delta: lambda_1 of paper Eq. 10, on the canonical deltas from frame to frame.
         pairwise: lambda_2 of paper Eq. 10.
+        huber: normalized error of these three above which it counts by its length, not by its square. The lower, the
+            less those count who are fast where noise hides whether anybody is, and the calmer people become.
         consistency: lambda_3 of paper Eq. 10, for rotation and translation alike.
         consistency_warmup: training steps over which lambda_3 grows from 0.
         near: error of pairwise transforms in which centimetres near a partner count (ours).
@@ -122,6 +128,7 @@ class DenoiserLoss:
     latent: float = 1.0
     delta: float = 1.0
     pairwise: float = 1.0
+    huber: float = 1.0
     consistency: float = 0.1
     consistency_warmup: int = 1000
     near: float = 0.0
@@ -138,6 +145,7 @@ class DenoiserLoss:
     def __post_init__(self) -> None:
         require_whole("consistency_warmup", self.consistency_warmup, 0)
         require_number("decoded_share", self.decoded_share, 0, 1)
+        require_number("huber", self.huber, over=0)
         require_choice("weighting", self.weighting, Weighting)
         require_number("snr_gamma", self.snr_gamma, over=0)
 

@@ -105,6 +105,7 @@ def with_self_forcing(
     generator: torch.Generator,
     shift: float = 1.0,
     cond: Tensor | None = None,
+    faint: int = 0,
 ) -> Tensor:
     """Normalized tokens in which the clean pasts of some scenes are the model's own work; the rest is the truth.
 
@@ -117,18 +118,20 @@ def with_self_forcing(
         requantize: latents to their nearest codes; None: they stay as they are.
         normalizer, layout: of the tokens.
         truth: (B, N, P, D) normalized.
-        levels: (B, N, P) int; the past of an agent is what is clean before something that is not.
+        levels: (B, N, P) int; the past of an agent is what is clean, or at `faint` at most, from the first
+            token to something noisier.
         scene: the same scenes, of P agents.
         options: the share of scenes, and how a past is placed.
         generator: of all randomness.
         shift: of the added noise, see `magnet.sampling.noise.shifted`.
         cond: condition of the scenes.
+        faint: highest level of a past that is shown a little noisy.
 
     Returns:
         (B, N, P, D).
     """
-    clean = levels == 0
-    past = clean & (levels.flip(1).cummax(dim=1).values.flip(1) > 0)
+    clean = levels.cummax(dim=1).values <= faint
+    past = clean & (levels.flip(1).cummax(dim=1).values.flip(1) > faint)
     selected = torch.rand(len(levels), generator=generator, device=levels.device) < options.share
     few = (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]
     if not len(few):
@@ -159,7 +162,7 @@ def with_self_forcing(
     moved = past[..., None]
     if layout.slots:  # a pairwise transform moves with either of its ends, where it is shown at all
         either = past[..., None] | past[..., partners(layout.agents, past.device)]
-        moved = torch.cat([moved, either & (layout.group_levels(levels[few]) == 0)[..., 1:]], dim=-1)
+        moved = torch.cat([moved, either & (layout.group_levels(levels[few]) <= faint)[..., 1:]], dim=-1)
     shown = truth.clone()
     shown[few] = torch.where(layout.spread(moved), made, truth[few])
     return shown

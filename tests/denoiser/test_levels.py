@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import FROM_NOTHING, FROM_NOTHING_MIXED, MIXED, ROLES, draw_levels, rollout_levels
+from magnet.denoiser.levels import FAINT, FROM_NOTHING, FROM_NOTHING_MIXED, MIXED, ROLES, draw_levels, rollout_levels
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -54,6 +54,26 @@ def test_a_shift_draws_high_levels_more_often_and_keeps_both_ends(kind, generato
     assert moved.mean() > even.mean() + 40
     if kind != "mixture":
         assert moved.median() == pytest.approx(750, abs=30)  # 3 / 2 over 1 + 2 / 2
+
+
+def test_a_faint_past_is_at_one_level_up_to_the_faintest_and_those_who_are_given_stay_clean(generator):
+    levels = rollout_levels(6000, 16, 2, generator, faint=1.0)
+    assert (levels[:, :, 0] == 0).all(dim=1).any()  # given to the end
+    first, last = levels[:, 0, 0], levels[:, -1, 0]
+    past = (first > 0) & (first <= FAINT) & (last == LEVELS) & (levels[:, 1, 0] == first)
+    assert past.any()
+    changes = (levels[:, :, 0].clamp_max(FAINT + 1).diff(dim=1) != 0).sum(dim=1)
+    assert changes[past].float().mean() < 4  # of the past, the block and what is unknown
+    later = (levels[:, 0, 0] == 0) & ((levels[:, :, 0] > 0) & (levels[:, :, 0] <= FAINT)).any(dim=1)
+    assert later.any()  # in others it begins some tokens later
+
+
+def test_without_a_faint_past_levels_are_as_they_were(generator):
+    plain, off = (rollout_levels(50, 16, 2, torch.Generator().manual_seed(3), 2.0, *faint) for faint in ((), (0.0,)))
+    assert torch.equal(plain, off)
+    half = rollout_levels(4000, 16, 1, generator, faint=0.5)[:, :, 0]
+    shown = (half > 0) & (half <= FAINT)
+    assert 0.2 < float(shown.any(dim=1).double().mean()) < 0.6
 
 
 def test_an_unknown_kind_is_named(generator):

@@ -37,6 +37,11 @@ def packed(scene: Scene) -> torch.Tensor:
     return LAYOUT.pack(torch.zeros(*deltas.shape[:3], 8), deltas, pairs)
 
 
+def shown_clean(scene: Scene) -> torch.Tensor:
+    """Levels of 0, of every group of every token."""
+    return torch.zeros(scene.scenes, scene.frames // 4, 3, 3, dtype=torch.long)
+
+
 def everybody(scene: Scene) -> torch.Tensor:
     return torch.ones(scene.scenes, scene.frames // 4, 3, 3, dtype=torch.bool)
 
@@ -142,19 +147,47 @@ def test_the_shake_loss_counts_how_errors_of_deltas_change_across_tokens_as_well
     for frame in (3, 4, 9):  # the last of a token, the first of one, any
         once = moved_deltas(truth, 1, slice(frame, frame + 1), four)
         # There and back again, by four units each, of which Huber counts all but a half.
-        assert shake_loss(once, truth, LAYOUT, there) == pytest.approx(2 * 3.5 / counted, rel=1e-3)
+        assert shake_loss(once, truth, LAYOUT, there, shown_clean(scene)) == pytest.approx(2 * 3.5 / counted, rel=1e-3)
     for_good = moved_deltas(truth, 1, slice(8, None), four)
-    assert shake_loss(for_good, truth, LAYOUT, there) == pytest.approx(3.5 / counted, rel=1e-3)
+    assert shake_loss(for_good, truth, LAYOUT, there, shown_clean(scene)) == pytest.approx(3.5 / counted, rel=1e-3)
     turned = moved_deltas(truth, 0, slice(9, 10), yaw=two)
-    assert shake_loss(turned, truth, LAYOUT, there) == pytest.approx(2 * 1.5 / counted, rel=1e-3)
+    assert shake_loss(turned, truth, LAYOUT, there, shown_clean(scene)) == pytest.approx(2 * 1.5 / counted, rel=1e-3)
 
 
 def test_the_shake_loss_leaves_the_first_frame_and_the_absent_out(scene: Scene):
     truth, there = packed(scene), everybody(scene)
-    assert shake_loss(truth, truth, LAYOUT, there) == 0
-    assert shake_loss(moved_deltas(truth, 1, slice(0, 1), 0.3), truth, LAYOUT, there) == 0
+    assert shake_loss(truth, truth, LAYOUT, there, shown_clean(scene)) == 0
+    assert shake_loss(moved_deltas(truth, 1, slice(0, 1), 0.3), truth, LAYOUT, there, shown_clean(scene)) == 0
     there[:, :, 1] = False
-    assert shake_loss(moved_deltas(truth, 1, slice(6, 7), 0.3), truth, LAYOUT, there) == 0
+    assert shake_loss(moved_deltas(truth, 1, slice(6, 7), 0.3), truth, LAYOUT, there, shown_clean(scene)) == 0
+
+
+def test_the_shake_loss_counts_by_what_was_shown(scene: Scene):
+    truth, there, shown = packed(scene), everybody(scene), shown_clean(scene)
+    off = moved_deltas(truth, 1, slice(6, 7), 0.3)
+    clean = shake_loss(off, truth, LAYOUT, there, shown)
+    noisy = shown.clone()
+    noisy[:, :, 1, 0] = 300
+    signal = float(alpha_bar(torch.tensor(300)))
+    assert shake_loss(off, truth, LAYOUT, there, noisy) == pytest.approx(signal * float(clean), rel=1e-4)
+    assert shake_loss(off, truth, LAYOUT, there, torch.full_like(shown, 1000)) < 1e-6 * clean
+
+
+def test_what_cannot_be_told_is_expected_at_its_mean_where_all_errors_count_by_their_square(scene: Scene):
+    """Most are slow and few fast: a loss that counts far ones by their length has its least for people who are slow."""
+    few, there = torch.tensor([0.0] * 9 + [4.0]), everybody(scene)
+    truth = few.view(10, 1, 1, 1, 1).expand(10, *packed(scene).shape)
+
+    def least(huber: float) -> float:
+        guesses = torch.linspace(0, 1, 101)
+        each = [
+            sum(float(token_losses(torch.full_like(one, g), one, LAYOUT, there, huber=huber)["delta"]) for one in truth)
+            for g in guesses.tolist()
+        ]
+        return float(guesses[each.index(min(each))])
+
+    assert least(5.0) == pytest.approx(0.4, abs=0.011)
+    assert least(1.0) < 0.15
 
 
 def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_shown(scene: Scene, generator):

@@ -24,11 +24,11 @@ def scene():
     return random_scene(4, 4 * N, 3, torch.Generator().manual_seed(0))
 
 
-def shown(model, scene, levels, share=1.0, seed=1):
+def shown(model, scene, levels, share=1.0, seed=1, faint=0):
     truth = model.normalizer.normalize(model.tokenize(scene)[0])
     generator = torch.Generator().manual_seed(seed)
     parts = (model.denoise, model.tokenizer.requantize, model.normalizer, model.layout)
-    return truth, with_self_forcing(*parts, truth, levels, scene, SelfForcing(share), generator)
+    return truth, with_self_forcing(*parts, truth, levels, scene, SelfForcing(share), generator, faint=faint)
 
 
 def rolled_out() -> torch.Tensor:
@@ -59,6 +59,15 @@ def test_latents_of_a_made_past_are_codes(model, scene):
     _, made = shown(model, scene, rolled_out())
     latent = model.layout.unpack(model.normalizer.denormalize(made))[0][:, :PAST, :2]
     torch.testing.assert_close(model.tokenizer.requantize(latent), latent, atol=1e-5, rtol=0)
+
+
+def test_a_faint_past_is_made_anew_too(model, scene):
+    levels = rolled_out()
+    faint = torch.where((levels == 0) & (torch.arange(3) < 2), 150, levels)
+    truth, made = shown(model, scene, faint, faint=300)
+    _, clean = shown(model, scene, levels)
+    assert torch.equal(made, clean)  # noise is added to it later
+    assert torch.equal(shown(model, scene, faint)[1], truth)
 
 
 @pytest.mark.parametrize("level", [0, 700])
