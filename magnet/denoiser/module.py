@@ -289,9 +289,9 @@ class Denoiser(TokenModel):
             return truth
         requantize = self.tokenizer.requantize if self.quantized else None
         parts = (self.denoise, requantize, self.normalizer, self.layout)
+        options, shift = self.self_forcing, self.noise.shift
         faint = FAINT if self.noise.faint_past else 0
-        how = (self.self_forcing, generator, self.noise.shift, cond, faint)
-        shown = with_self_forcing(*parts, truth, levels, scene, *how)
+        shown = with_self_forcing(*parts, truth, levels, scene, options, generator, shift, cond, faint)
         if shown is truth and is_sharded(self.transformer):  # nobody ran it; processes must run shards equally often
             self.denoise(truth[:1], levels[:1], scene.present[:1], None if cond is None else cond[:1])
         return shown
