@@ -92,6 +92,12 @@ def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -
     return scene.replace(T_world_root=T_world_root)
 
 
+def past_of(levels: Tensor, faint: int) -> Tensor:
+    """Token steps clean, or at `faint` at most, from the first on to something noisier. levels (B, N, P) -> bool"""
+    begun = levels.cummax(dim=1).values <= faint
+    return begun & (levels.flip(1).cummax(dim=1).values.flip(1) > faint)
+
+
 @torch.no_grad()
 def with_self_forcing(
     denoise: Denoise,
@@ -117,28 +123,24 @@ def with_self_forcing(
         denoise: the model.
         requantize: latents to their nearest codes; None: they stay as they are.
         normalizer, layout: of the tokens.
-        truth: (B, N, P, D) normalized.
-        levels: (B, N, P) int; the past of an agent is what is clean, or at `faint` at most, from the first
-            token to something noisier.
+        truth, levels: (B, N, P, D) normalized, and (B, N, P) int, which say what a past is: `past_of`.
         scene: the same scenes, of P agents.
         options: the share of scenes, and how a past is placed.
         generator: of all randomness.
         shift: of the added noise, see `magnet.sampling.noise.shifted`.
-        cond: condition of the scenes.
-        faint: highest level of a past that is shown a little noisy.
+        cond, faint: condition of the scenes; highest level of a past that is shown a little noisy.
 
     Returns:
         (B, N, P, D).
     """
-    clean = levels.cummax(dim=1).values <= faint
-    past = clean & (levels.flip(1).cummax(dim=1).values.flip(1) > faint)
+    past = past_of(levels, faint)
     selected = torch.rand(len(levels), generator=generator, device=levels.device) < options.share
     few = (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]
     if not len(few):
         return truth
     past, T_world_can = past[few], canonical_frame(scene.T_world_root[few])
-    even = torch.rand(len(few), 1, 1, generator=generator, device=levels.device)
-    even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * even
+    drawn = torch.rand(len(few), 1, 1, generator=generator, device=levels.device)
+    even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * drawn
     renoised = torch.where(past, shifted((even * LEVELS).long(), shift), levels[few])
     noise = torch.randn(truth[few].shape, generator=generator, device=truth.device)
     noisy = add_noise(truth[few], noise, layout.spread(layout.group_levels(renoised)))
