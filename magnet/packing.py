@@ -13,8 +13,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from magnet.precision import quick_int8
+
 ROWS = 32
 """Rows that weights are packed for; products with fewer or more give the same numbers and are about as fast."""
+
+LEAST = 1e-30
+"""Rows and weights of nothing but zeros are divided by this."""
 
 Linear = Callable[..., Tensor]
 
@@ -43,6 +48,30 @@ def linear_of(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> Linear:
         if plus is not None:
             return product.binary(x, plus.to(dtype), packed, bias, "add")
         return product.default(x, packed, bias, *(("gelu", [], "none") if gelu else ("none", [], "")))
+
+    return fast
+
+
+def int8_linear_of(weight: Tensor, bias: Tensor) -> Linear:
+    """As `linear_of`, in whole numbers from -127 to 127: weights scaled by output, what comes in by row.
+
+    So a row's numbers do not depend on the others. Where a processor does not multiply such numbers quickly, weights
+    are rounded to them and the rest is float32.
+    """
+    weight, bias = weight.detach().float(), bias.detach().float()
+    scale = (weight.abs().amax(1) / 127).clamp_min(LEAST)
+    held = (weight / scale[:, None]).round().to(torch.int8)
+    if not quick_int8(weight.device):
+        return linear_of(held * scale[:, None], bias, torch.float32)
+    held = held.T
+
+    def fast(x: Tensor, gelu: bool = False, plus: Tensor | None = None) -> Tensor:
+        rows = x.float().flatten(0, -2)
+        size = (rows.abs().amax(1, keepdim=True) / 127).clamp_min_(LEAST)
+        product = torch._int_mm((rows / size).round_().to(torch.int8), held)
+        start = bias if plus is None else plus.float().flatten(0, -2) + bias
+        made = product.float().mul_(size).mul_(scale).add_(start).unflatten(0, x.shape[:-1])
+        return F.gelu(made) if gelu else made
 
     return fast
 

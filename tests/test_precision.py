@@ -90,11 +90,21 @@ def test_a_trainer_that_would_convert_scenes_is_refused(part, precision, tmp_pat
         trainer.validate(model if part == "denoiser" else model.tokenizer, loader, verbose=False)
 
 
-@pytest.mark.parametrize("capability, taken", [("AVX2", "32-true"), ("DEFAULT", "32-true"), ("AVX512", "bf16-mixed")])
+@pytest.mark.parametrize(
+    "capability, knows, taken",
+    [
+        ("AVX2", False, "32-true"),
+        ("DEFAULT", False, "32-true"),
+        ("AVX512", False, "32-true"),
+        ("AVX512", True, "bf16-mixed"),
+    ],
+)
 def test_a_processor_that_emulates_bfloat16_trains_in_float32(
-    capability: str, taken: str, monkeypatch: pytest.MonkeyPatch
+    capability: str, knows: bool, taken: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: knows)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     assert quick_precision("bf16-mixed", "cpu") == taken
 
 

@@ -28,7 +28,7 @@ from magnet.tokenizer.module import Tokenizer
 Clock = Callable[[], float]
 """Seconds: `time.perf_counter`, or `time.process_time`, which others on the machine disturb less."""
 
-PRODUCTS = ("mm", "addmm", "bmm", "baddbmm", "convolution", "_scaled_dot_product", "_linear_pointwise")
+PRODUCTS = ("mm", "_int_mm", "addmm", "bmm", "baddbmm", "convolution", "_scaled_dot_product", "_linear_pointwise")
 """Beginnings of the names of the operators that count: everything that grows with a product of two sizes."""
 
 

@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
         choices=("off", "light", "firm", "hold"),
         help="correct poses (default: as the model is best sampled)",
     )
-    add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
+    add("--precision", default=None, help="reference, float32, bf16 or int8 (default: the sampler's)")
     add("--seed", type=int, default=0, help="of the noise, the same for all (default: %(default)s)")
     add("--play", metavar="FILE", help="play the motion in this file instead of generating any")
     add("--person", type=int, default=0, help="person of that file (default: the first)")

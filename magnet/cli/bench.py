@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     add("--rounds", type=int, default=3, help="rounds to take medians over (default: %(default)s)")
     add("--sampler", default="default", metavar="PRESET", help="sampler preset (default: %(default)s)")
     add("--steps", type=int, default=None, help="denoising steps (default: the sampler's)")
-    add("--precision", default=None, help="reference, float32 or bf16 (default: the sampler's)")
+    add("--precision", default=None, help="reference, float32, bf16 or int8 (default: the sampler's)")
     add("--live", type=float, default=None, metavar="SECONDS", help="seconds of live answers (default: 60); 0: none")
     add("--threads", type=int, default=None, help="threads of torch (default: its own choice)")
     add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: seconds of this process, for a busy machine")

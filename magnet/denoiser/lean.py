@@ -18,11 +18,11 @@ from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
 from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
-from magnet.packing import Kept, Linear, linear_of, norm_of
+from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of
 from magnet.precision import quick_bf16
 from magnet.sampling.noise import LEVELS
 
-Precision = Literal["float32", "bf16"]
+Precision = Literal["float32", "bf16", "int8"]
 
 
 class LeanBlock:
@@ -31,14 +31,13 @@ class LeanBlock:
     Only of the last one some tokens may be asked for: it keeps weights of queries beside those of keys and values.
 
     Args:
-        held: the type that weights are rounded to.
+        layer: a packed layer of weights and bias.
         dtype: the type that it computes in.
     """
 
-    def __init__(self, block: TransformerBlock, held: torch.dtype, dtype: torch.dtype, asked: bool) -> None:
-        def layer(weight: Tensor, bias: Tensor) -> Linear:
-            return linear_of(weight.to(held), bias.to(held), dtype)
-
+    def __init__(
+        self, block: TransformerBlock, layer: Callable[[Tensor, Tensor], Linear], dtype: torch.dtype, asked: bool
+    ) -> None:
         width = block.out.in_features
         self.heads, self.each = block.heads, width // block.heads
         weight, bias = block.qkv.weight.detach(), block.qkv.bias.detach()
@@ -134,7 +133,7 @@ class LeanTransformer:
     Args:
         network: what it computes; changes of its weights afterwards are not seen.
         precision: `bf16` rounds the weights of the blocks to bfloat16 and computes them in it, where the processor
-            does so; what goes in and out stays float32.
+            does so; `int8` does their products in 8-bit whole numbers; what goes in and out stays float32.
     """
 
     def __init__(self, network: Transformer, precision: Precision = "float32") -> None:
@@ -152,7 +151,12 @@ class LeanTransformer:
             linear_of(x.weight, x.bias, torch.float32) if isinstance(x, nn.Linear) else plain_layer(x) for x in layers
         ]
         blocks = list(network.blocks)
-        self.blocks = [LeanBlock(block, held, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
+
+        def layer(weight: Tensor, bias: Tensor) -> Linear:
+            return linear_of(weight.to(held), bias.to(held), self.dtype)
+
+        packed = int8_linear_of if precision == "int8" else layer
+        self.blocks = [LeanBlock(block, packed, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
         self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
         self.condition = network.condition if o.cond_dim else None
 
@@ -359,8 +363,9 @@ def seen(steps: int, people: int, block: int, device: torch.device) -> Tensor | 
 
 FULL: Kept[LeanTransformer] = Kept(LeanTransformer)  # type: ignore[arg-type]
 HALF: Kept[LeanTransformer] = Kept(lambda network: LeanTransformer(network, "bf16"))  # type: ignore[arg-type]
+WHOLE: Kept[LeanTransformer] = Kept(lambda network: LeanTransformer(network, "int8"))  # type: ignore[arg-type]
 
 
 def lean(network: Transformer, precision: Precision = "float32") -> LeanTransformer:
     """The lean form of a network of float32 weights, made once and again after they have changed."""
-    return (HALF if precision == "bf16" else FULL).of(network)
+    return {"float32": FULL, "bf16": HALF, "int8": WHOLE}[precision].of(network)

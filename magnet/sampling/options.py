@@ -18,7 +18,7 @@ Settling = Literal["off", "light", "firm", "hold"]
 
 
 NoiseSampling = Literal["joint", "independent"]
-Precision = Literal["reference", "float32", "bf16"]
+Precision = Literal["reference", "float32", "bf16", "int8"]
 Spacing = Literal["even", "log_snr"]
 
 
@@ -83,8 +83,9 @@ class SamplerOptions:
         spacing: of the levels: `even`, as in the paper, changed by `shift`; or evenly in `log_snr`, with a last level
             near 0.
         precision: of the network while it samples: `float32`, with weights packed for the processor, which is twice as
-            fast on a CPU and rounds otherwise than the network as it is trained, `reference`; or `bf16`, the
-            blocks' weights in half precision, a trade (docs/speed.md says what it costs in poses).
+            fast on a CPU and rounds otherwise than the network as it is trained, `reference`; or `bf16` or `int8`,
+            the blocks in half precision or in 8-bit whole numbers, trades (docs/speed.md says what they cost in
+            poses). On a processor without such instructions they round as much and are no faster.
     """
 
     steps: int = 16

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.denoiser.lean import LeanTransformer, Memory, lean
+from magnet.denoiser.lean import LeanTransformer, Memory, Precision, lean
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
@@ -62,9 +62,11 @@ def test_the_lean_form_predicts_what_the_network_does(options: dict[str, Any], p
     there = present[:, None, :, None]
     torch.testing.assert_close(torch.where(there, got, 0), torch.where(there, expected, 0), rtol=1e-4, atol=1e-5)
     assert not got[~present[:, None].expand(4, 5, 3)].any()
-    half = LeanTransformer(made, "bf16")(*asked)
-    off = (half - expected)[there.expand_as(half)].norm() / expected[there.expand_as(half)].norm()
-    assert 1e-5 < off < 0.05
+    roundings: tuple[Precision, ...] = ("bf16", "int8")
+    for precision in roundings:
+        rounded = LeanTransformer(made, precision)(*asked)
+        off = (rounded - expected)[there.expand_as(rounded)].norm() / expected[there.expand_as(rounded)].norm()
+        assert 1e-5 < off < 0.05
 
 
 @pytest.mark.parametrize("options", [{"agent_embedding": False}, {"pairwise": False}, {"cond_dim": 4}], ids=str)
@@ -91,9 +93,10 @@ def test_tokens_that_are_not_asked_for_cost_nothing_in_the_last_block_and_are_ze
     assert not some[:, ~wanted].any()
 
 
+@pytest.mark.parametrize("precision", ["float32", "int8"])
 @torch.no_grad()
-def test_a_scene_does_not_depend_on_what_else_is_in_the_batch() -> None:
-    made = LeanTransformer(network())
+def test_a_scene_does_not_depend_on_what_else_is_in_the_batch(precision: Precision) -> None:
+    made = LeanTransformer(network(), precision)
     noisy, levels, present = question(made, 4, 5)  # type: ignore[arg-type]
     whole = made(noisy, levels, present)
     for scene in range(4):
@@ -105,7 +108,7 @@ def test_a_scene_does_not_depend_on_what_else_is_in_the_batch() -> None:
 def test_it_is_made_once_and_again_when_weights_change() -> None:
     made = network()
     first = lean(made)
-    assert lean(made) is first and lean(made, "bf16") is lean(made, "bf16") is not first
+    assert lean(made) is first and lean(made, "bf16") is lean(made, "bf16") is not first is not lean(made, "int8")
     made.out_proj.weight.mul_(2)
     asked = question(made, 1, 4)
     torch.testing.assert_close(lean(made)(*asked), made(*asked), rtol=1e-4, atol=1e-5)

@@ -202,7 +202,7 @@ def test_an_answer_takes_the_same_work_however_long_the_past():
     assert held.tokens.shape[1] <= 2 * (8 + sum(model.tokenizer.receptive_field)) + 4
 
 
-@pytest.mark.parametrize(("precision", "most"), [("float32", 2500), ("bf16", 2500)])
+@pytest.mark.parametrize(("precision", "most"), [("float32", 2500), ("bf16", 2500), ("int8", 3200)])
 def test_an_answer_is_few_operators(precision: str, most: int) -> None:
     """Each is so small that its call is its time; a sixth more were work done again."""
     model = tiny_denoiser(max_agents=2, window=8)
