@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2)
     parser.add_argument("--frames", type=int, default=150, help="after the context")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 4, 8, 16, 30])
-    parser.add_argument("--precision", default="float32", choices=["reference", "float32", "bf16"])
+    parser.add_argument("--precision", default="float32", choices=["reference", "float32", "bf16", "int8"])
     parser.add_argument("--task", nargs="+", default=TASKS, choices=registry.names())
     given = parser.parse_args()
     quiet()

@@ -66,13 +66,16 @@ def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
     return chosen
 
 
-def checkpoints(folder: Path, model: LightningModule) -> list[Callback]:
-    """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt`."""
+def checkpoints(folder: Path, model: LightningModule, best: bool) -> list[Callback]:
+    """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt` if it is wanted."""
     place = folder / "checkpoints"
+    last = LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False)
+    if not best:
+        return [last]
     monitor = getattr(model, "monitor", MONITOR)
     mode = getattr(model, "monitor_mode", "min")
     return [
-        LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False),
+        last,
         ModelCheckpoint(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False),
     ]
 

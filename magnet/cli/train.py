@@ -240,8 +240,8 @@ class MagnetCLI(LightningCLI):
         fit = self.command == "fit"
         if fit and config.get("enable_checkpointing") is not False and not config.get("fast_dev_run"):
             self._refuse_overwriting()
-            if not any(isinstance(callback, ModelCheckpoint) for callback in callbacks):
-                callbacks += run_folder.checkpoints(self.folder, self.model)
+            own = any(isinstance(callback, ModelCheckpoint) for callback in callbacks)
+            callbacks += run_folder.checkpoints(self.folder, self.model, best=not own)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
             callbacks.append(run_folder.progress_bar(sampling))
