@@ -67,7 +67,7 @@ def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
 
 
 def checkpoints(folder: Path, model: LightningModule, best: bool) -> list[Callback]:
-    """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt` if it is wanted."""
+    """`last.ckpt` after every epoch or validation, also when training is interrupted; `best.ckpt` if it is wanted."""
     place = folder / "checkpoints"
     last = LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False)
     if not best:
