@@ -204,10 +204,14 @@ class ViewerBase:
         self.distance = distance
 
     def _move_cameras(self, preset: str, client: Any = None) -> None:
+        """Send cameras to a preset, and back from there until everybody is in the picture, also while nothing plays."""
         for each in [client] if client is not None else self.server.get_clients().values():
             with each.atomic():
                 each.camera.position = self._eye(preset, self.distance)
                 each.camera.look_at = self._aim(each.camera, self.distance)
+        with self.lock:
+            if self.views and self.shown >= 0:
+                self._keep_in_sight(self.shown)
 
     def _aim(self, camera: Any, distance: float) -> Array:
         """Where a camera so far away looks: below people's middle, so that feet are above the timeline. -> (3,)"""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -105,6 +107,32 @@ def test_the_camera_follows_people_or_stays_where_it_is(body: Body) -> None:
     middle = scene.T_world_root[0, :, :, :3, 3].mean(dim=1)[:, [0, 2]]
     assert torch.equal(places[0], places[1])
     torch.testing.assert_close(places[2] - places[0], middle[12] - middle[20], atol=1e-4, rtol=0)
+
+
+def test_a_camera_sent_to_a_preset_sees_everybody_while_nothing_plays(
+    body: Body, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(1))
+    viewer = Viewer([take("dance", scene)], body, port=0)
+    camera = SimpleNamespace(position=[0.0, 1.0, 1.0], look_at=[0.0, 0.0, 0.0], fov=0.8, aspect=1.5, image_height=600)
+    client = SimpleNamespace(client_id=7, camera=camera, atomic=contextlib.nullcontext)
+    try:
+        viewer.clock.seek(10)
+        viewer.draw()
+        monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: client})
+        viewer.placed.add(7)
+        viewer.distance = 0.5  # far too near
+        viewer._move_cameras("front", client)
+        before = np.array(camera.position)
+        viewer.shown = -1
+        viewer.draw()
+    finally:
+        viewer.stop()
+    assert np.linalg.norm(before) > 2.0
+    np.testing.assert_allclose(camera.position, before, atol=1e-6)
 
 
 def heard_of(slider: Any, heard: list[Any]) -> list[int]:
