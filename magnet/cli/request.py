@@ -59,7 +59,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     words = given.without("ckpt_path")
     fields, words = split_flags(words) if command in SAMPLING else ([], words)
     name, out = run_name(command, given.files), given.value("out")
-    checkpoint = which_checkpoint(command, given, name)
+    runs = Path(given.flag("trainer.default_root_dir") or RUNS)  # Lightning's word for where runs lie
+    checkpoint = which_checkpoint(command, given, runs, name)
     if command == "fit":
         checkpoint_config.refuse_linked(given)
     layer: dict[str, Any] = {}
@@ -69,7 +70,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
     elif command == "fit" and (start := given.option("model", "start_from")):
         layer = checkpoint_config.started(start, given, models, registry.default_path())
-    folder = run_folder.run_folder(RUNS / name, out)
+    folder = run_folder.run_folder(runs / name, out)
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
     settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
@@ -92,7 +93,7 @@ def run_name(command: str, files: list[str]) -> str:
     return file.parent.parent.name if file.name == "config.yaml" and (file.parent / "run.json").exists() else file.stem
 
 
-def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
+def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Path | None:
     """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
 
     Raises:
@@ -101,7 +102,7 @@ def which_checkpoint(command: str, given: Arguments, run: str) -> Path | None:
     name, out = given.value("ckpt_path"), given.value("out")
     if name is None and (command == "fit" or given.only_shown):
         return None
-    folders = [Path(out)] if out and command == "fit" else [Path(out or RUNS), RUNS / run, RUNS]
+    folders = [Path(out)] if out and command == "fit" else [Path(out or runs), runs / run, runs]
     return checkpoint_config.find_checkpoint(name, folders)
 
 

@@ -86,6 +86,16 @@ def test_a_run_that_keeps_checkpoints_of_its_own_leaves_the_last_one_too(toy: Pa
     assert torch.load(toy / "on" / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 4
 
 
+def test_runs_lie_where_lightning_is_told_to_put_them(toy: Path) -> None:
+    elsewhere = ("--trainer.default_root_dir", "elsewhere")
+    go("fit", "--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "2", *elsewhere)
+    assert not (toy / "runs").exists()
+    assert (toy / "elsewhere" / "fit" / "latest" / "checkpoints" / "last.ckpt").exists()
+    go("fit", "--ckpt_path", "last", "--trainer.max_steps", "3", *elsewhere)
+    last = toy / "elsewhere" / "fit" / "latest" / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == 3
+
+
 def test_a_flag_beats_a_file_beats_the_checkpoint_beats_the_default(trained: Path, toy: Path) -> None:
     (toy / "my.yaml").write_text("model: {class_path: ToyModel, init_args: {lr: 0.5}}\n")
     checkpoint = ("--ckpt_path", "trained/checkpoints/last.ckpt")
