@@ -233,6 +233,7 @@ class Model:
         require_whole("people", people, 1, MOST)
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         if people > self.most_people:
+            require_whole("frames of a crowd, which begins with 32", frames, START + 1)
             return self.predict(self.start_crowd(people, seed=seed), context=START, frames=frames - START, **said)
         empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
@@ -257,8 +258,8 @@ class Model:
         """Continue a scene for everybody in it.
 
         Args:
-            context: number of its last frames to start from, rounded down to a multiple of 4; None: all of them. The
-                result begins with them.
+            context: number of its last frames to start from; None: all of them. Rounded down to a multiple of 4, so
+                that up to three of the first frames are left out. The result begins with them.
 
         Raises:
             ValueError: fewer than 4 frames.

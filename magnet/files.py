@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -181,6 +181,12 @@ def inside(folder: Path, name: Any) -> Path:
     if not isinstance(name, str) or name in ("", ".", "..") or set("/\\\0") & set(name):
         raise Refused(f"{folder}: its index names {name!r:.80}, expected the name of a file in it; make it anew")
     return folder / name
+
+
+def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write a compressed npz under exactly this name: numpy adds .npz to names that end in .NPZ."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:

@@ -22,7 +22,8 @@ class CommandError(Exception):
 def no_such(what: str, name: str, known: Sequence[str] | dict[str, str], more: str) -> str:
     """The message for a name that nothing has."""
     close = difflib.get_close_matches(name, list(known), n=1)
-    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}."
+    others = f"there are {', '.join(known)}." if known else "there are none."
+    hint = f"did you mean {close[0]}?" if close else others
     return f"no {what} {name}; {hint} See {more}"
 
 

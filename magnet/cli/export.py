@@ -70,7 +70,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.export import formats
     from magnet.export.bones import BoneOptions
 
-    out = scene_files.path_to_write(options.out)
+    out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size))
+    if options.context < 0:
+        raise CommandError(f"--context {options.context}: expected 0 frames or more")
     given = dict(pair.partition("=")[::2] for pair in options.joint)
     film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
     reading = formats.Reading(

@@ -90,7 +90,11 @@ def main(arguments: Sequence[str]) -> int:
     options = parser().parse_args(words)
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
-    outs = [scene_files.path_to_write(out) for out in options.out]
+    for name, least in (("frames", 1), ("context", 0)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise CommandError(f"--{name} {value}: expected at least {least}")
+    outs = [scene_files.path_to_write(out, options.inputs, tuple(options.size)) for out in options.out]
     from magnet.api import Model
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.module import Denoiser
@@ -109,7 +113,7 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.export import formats
 
     given, plain = made.context, made.plain()
-    if plain.scenes > 1:
+    if plain.scenes > 1 and scene.scenes == 1:
         plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
     look: dict[str, Any] = {"style": options.style, "size": tuple(options.size), "context_frames": given}
     for out in outs:
@@ -144,7 +148,12 @@ def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, 
     if people < max(scene.agents, 1):
         raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
     if people > max(model.most_people, scene.agents):
-        options.context = options.context or CONTEXT
+        if options.context is None:
+            options.context = CONTEXT
+        if not options.context:
+            raise CommandError(
+                f"--context 0: a crowd goes on from frames of everybody; it begins with {CONTEXT} by itself"
+            )
         groups = [scene.slice(0, options.context)] if options.inputs else []
         if options.task == "generation" and not groups:
             options.task = None  # a crowd from nothing: couples that the model makes, from which it goes on
@@ -207,6 +216,7 @@ def lengths(
         CommandError: the task reads motion that was not recorded.
         ValueError: the task makes no sense at these sizes.
     """
+    from magnet.motion.scene import FPS
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
 
@@ -214,6 +224,8 @@ def lengths(
     nothing = bool(added) or not (options.inputs or crowd)
     context = options.context if options.context is not None else 0 if nothing else CONTEXT
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
+    if options.inputs and not recorded:
+        raise CommandError(f"the files hold {scene.frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
     if context > recorded:
         raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
     rest = options.frames or (recorded - context) or FUTURE

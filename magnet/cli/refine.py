@@ -58,8 +58,15 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.export import formats
 
-    out = scene_files.path_to_write(options.out)
+    out = scene_files.path_to_write(options.out, options.inputs)
+    if not 0 <= options.slides < float("inf"):
+        raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
+    if options.plot and Path(options.plot).suffix.lower() != ".svg":
+        raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
     got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
+    formats.require_finite(got.scene)
+    if not got.scene.frames:
+        raise CommandError(f"{options.inputs[0]}: holds no frames, so there is nothing to refine")
     if got.scene.agents < 2 and options.poses == "keep":
         raise CommandError(
             f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people, or let "
@@ -82,6 +89,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.plot:
         plot = Path(options.plot)
         before, after = (by_frame(scene, got.body) for scene in (got.scene, refined))
+        plot.parent.mkdir(parents=True, exist_ok=True)
         plot.write_text(drawn(before, after, got.scene.fps), encoding="utf-8")
         scene_files.say_written([plot])
     return 0

@@ -35,7 +35,10 @@ def run_folder(root: Path, out: str | None) -> Path:
     """
     folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     if folder.is_file():
-        raise CommandError(f"--out {out}: got a file, expected a folder for what the run leaves behind")
+        raise CommandError(
+            f"--out {out}: got a file, expected a folder for what the run leaves behind; of files to predict from, the "
+            "first comes first: magnet predict FILE ... --out FILE"
+        )
     number = 1
     while out is None and folder.exists():
         number += 1

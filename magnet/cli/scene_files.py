@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 
 if TYPE_CHECKING:
+    from magnet.export.drawing import Size
     from magnet.export.formats import Read, Reading
 
 Options = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -49,11 +51,17 @@ PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metav
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
-def path_to_write(out: str) -> Path:
-    """OUT, whose suffix is one that can be written.
+def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None) -> Path:
+    """OUT, which can be written: known before anything is made for it.
+
+    Args:
+        inputs: files that are read. One that OUT does not name, but would write, is not overwritten.
+        size: pixels of a film's panel.
 
     Raises:
-        CommandError: it is not.
+        CommandError: nothing writes its suffix, or it would take the place of an input.
+        ValueError: the size of a film cannot be.
+        ImportError: what writes it is not installed.
     """
     from magnet.export import formats
 
@@ -61,6 +69,15 @@ def path_to_write(out: str) -> Path:
     if path.suffix.lower() not in formats.WRITTEN:
         known = ", ".join(formats.WRITTEN)
         raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
+    also = re.compile(re.escape(path.stem) + r"(_scene\d+)?(_\d+)?" + re.escape(path.suffix))
+    for each in map(Path, inputs):
+        beside = each.parent.resolve() == path.parent.resolve() and each.name != path.name
+        if beside and also.fullmatch(each.name):
+            raise CommandError(
+                f"{path}: people or scenes get a file each, and {each.name}, which is read, may be one of them; give "
+                "OUT another name"
+            )
+    formats.require_writer(path, size)
     return path
 
 

@@ -85,7 +85,8 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     from magnet.sampling.options import SamplerOptions
 
     task, name = benchmark.task(given.task), given.method.replace("_", " ")
-    samples = given.samples or (1 if name in ("NN", "zero velocity", "ridge") else benchmark.samples)
+    usual = 1 if name in ("NN", "zero velocity", "ridge") else benchmark.samples
+    samples = usual if given.samples is None else given.samples
     if samples not in (1, benchmark.samples):
         raise CommandError(f"--samples {samples}: the benchmark has {benchmark.samples} of each scene, or 1")
     if name in methods.BASELINES:

@@ -17,6 +17,22 @@ Array = NDArray[np.floating]
 Size = tuple[int, int]
 Colour = tuple[int, int, int]
 
+
+def require_size(size: Size) -> None:
+    """Refuse a film's panel that nothing can be drawn in.
+
+    Raises:
+        ValueError: width or height is odd, or too small.
+    """
+    if size[0] % 2 or size[1] % 2:
+        raise ValueError(f"size {size}: video needs even numbers of pixels")
+    if min(size) < SMALLEST:
+        raise ValueError(f"size {size}: expected at least {SMALLEST} pixels each way")
+
+
+SMALLEST = 16
+"""Pixels of a film's panel, at least."""
+
 BACKGROUND: Colour = (250, 250, 252)
 TILES: tuple[Colour, Colour] = ((236, 239, 244), (223, 228, 236))
 SHADOW: Colour = (52, 58, 82)

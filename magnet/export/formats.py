@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,12 +15,13 @@ from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, save_bvh
 from magnet.export.cast import Style
-from magnet.export.drawing import Size
-from magnet.export.fbx import save_fbx
+from magnet.export.drawing import Size, require_size
+from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.retarget import load_bvh, together
+from magnet.export.usd import NEEDS as USD_NEEDS
 from magnet.files import load_npz
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
@@ -92,6 +94,8 @@ def read(
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
     scenes, notes, foreign = [], [], False
     for file in files:
+        if options.unit is not None:
+            raise ValueError(f"{file}: unit {options.unit!r} is for .bvh; lengths in a .npz are metres")
         scene, note, strange = _read_npz(file, body, options.up)
         scenes.append(scene)
         notes += note
@@ -137,6 +141,8 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     if "meta" in keys:
+        if up not in (None, "y"):
+            raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
         scene = Scene.load(path)
         if scene.body != body.id:
             raise ValueError(
@@ -234,6 +240,22 @@ WRITTEN: dict[str, Format] = {
 """Suffixes that can be written, and how."""
 
 
+def require_writer(path: Path, size: Size | None = None) -> None:
+    """Refuse what `write` would refuse once there is a scene: what takes minutes to make is not to be lost.
+
+    Raises:
+        ValueError: the pixels of a film's panel cannot be.
+        ImportError: Blender or a package is missing; says which.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".fbx":
+        blender()
+    if suffix in USD and importlib.util.find_spec("pxr") is None:
+        raise ImportError(USD_NEEDS)
+    if suffix in PICTURES and size is not None:
+        require_size(size)
+
+
 def write(
     scene: Scene,
     path: str | Path,
@@ -284,7 +306,7 @@ def write(
     if fps is not None:
         require_number("fps", fps, over=0)
     if apart or not kind.nan:
-        _require_finite(scene)
+        require_finite(scene)
     rate = scene.fps if fps is None else fps
     if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
         context_frames = round(context_frames * rate / scene.fps)
@@ -296,8 +318,11 @@ def write(
     return [made for b, place in enumerate(places) for made in kind.write(scene.select([b]), place, options)]
 
 
-def _require_finite(scene: Scene) -> None:
+def require_finite(scene: Scene) -> None:
     """Refuse NaN, which other programs cannot read; only our own scene files may hold it."""
+    shapes = (~scene.betas.isfinite().all(-1) & scene.present).nonzero().tolist()
+    if shapes:
+        raise ValueError(f"scene {shapes[0][0]}, agent {shapes[0][1]}: betas, the shape of the body, are not finite")
     finite = scene.T_world_root.flatten(3).isfinite().all(-1) & scene.body_rot.flatten(3).isfinite().all(-1)
     bad = (~finite & scene.present[:, None]).nonzero().tolist()
     if bad:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.files import load_npz
+from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 
@@ -54,14 +55,15 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
         "body": np.array(scene.body),
         "name": np.array(scene.names[0] if scene.names else ""),
     }
-    path = Path(path).with_suffix(".npz")
+    path = Path(path)
+    path = path if path.suffix.lower() == ".npz" else path.with_suffix(".npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     if not apart:
-        np.savez_compressed(path, **arrays, **facts)  # type: ignore[arg-type]
+        save_npz(path, arrays | facts)
         return [path]
     paths = [path.with_name(f"{path.stem}_{p}.npz") for p in range(scene.agents)]
     for p, each in enumerate(paths):
-        np.savez_compressed(each, **{key: value[p] for key, value in arrays.items()}, **facts)  # type: ignore[arg-type]
+        save_npz(each, {key: value[p] for key, value in arrays.items()} | facts)
     return paths
 
 
@@ -123,6 +125,15 @@ ALSO = {"transl": ("transl", "trans"), "mocap_frame_rate": ("mocap_frame_rate", 
 """Our keys, and those that mean the same."""
 
 
+def _rate(path: Path, key: str, file: Mapping[str, np.ndarray]) -> float:
+    """Frames a second, which some programs write as an array of one number."""
+    try:
+        (rate,) = np.ravel(file[key]).tolist()
+        return float(rate)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {key}: expected one number, frames a second") from error
+
+
 def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
     """Arrays by our keys, frames a second, the body that the file was written for if it says so, and its name."""
     if not path.is_file():
@@ -139,8 +150,11 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
             if missing:
                 has = ", ".join(sorted(there))
                 raise ValueError(f"{path}: lacks {', '.join(sorted(missing))}; it has {has}")
+            lengths = {part: file[part].shape[:-1] for part in parts}
+            if len(set(lengths.values())) > 1:
+                raise ValueError(f"{path}: {' and '.join(f'{part} {shape}' for part, shape in lengths.items())} differ")
             poses = np.concatenate([file[part] for part in parts], axis=-1)
-            transl, fps = file[key["transl"]], float(file[key["mocap_frame_rate"]])
+            transl, fps = file[key["transl"]], _rate(path, key["mocap_frame_rate"], file)
             betas = file["betas"] if "betas" in there else np.zeros((*poses.shape[:-2], 10))
             written_for = str(file["body"]) if "body" in there else None
             name = str(file["name"]) if "name" in there else ""
@@ -149,7 +163,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     arrays = {"poses": poses, "transl": transl, "betas": betas}
     bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
-    if bad or not fps > 0:
+    if bad or not 0 < fps < float("inf"):
         raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
     tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
     if given is not None:

@@ -120,7 +120,9 @@ def load_bvh(
     rates = {file.fps for file in files}
     if len(rates) > 1 and fps is None:
         found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
-        raise ValueError(f"frame rates differ: {found}; bring all to one with --fps 30 (fps=30)")
+        raise ValueError(
+            f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
+        )
     skeletons = [understood(file, unit, up, joints) for file in files]
     read = [onto(skeleton, body) for skeleton in skeletons]
     labels = [str(path) for path in each]
@@ -304,7 +306,7 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
     if len(rates) > 1:
         raise ValueError(
             f"frame rates differ: {_each(labels, [f'{person.fps:g} fps' for person in people])}; "
-            f"bring all to one with --fps 30 (fps=30)"
+            f"bring all to one with magnet export --fps 30, or fps=30 in Python"
         )
     bodies = {person.body for person in people}
     if len(bodies) > 1:

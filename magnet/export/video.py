@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from magnet.body import Body
 from magnet.export.cast import Cast, Scenes, Style, cast, default_body, known_frames, panels
-from magnet.export.drawing import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views
+from magnet.export.drawing import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views, require_size
 from magnet.export.figures import add_ghosts, add_shadows
 from magnet.motion.scene import FPS, Scene
 
@@ -67,10 +67,9 @@ def render_video(
         ImportError: .mp4 without PyAV.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
-    if size[0] % 2 or size[1] % 2:
-        raise ValueError(f"size {size}: video needs even numbers of pixels")
+    require_size(size)
     for name, value in (("fps", fps), ("speed", speed)):
         if not value > 0:
             raise ValueError(f"{name}: got {value:g}, expected more than 0")

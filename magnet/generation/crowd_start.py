@@ -51,8 +51,11 @@ def start_crowd(
 
     Returns:
         One scene of `people`; of `START` frames where the model makes it.
+
+    Raises:
+        ValueError: nobody, or more people than `MOST`.
     """
-    require_whole("people", people, 1)
+    require_whole("people", people, 1, MOST)
     turns = torch.Generator()
     turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
     if not groups:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_number
-from magnet.files import load_npz
+from magnet.files import load_npz, save_npz
 
 BODY_JOINTS = 22
 """The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
@@ -207,11 +207,12 @@ class Scene:
     def save(self, path: str | Path) -> Path:
         """Write all B scenes to one npz that needs no unpickling. Returns the path written."""
         path = Path(path)
+        path = path if path.suffix.lower() == ".npz" else path.with_name(path.name + ".npz")
         path.parent.mkdir(parents=True, exist_ok=True)
         meta = {"format": SCENE_FORMAT, "fps": self.fps, "body": self.body, "names": list(self.names)}
         arrays = {name: value.detach().cpu().numpy() for name, value in self.tensors().items()}
-        np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
-        return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+        save_npz(path, {"meta": np.array(json.dumps(meta)), **arrays})
+        return path
 
     @staticmethod
     def load(path: str | Path) -> Scene:

@@ -154,7 +154,7 @@ class ViewerBase:
             self.follow = bool(follow.value)
 
         follow.on_update(set_follow)
-        presets.on_click(lambda event: self._move_cameras(presets.value, event.client))
+        presets.on_click(lambda event: self.move_cameras(presets.value, event.client))
 
     def set_style(self, render: RenderOptions) -> None:
         """Show it with other options."""
@@ -203,8 +203,8 @@ class ViewerBase:
         camera.position, camera.look_at, camera.fov = self._eye(preset, distance), np.array([0.0, AIM, 0.0]), FIELD
         self.distance = distance
 
-    def _move_cameras(self, preset: str, client: Any = None) -> None:
-        """Send cameras to a preset, and back from there until everybody is in the picture, also while nothing plays."""
+    def move_cameras(self, preset: str, client: Any = None) -> None:
+        """Send cameras (of everybody, or of one) to a preset, and back until all people are in the picture."""
         for each in [client] if client is not None else self.server.get_clients().values():
             with each.atomic():
                 each.camera.position = self._eye(preset, self.distance)

@@ -170,7 +170,9 @@ def test_files_of_other_rates_and_lengths_need_a_word(body: Body, tmp_path: Path
     duo = random_scene(1, 30, 2, torch.Generator().manual_seed(2))
     a = save_bvh(duo.permute_agents(torch.tensor([0])), tmp_path / "a.bvh", body)[0]
     b = save_bvh(duo.permute_agents(torch.tensor([1])).replace(fps=60.0), tmp_path / "b.bvh", body)[0]
-    with pytest.raises(ValueError, match=r"a\.bvh 30 fps, .*b\.bvh 60 fps; bring all to one with --fps 30"):
+    with pytest.raises(
+        ValueError, match=r"a\.bvh 30 fps, .*b\.bvh 60 fps; bring all to one with magnet export --fps 30"
+    ):
         load_bvh([a, b], body)
     with pytest.raises(ValueError, match=r"a\.bvh 30 frames, .*b\.bvh 15 frames.*--trim"):
         load_bvh([a, b], body, fps=30)

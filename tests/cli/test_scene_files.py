@@ -1,0 +1,171 @@
+"""What is read stays, what cannot be written is said before anything is made, and what means nothing is refused."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import magnet
+from magnet import cli
+from magnet.body import Body, load_body
+from magnet.export.bvh import save_bvh
+from magnet.export.npz import load_smplx, save_smplx
+from magnet.motion.scene import Scene
+from magnet.testing import random_scene
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return load_body()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: Body) -> Path:
+    """Holds duet.npz and, as another program would have recorded them, take_0.bvh and take_1.bvh."""
+    monkeypatch.chdir(tmp_path)
+    scene = random_scene(1, 12, 2, torch.Generator().manual_seed(0)).replace(names=("duet",))
+    scene.save(tmp_path / "duet.npz")
+    save_bvh(scene, tmp_path / "take.bvh", body)
+    return tmp_path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert cli.main(list(words)) != 0
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    return said.err
+
+
+@pytest.mark.parametrize("command", ["refine", "export", "predict"])
+def test_files_that_are_read_are_not_written_over_unless_they_are_named(
+    command: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
+    out = ["--out", "take.bvh"] if command == "predict" else ["take.bvh"]
+    assert "take_0.bvh, which is read" in refused(capsys, command, "take_0.bvh", "take_1.bvh", *out)
+    assert before == [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
+
+
+def test_a_file_that_is_named_may_be_written_over(folder: Path) -> None:
+    assert cli.main(["export", "duet.npz", "duet.npz"]) == 0
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--out", "o.mp4", "--size", "63", "64"], "even numbers"),
+        (["--out", "o.gif", "--size", "0", "-4"], "expected at least 16 pixels"),
+        (["--out", "o.npz", "--frames", "0"], "--frames 0: expected at least 1"),
+        (["--out", "o.npz", "--frames", "-4"], "--frames -4: expected at least 1"),
+        (["--out", "o.npz", "--context", "-4"], "--context -4: expected at least 0"),
+        (["--out", "o.npz", "--people", "5", "--context", "0"], "--context 0: a crowd goes on"),
+        (["--out", "o.npz", "--people", "201"], "got 201, expected 1 to 200"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_sampled(
+    words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("sampled")
+
+    monkeypatch.setattr("magnet.generation.crowd_start.generate", never)
+    monkeypatch.setattr("magnet.api.Model.predict", never)
+    people = [] if "--people" in words else ["--people", "2"]
+    assert said in refused(capsys, "predict", *people, *words)
+
+
+def test_a_format_whose_writer_is_not_here_is_refused_first(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MAGNET_BLENDER", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    for suffix, needs in ((".fbx", "Blender"), (".usdz", "usd-core")):
+        assert needs in refused(capsys, "predict", "--people", "2", "--out", f"o{suffix}")
+
+
+BROKEN: dict[str, Callable[[Scene], Scene]] = {
+    "betas": lambda scene: scene.replace(betas=scene.betas.clone().index_fill_(2, torch.tensor([3]), torch.nan)),
+    "T_world_root": lambda scene: scene.replace(T_world_root=scene.T_world_root.clone().fill_(torch.nan)),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+@pytest.mark.parametrize("words", [["refine", "o.npz"], ["export", "o.glb"], ["export", "o.bvh"], ["export", "o.csv"]])
+def test_numbers_that_are_not_finite_are_refused(
+    what: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    BROKEN[what](Scene.load("duet.npz")).save("broken.npz")
+    assert "finite" in refused(capsys, words[0], "broken.npz", words[1])
+    assert not Path(words[1]).exists()
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["empty.npz", "o.npz"], "holds no frames"),
+        (["duet.npz", "o.npz", "--slides", "nan"], "--slides nan"),
+        (["duet.npz", "o.npz", "--slides", "-1"], "--slides -1"),
+        (["duet.npz", "o.npz", "--plot", "p.png"], "--plot p.png: is drawn as .svg"),
+    ],
+)
+def test_refine_refuses_what_means_nothing(
+    words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Scene.load("duet.npz").slice(0, 0).save("empty.npz")
+    assert said in refused(capsys, "refine", *words)
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--in_unit", "furlong"], "unit 'furlong' is for .bvh"),
+        (["--up", "q"], "up axis 'q' is for other programs' files"),
+        (["--context", "-5"], "--context -5: expected 0 frames or more"),
+    ],
+)
+def test_options_that_a_scene_of_ours_has_no_use_for_are_refused(
+    words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said in refused(capsys, "export", "duet.npz", "o.glb", *words)
+
+
+def test_less_than_a_token_is_said_to_be_too_little(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Scene.load("duet.npz").slice(0, 3).save("short.npz")
+    told = refused(capsys, "predict", "short.npz", "--context", "0", "--task", "partner_inpainting", "--out", "o.npz")
+    assert "hold 3 frames at 30 a second; a token needs 4" in told
+
+
+def test_a_crowd_from_nothing_is_longer_than_its_beginning() -> None:
+    with pytest.raises(ValueError, match="got 8, expected at least 33"):
+        magnet.load("duet").generate(people=5, frames=8)
+
+
+def test_a_name_in_capitals_is_kept(folder: Path, body: Body) -> None:
+    scene = Scene.load("duet.npz")
+    kept = Path("dd.npz").write_bytes(b"something else") and Path("dd.npz").read_bytes()
+    assert scene.save("DD.NPZ") == Path("DD.NPZ") and Path("DD.NPZ").is_file()
+    assert save_smplx(scene, "DD.NPZ", body) == [Path("DD.NPZ")]
+    assert load_smplx("DD.NPZ", body).frames == 12
+    assert Path("dd.npz").read_bytes() == kept
+
+
+@pytest.mark.parametrize("rate", [np.array([120.0]), np.array([[120.0]]), np.array(120)], ids=["1", "1 1", "number"])
+def test_a_frame_rate_may_be_an_array_of_one_number(rate: np.ndarray, folder: Path, body: Body) -> None:
+    save_smplx(Scene.load("duet.npz"), "one.npz", body)
+    np.savez("amass.npz", **{**dict(np.load("one.npz")), "mocap_frame_rate": rate})
+    assert load_smplx("amass.npz", body).fps == 120
+
+
+@pytest.mark.parametrize("rate", [np.array([120.0, 30.0]), np.array("120fps"), np.array([])], ids=["2", "text", "none"])
+def test_another_frame_rate_is_refused_by_file_and_key(rate: np.ndarray, folder: Path, body: Body) -> None:
+    save_smplx(Scene.load("duet.npz"), "one.npz", body)
+    np.savez("amass.npz", **{**dict(np.load("one.npz")), "mocap_frame_rate": rate})
+    with pytest.raises(ValueError, match=r"amass\.npz: mocap_frame_rate: expected one number"):
+        load_smplx("amass.npz", body)
