@@ -13,13 +13,12 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
 
 import torch
 from pairwise_error import windows
 from torch import Tensor
 
-from magnet.denoiser.lean import lean
+from magnet.denoiser.lean import Precision, lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
@@ -31,11 +30,7 @@ from magnet.sampling.noise import add_noise
 from magnet.tokenizer.losses import matrices
 
 LEVELS = (20, 100, 300, 600, 1000)
-PRECISIONS = ("float32", "bf16", "int8")
-
-
-def network(model: Denoiser, precision: str) -> Callable[..., Tensor]:
-    return model.transformer if precision == "reference" else lean(model.transformer, precision)  # type: ignore[arg-type]
+PRECISIONS: tuple[Precision, ...] = ("float32", "bf16", "int8")
 
 
 def bodies(model: Denoiser, scene: Scene, clean: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,7 +57,7 @@ def errors(model: Denoiser, scene: Scene) -> dict[str, dict[str, float]]:
         whole = model.denoise(noisy, levels, there)
         exact, pairs = bodies(model, scene, whole)
         for name in PRECISIONS:
-            made = model.denoise(noisy, levels, there, network=network(model, name))
+            made = model.denoise(noisy, levels, there, network=lean(model.transformer, name))
             joints, other = bodies(model, scene, made)
             off = (joints - exact).norm(dim=-1)[:, 4 * half :].transpose(1, 2)[there]
             seen = model.layout.group_present(there)[:, None, :, 1:].expand(pairs.shape[:4])[:, half:]
@@ -88,7 +83,7 @@ def times(made: Transformer, scenes: int, rounds: int = 40) -> dict[str, float]:
     present[:, :2] = True
     noisy = torch.randn(scenes, 16, layout.agents, layout.width)
     levels = torch.full(noisy.shape[:3], 500)
-    each = {"reference": made, **{name: lean(made, name) for name in PRECISIONS}}  # type: ignore[arg-type]
+    each = {"reference": made, **{name: lean(made, name) for name in PRECISIONS}}
     spent: dict[str, list[float]] = {name: [] for name in each}
     for _ in range(rounds):
         for name, run in each.items():

@@ -233,7 +233,7 @@ class Model:
         require_whole("people", people, 1, MOST)
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         if people > self.most_people:
-            require_whole("frames of a crowd, which begins with 32", frames, START + 1)
+            require_whole(f"frames of a crowd, which begins with {START}", frames, START + 1)
             return self.predict(self.start_crowd(people, seed=seed), context=START, frames=frames - START, **said)
         empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
         scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))

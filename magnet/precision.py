@@ -61,8 +61,8 @@ def device_of(device: str | torch.device) -> torch.device:
 def quick_bf16(device: torch.device) -> bool:
     """Whether a device multiplies matrices in bfloat16.
 
-    A CPU without AVX-512 emulates it, some eighty times slower, and one whose AVX-512 does not know it is three times
-    slower than in float32.
+    A CPU without AVX-512 emulates it, some eighty times slower, and one whose AVX-512 does not know it is two to four
+    times slower than in float32.
     """
     if device.type != "cpu":
         return True

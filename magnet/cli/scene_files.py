@@ -69,12 +69,12 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
     if path.suffix.lower() not in formats.WRITTEN:
         known = ", ".join(formats.WRITTEN)
         raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
-    also = re.compile(re.escape(path.stem) + r"(_scene\d+)?(_\d+)?" + re.escape(path.suffix))
-    for each in map(Path, inputs):
+    also = re.compile(re.escape(path.stem) + r"(_scene\d+)?(_\d+)?\.bvh", re.IGNORECASE)
+    for each in map(Path, inputs) if path.suffix.lower() == ".bvh" else ():
         beside = each.parent.resolve() == path.parent.resolve() and each.name != path.name
         if beside and also.fullmatch(each.name):
             raise CommandError(
-                f"{path}: people or scenes get a file each, and {each.name}, which is read, may be one of them; give "
+                f"{path}: people and scenes get a .bvh each, and {each.name}, which is read, may be one of them; give "
                 "OUT another name"
             )
     formats.require_writer(path, size)

@@ -18,6 +18,10 @@ Size = tuple[int, int]
 Colour = tuple[int, int, int]
 
 
+SMALLEST = 16
+"""Pixels of a film's panel, at least."""
+
+
 def require_size(size: Size) -> None:
     """Refuse a film's panel that nothing can be drawn in.
 
@@ -29,9 +33,6 @@ def require_size(size: Size) -> None:
     if min(size) < SMALLEST:
         raise ValueError(f"size {size}: expected at least {SMALLEST} pixels each way")
 
-
-SMALLEST = 16
-"""Pixels of a film's panel, at least."""
 
 BACKGROUND: Colour = (250, 250, 252)
 TILES: tuple[Colour, Colour] = ((236, 239, 244), (223, 228, 236))

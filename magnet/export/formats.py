@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.retarget import load_bvh, together
-from magnet.export.usd import NEEDS as USD_NEEDS
+from magnet.export.usd import require_usd, save_usd
 from magnet.files import load_npz
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
@@ -188,12 +187,14 @@ class Format:
         batch: one file holds several scenes; else each scene gets a file.
         own_rate: it chooses its frames itself; else the scene is resampled to the requested rate first.
         nan: it may hold numbers that are not finite.
+        ready: raises ImportError where what writes it is not here; known before there is a scene.
     """
 
     write: Callable[[Scene, Path, WriteOptions], Sequence[Path]]
     batch: bool = False
     own_rate: bool = False
     nan: bool = False
+    ready: Callable[[], object] = lambda: None
 
 
 def _write_npz(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
@@ -209,8 +210,6 @@ def _write_page(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
 
 
 def _write_usd(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    from magnet.export.usd import save_usd
-
     return [save_usd(scene, path, o.body, o.bones)]
 
 
@@ -218,6 +217,12 @@ def _write_film(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
     from magnet.export.video import render_video
 
     return [render_video(scene, path, fps=o.fps, size=o.size, progress=o.progress, **o.look)]
+
+
+def _ready_for_mp4() -> None:
+    from magnet.export.video import require_av
+
+    require_av()
 
 
 def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
@@ -230,11 +235,12 @@ WRITTEN: dict[str, Format] = {
     ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
     ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit)),  # a skeleton a person, one file each
     ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
-    ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)]),  # the same, by Blender
-    **{suffix: Format(_write_usd) for suffix in USD},
+    ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)], ready=blender),  # the same, by Blender
+    **{suffix: Format(_write_usd, ready=require_usd) for suffix in USD},
     ".csv": Format(lambda all, to, o: [save_csv(all, to, o.body)], batch=True),  # a table of joint positions
     ".html": Format(_write_page, batch=True),  # a page that plays the scene, by itself
     **{suffix: Format(_write_film, batch=True, own_rate=True) for suffix in PICTURES},
+    ".mp4": Format(_write_film, batch=True, own_rate=True, ready=_ready_for_mp4),
     ".png": Format(_write_strip, batch=True, own_rate=True),  # a strip of moments
 }
 """Suffixes that can be written, and how."""
@@ -248,10 +254,7 @@ def require_writer(path: Path, size: Size | None = None) -> None:
         ImportError: Blender or a package is missing; says which.
     """
     suffix = path.suffix.lower()
-    if suffix == ".fbx":
-        blender()
-    if suffix in USD and importlib.util.find_spec("pxr") is None:
-        raise ImportError(USD_NEEDS)
+    WRITTEN[suffix].ready()
     if suffix in PICTURES and size is not None:
         require_size(size)
 

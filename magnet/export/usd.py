@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,16 @@ NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
 ROOT = "root"
 
 
+def require_usd() -> None:
+    """Refuse where usd-core is not installed.
+
+    Raises:
+        ImportError: says how to install it.
+    """
+    if importlib.util.find_spec("pxr") is None:
+        raise ImportError(NEEDS)
+
+
 def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as UsdSkel: metres, y up, a time code for every frame of the scene.
 
@@ -49,10 +60,9 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ImportError: usd-core is not installed.
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
-    try:
-        from pxr import Usd, UsdGeom, UsdSkel, UsdUtils
-    except ImportError as error:
-        raise ImportError(NEEDS) from error
+    require_usd()
+    from pxr import Usd, UsdGeom, UsdSkel, UsdUtils
+
     slots = slots_to_write(scene, body)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -210,11 +211,20 @@ def _frames(film: Film, report: Report) -> Iterator[Image.Image]:
         report(index + 1, film.frames)
 
 
+def require_av() -> None:
+    """Refuse where PyAV is not installed.
+
+    Raises:
+        ImportError: says how to install it.
+    """
+    if importlib.util.find_spec("av") is None:
+        raise ImportError('.mp4 needs PyAV: pip install "magnet-motion[video]"; .gif and .webp do not')
+
+
 def _write_mp4(film: Film, path: Path, report: Report) -> None:
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError('.mp4 needs PyAV: pip install "magnet-motion[video]"; .gif and .webp do not') from error
+    require_av()
+    import av
+
     with av.open(str(path), "w") as container:
         rate = Fraction(film.fps).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
