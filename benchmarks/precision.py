@@ -10,15 +10,17 @@ turn, of the model's sizes and of the paper's.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import statistics
 import time
+from collections.abc import Callable
 
 import torch
 from pairwise_error import windows
 from torch import Tensor
 
-from magnet.denoiser.lean import Precision, lean
+from magnet.denoiser.lean import lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
@@ -30,7 +32,17 @@ from magnet.sampling.noise import add_noise
 from magnet.tokenizer.losses import matrices
 
 LEVELS = (20, 100, 300, 600, 1000)
-PRECISIONS: tuple[Precision, ...] = ("float32", "bf16", "int8")
+
+
+def networks(made: Transformer) -> dict[str, Callable[..., Tensor]]:
+    """What predicts with each choice. The last is what `--sampler.precision int8 --sampler.compile true` does."""
+    int8 = lean(made, "int8")
+    return {
+        "float32": lean(made),
+        "bf16": lean(made, "bf16"),
+        "int8": int8,
+        "int8 compiled": functools.partial(int8, compiled=True),
+    }
 
 
 def bodies(model: Denoiser, scene: Scene, clean: Tensor) -> tuple[Tensor, Tensor]:
@@ -48,7 +60,8 @@ def errors(model: Denoiser, scene: Scene) -> dict[str, dict[str, float]]:
     """Of each precision against `reference`: share of the output, and centimetres (mean and 99 %, and of partners)."""
     truth = model.normalizer.normalize(model.tokenize(scene)[0])
     half, there = truth.shape[1] // 2, scene.present
-    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in PRECISIONS}
+    each = networks(model.transformer)
+    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in each}
     for level in LEVELS:
         levels = torch.zeros(truth.shape[:3], dtype=torch.long)
         levels[:, half:] = level
@@ -56,8 +69,8 @@ def errors(model: Denoiser, scene: Scene) -> dict[str, dict[str, float]]:
         noisy = add_noise(truth, noise, model.layout.spread(model.layout.group_levels(levels)))
         whole = model.denoise(noisy, levels, there)
         exact, pairs = bodies(model, scene, whole)
-        for name in PRECISIONS:
-            made = model.denoise(noisy, levels, there, network=lean(model.transformer, name))
+        for name, network in each.items():
+            made = model.denoise(noisy, levels, there, network=network)
             joints, other = bodies(model, scene, made)
             off = (joints - exact).norm(dim=-1)[:, 4 * half :].transpose(1, 2)[there]
             seen = model.layout.group_present(there)[:, None, :, 1:].expand(pairs.shape[:4])[:, half:]
@@ -83,7 +96,7 @@ def times(made: Transformer, scenes: int, rounds: int = 40) -> dict[str, float]:
     present[:, :2] = True
     noisy = torch.randn(scenes, 16, layout.agents, layout.width)
     levels = torch.full(noisy.shape[:3], 500)
-    each = {"reference": made, **{name: lean(made, name) for name in PRECISIONS}}
+    each = {"reference": made, **networks(made)}
     spent: dict[str, list[float]] = {name: [] for name in each}
     for _ in range(rounds):
         for name, run in each.items():

@@ -118,6 +118,12 @@ def test_denoising_steps_are_one_to_a_thousand(steps):
         ddim_levels(steps)
 
 
+def test_what_is_sampled_as_it_was_trained_is_not_compiled() -> None:
+    with pytest.raises(ValueError, match="^compile: the precision reference is the network as it was trained"):
+        SamplerOptions(precision="reference", compile=True)
+
+
+
 def test_the_grid_takes_whatever_the_sampler_does():
     """Options that are accepted plan: no number passes one check and fails another without a word."""
     options = SamplerOptions(steps=335, stride=8, pyramid_offset=None)

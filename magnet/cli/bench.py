@@ -54,6 +54,7 @@ def parser() -> argparse.ArgumentParser:
     add("--sampler", default="default", metavar="PRESET", help="sampler preset (default: %(default)s)")
     add("--steps", type=int, default=None, help="denoising steps (default: the sampler's)")
     add("--precision", default=None, help="reference, float32, bf16 or int8 (default: the sampler's)")
+    add("--compile", action="store_true", help="compile the network, with int8 or on a GPU; not counted")
     add("--live", type=float, default=None, metavar="SECONDS", help="seconds of live answers (default: 60); 0: none")
     add("--threads", type=int, default=None, help="threads of torch (default: its own choice)")
     add("--clock", choices=("wall", "cpu"), default="wall", help="cpu: seconds of this process, for a busy machine")
@@ -140,7 +141,7 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     tasks = given.task or registry.names()
     options_of = task_options(of_tasks, tasks)
     model = load(given.model).to(given.device)
-    asked = {"steps": given.steps, "precision": given.precision}
+    asked = {"steps": given.steps, "precision": given.precision, "compile": given.compile or None}
     options = SamplerOptions.preset(given.sampler, **{name: v for name, v in asked.items() if v is not None})
     people = [P for P in given.people or usual["people"] if model.layout.agents >= P]
     threads = torch.get_num_threads()

@@ -17,9 +17,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
+from magnet.denoiser.compiled import Compiled
 from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
-from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of
-from magnet.precision import quick_bf16
+from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of, packs
+from magnet.precision import quick_bf16, quick_int8
 from magnet.sampling.noise import LEVELS
 
 Precision = Literal["float32", "bf16", "int8"]
@@ -159,6 +160,9 @@ class LeanTransformer:
         self.blocks = [LeanBlock(block, packed, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
         self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
         self.condition = network.condition if o.cond_dim else None
+        packed_once = device.type == "cpu" and packs() and not (precision == "int8" and quick_int8(device))
+        why = f"what is packed for the processor ({precision}) is not compiled; int8 is" if packed_once else None
+        self._compiled = Compiled(self._all_blocks, "sampler.compile", refused=why)
 
     def __call__(
         self,
@@ -168,10 +172,12 @@ class LeanTransformer:
         cond: Tensor | None = None,
         wanted: Tensor | None = None,
         memory: Memory | None = None,
+        compiled: bool = False,
     ) -> Tensor:
         """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero.
 
         With a `memory`, what this was last asked with it must have been the same but for the token steps that change.
+        The blocks are `compiled` where they can be, and where keys and values of earlier blocks are not kept.
         """
         B, N, _, _ = noisy.shape
         begins, ends = self._span(N, wanted, memory)
@@ -185,7 +191,7 @@ class LeanTransformer:
             if extra is not None:
                 x = x + (extra if len(extra) == 1 or scenes is None else extra[scenes])
             asked = None if wanted is None else wanted[begins:ends, slots].flatten().nonzero()[:, 0]
-            y = self._blocks(x, begins, asked, memory, group)
+            y = self._blocks(x, begins, asked, memory, group, compiled)
             answer = self.exit(y)
             if asked is not None:
                 whole = answer.new_zeros(len(x), x.shape[1] * x.shape[2], answer.shape[-1])
@@ -267,7 +273,9 @@ class LeanTransformer:
             x = layer(x)
         return x
 
-    def _blocks(self, x: Tensor, begins: int, asked: Tensor | None, memory: Memory | None, group: int) -> Tensor:
+    def _blocks(
+        self, x: Tensor, begins: int, asked: Tensor | None, memory: Memory | None, group: int, compiled: bool = False
+    ) -> Tensor:
         """All blocks, of token steps from `begins` on. (B, n, p, d) -> (B, n * p or as many as are asked for, d)"""
         o, people = self.options, x.shape[2]
         steps, skipped = begins + x.shape[1], begins * people
@@ -280,6 +288,9 @@ class LeanTransformer:
         elif o.rope == "hidden":
             x = x + split_turned(x, turns(steps, people, o.width, x.device)[skipped:])
         x = x.to(self.dtype)
+        if compiled and (memory is None or not memory.steps):
+            made: Tensor = self._compiled(x, turn, sees, asked)
+            return made
         for number, block in enumerate(self.blocks):
             before = None if memory is None else memory.blocks.get((group, number))
             x, pair = block(x, turn, sees, asked if number == len(self.blocks) - 1 else None, before)
@@ -288,6 +299,12 @@ class LeanTransformer:
                 kept = memory.steps * people
                 memory.blocks[group, number] = keys[:, :, :kept].clone(), values[:, :, :kept].clone()
         return x.float()
+
+    def _all_blocks(self, x: Tensor, turn: Tensor | None, sees: Tensor | None, asked: Tensor | None) -> Tensor:
+        """All blocks, of which nothing is remembered: what is compiled. (B, L, d) -> (B, L or r, d)"""
+        for block in self.blocks[:-1]:
+            x = block(x, turn, sees)[0]
+        return self.blocks[-1](x, turn, sees, asked)[0].float()
 
 
 def split_turned(x: Tensor, turn: Tensor) -> Tensor:

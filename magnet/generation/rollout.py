@@ -306,7 +306,7 @@ class Rollout:
             self._asked[len(self._asked) - self._ahead :] = True
         asked = None if whole else self._asked
         packed = self._packed = self._packed or lean(network, precision)  # a stage looks once whether weights changed
-        return functools.partial(packed, wanted=asked, memory=self._memory)
+        return functools.partial(packed, wanted=asked, memory=self._memory, compiled=self.options.compile)
 
     def _guided_by_condition(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         """Classifier-free guidance, where it has a weight: each window is predicted with its condition and without."""

@@ -86,6 +86,8 @@ class SamplerOptions:
             fast on a CPU and rounds otherwise than the network as it is trained, `reference`; or `bf16` or `int8`,
             the blocks in half precision or in 8-bit whole numbers, trades (docs/speed.md says what they cost in
             poses). On a processor without such instructions they round as much and are no faster.
+        compile: the network's blocks by torch.compile, on a GPU, or on a CPU with `int8`; elsewhere it says that it
+            does not. The first evaluation waits for it, half a minute, in later runs ten seconds (docs/speed.md).
     """
 
     steps: int = 16
@@ -111,6 +113,7 @@ class SamplerOptions:
     solver: Solver = "dpmpp_2m"
     spacing: Spacing = "log_snr"
     precision: Precision = "float32"
+    compile: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.guidance, Guidance):
@@ -131,6 +134,8 @@ class SamplerOptions:
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
         require_number("eta", self.eta, 0, 1)
         require_spacing(self.spacing, self.shift)
+        if self.compile and self.precision == "reference":
+            raise ValueError("compile: the precision reference is the network as it was trained; take float32 or int8")
 
     def filled(self, best: Any) -> SamplerOptions:
         """These options where they say something; what they leave open from another object's fields of that name."""

@@ -39,6 +39,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "solver": "ddim",  # A.3
         "spacing": "even",  # A.3
         "precision": "reference",  # A.3 names none: the network as it was trained
+        "compile": False,
         "crowd_enter": 1.5,  # the paper has no crowds
         "crowd_leave": 2.2,
         "apart": "off",  # the paper moves nobody out of another
