@@ -119,9 +119,8 @@ def test_denoising_steps_are_one_to_a_thousand(steps):
 
 
 def test_what_is_sampled_as_it_was_trained_is_not_compiled() -> None:
-    with pytest.raises(ValueError, match="^compile: the precision reference is the network as it was trained"):
+    with pytest.raises(ValueError, match=r"^compile: the precision reference is the network as it was trained"):
         SamplerOptions(precision="reference", compile=True)
-
 
 
 def test_the_grid_takes_whatever_the_sampler_does():
