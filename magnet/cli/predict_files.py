@@ -100,8 +100,9 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.denoiser.module import Denoiser
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
+    recorded, body = read_files(options)  # before the model is loaded, so that what is not there is said at once
     model = Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
-    scene, body, added = read_people(options, model)
+    scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
     context, frames = lengths(options, task, scene, added, model)
     began = time.perf_counter()
@@ -121,14 +122,11 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, tuple[int, ...]]:
-    """The scene of all files with room for those who are made from nothing. -> scene, body, slots of these
-
-    A crowd is composed of the files' people, again and again, or of couples that the model makes.
+def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
+    """The people of all files, or a scene of nobody, and its body.
 
     Raises:
-        CommandError: no files and no people, or fewer people than files hold.
-        ValueError: as `formats.read`.
+        ValueError, OSError: as `formats.read`.
     """
     import torch
 
@@ -140,10 +138,19 @@ def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, 
     if options.inputs:
         reading = formats.Reading(FPS, options.trim, options.in_unit, options.up, keep_floor=options.keep_floor)
         got = scene_files.read_inputs(options, reading)
-        scene, body = got.scene, got.body
-    else:
-        body = load_body(options.body or "open")
-        scene = empty_scene(1, TOKEN_FRAMES, 0, torch.zeros(())).replace(body=body.id)
+        return got.scene, got.body
+    body = load_body(options.body or "open")
+    return empty_scene(1, TOKEN_FRAMES, 0, torch.zeros(())).replace(body=body.id), body
+
+
+def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[Scene, tuple[int, ...]]:
+    """The scene of all files with room for those who are made from nothing, and the slots of these.
+
+    A crowd is composed of the files' people, again and again, or of couples that the model makes.
+
+    Raises:
+        CommandError: no files and no people, or fewer people than files hold.
+    """
     people = scene.agents if options.people is None else options.people
     if people < max(scene.agents, 1):
         raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
@@ -157,12 +164,12 @@ def read_people(options: argparse.Namespace, model: Model) -> tuple[Scene, Any, 
         groups = [scene.slice(0, options.context)] if options.inputs else []
         if options.task == "generation" and not groups:
             options.task = None  # a crowd from nothing: couples that the model makes, from which it goes on
-        return model.start_crowd(people, groups, options.spacing, seed=options.seed), body, ()
+        return model.start_crowd(people, groups, options.spacing, seed=options.seed), ()
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)
     present = scene.present.clone()
     present[:, list(added)] = True
-    return scene.replace(present=present), body, added
+    return scene.replace(present=present), added
 
 
 def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:

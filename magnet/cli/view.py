@@ -125,7 +125,11 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.viewer.takes import read_takes
 
     body = load_body(options.body or "open")
-    return read_takes(options.files, body, options.context, options.samples)
+    takes, body = read_takes(options.files, body, options.context, options.samples)
+    longest = max(each.scene.frames for each in takes)
+    if options.context > longest:
+        raise ValueError(f"--context {options.context}: got {longest} frames, so at most {longest} were given")
+    return takes, body
 
 
 def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:

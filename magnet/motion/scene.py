@@ -27,6 +27,9 @@ FPS = 30.0
 
 SCENE_FORMAT = 1
 
+NO_ROTATION = 1e-2
+"""A matrix whose R^T R is further from 1 than this, in any number, is none that anything wrote in float32."""
+
 TENSORS = ("body_rot", "T_world_root", "betas", "present", "valid", "given")
 """Fields of a scene that are tensors; the last two may be absent."""
 
@@ -219,7 +222,7 @@ class Scene:
         """Read what `save` wrote.
 
         Raises:
-            ValueError: the file is not such a file, or of a later format.
+            ValueError: the file is not such a file, of a later format, or has matrices that do not rotate.
         """
         try:
             with load_npz(path) as file:
@@ -233,7 +236,28 @@ class Scene:
             raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error
         if version > SCENE_FORMAT:
             raise ValueError(f"{path}: scene format {version}, this version reads up to {SCENE_FORMAT}")
-        return Scene(**arrays)
+        scene = Scene(**arrays)
+        require_rotations(scene, str(path))
+        return scene
+
+
+def require_rotations(scene: Scene, name: str) -> None:
+    """Refuse matrices that do not rotate, of people who are there in frames that count; what is not finite passes.
+
+    Raises:
+        ValueError: says which is the first.
+    """
+    root = scene.T_world_root[..., None, :3, :3]
+    turns = torch.cat([root, scene.body_rot], dim=3).float()  # (B, T, P, joints, 3, 3)
+    off = (turns.mT @ turns - torch.eye(3, device=turns.device)).abs().amax(dim=(-2, -1))
+    wrong = (off > NO_ROTATION) | (torch.linalg.cross(turns[..., 0], turns[..., 1]) * turns[..., 2]).sum(-1).lt(0)
+    wrong &= scene.present[:, None, :, None]
+    if scene.valid is not None:
+        wrong &= scene.valid[:, :, None, None]
+    if bool(wrong.any()):
+        b, frame, person, joint = wrong.nonzero()[0].tolist()
+        field = "T_world_root" if joint == 0 else f"body_rot of joint {joint}"
+        raise ValueError(f"{name}: {field} is no rotation (scene {b}, frame {frame}, person {person})")
 
 
 def empty_scene(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:

@@ -8,6 +8,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.checkpoints import FOLDER
+from magnet.denoiser.module import Denoiser
 from magnet.export import save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
@@ -127,3 +128,9 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
 
     assert not meant(["--task", "joint_future"]) and not meant([]) and not meant(["--data.path", "store.npz"])
     assert not meant(["generation"]) and not meant(["--help"]) and meant(["--help", "files"])
+
+
+def test_a_file_that_is_not_there_is_said_before_a_model_is_loaded(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(Denoiser, "load", lambda *_: pytest.fail("a model was loaded"))
+    assert cli.main(["predict", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out.npz")]) != 0
+    assert "none.npz" in capsys.readouterr().err

@@ -162,3 +162,19 @@ def test_a_scene_in_single_precision_is_itself(scene: Scene):
     assert scene.to_float32() is scene
     again = scene.replace(body_rot=scene.body_rot.double()).to_float32()
     assert again.body_rot.dtype == torch.float32 and torch.equal(again.body_rot, scene.body_rot)
+
+
+@pytest.mark.parametrize("field", ["T_world_root", "body_rot"])
+@pytest.mark.parametrize("factors", [(2.0, 1.0, 1.0), (-1.0, 1.0, 1.0)], ids=["scaled", "mirrored"])
+def test_a_file_whose_matrices_do_not_rotate_is_refused(scene: Scene, tmp_path, field, factors) -> None:
+    wrong = getattr(scene, field).clone()
+    spoiled = wrong[0, 3, 1] if field == "T_world_root" else wrong[0, 3, 1, 4]
+    spoiled[:3, :3] *= torch.tensor(factors)
+    path = scene.replace(**{field: wrong}).save(tmp_path / "spoiled.npz")
+    with pytest.raises(ValueError, match=rf"spoiled.npz: {field}.* is no rotation \(scene 0, frame 3, person 1\)"):
+        Scene.load(path)
+    for nobody in (scene.present & (torch.arange(scene.agents) != 1), scene.present):
+        valid = torch.ones(scene.scenes, scene.frames, dtype=torch.bool)
+        valid[0, 3] = nobody is not scene.present  # who is absent, and frames that do not count, hold anything
+        told = scene.replace(**{field: wrong, "present": nobody, "valid": valid})
+        assert Scene.load(told.save(tmp_path / "told.npz")).frames == scene.frames

@@ -124,6 +124,12 @@ def test_a_page_of_any_style_is_written_without_viser_or_a_server(
     assert "written:" in capsys.readouterr().out
 
 
+def test_no_more_frames_were_given_than_there_are(tmp_path: Path, duet: Scene, capsys) -> None:
+    path = duet.save(tmp_path / "a.npz")
+    assert main(["view", str(path), "--html", str(tmp_path / "a.html"), "--context", "9999"]) == 2
+    assert f"--context 9999: got {duet.frames} frames" in capsys.readouterr().err
+
+
 def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
     path = duet.save(tmp_path / "a.npz")
     assert main(["view", str(path), "--record", str(tmp_path / "r.npz"), "--html", str(tmp_path / "a.html")]) == 2
