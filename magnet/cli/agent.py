@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
-from magnet.files import require_place
 
 if TYPE_CHECKING:
     from magnet.agents.agent import Member
@@ -81,9 +80,6 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(f"--speed is {given.speed:g}, expected over 0 and at most 1, real time")
     if given.threads < 1:
         raise CommandError(f"--threads is {given.threads}, expected at least 1")
-    for out in (given.out, given.report):
-        if out is not None:
-            require_place(out)
     import torch
 
     from magnet.api import read

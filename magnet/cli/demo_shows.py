@@ -85,7 +85,6 @@ def run(options: argparse.Namespace) -> int:
     console = Console()
     began = time.perf_counter()
     out = Path(options.out)
-    require_place(out / f"{SHOWS[0].name}.npz")
     console.rule("magnet demo")
     model = Denoiser.load(options.ckpt_path)
     size = sum(p.numel() for p in model.transformer.parameters()) / 1e6

@@ -60,12 +60,10 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 
     Raises:
         CommandError: nothing writes its suffix, or it would take the place of an input.
-        CannotWrite: no file can be written there.
         ValueError: the size of a film cannot be.
         ImportError: what writes it is not installed.
     """
     from magnet.export import formats
-    from magnet.files import require_place
 
     path = Path(out)
     if path.suffix.lower() not in formats.WRITTEN:
@@ -79,7 +77,6 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
                 f"{path}: people and scenes get a .bvh each, and {each.name}, which is read, may be one of them; give "
                 "OUT another name"
             )
-    require_place(path)
     formats.require_writer(path, size)
     return path
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from magnet.cli.flags import PlainParser
-from magnet.files import require_place
 from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
@@ -74,9 +73,6 @@ def main(arguments: Sequence[str]) -> int:
     """
     options = arguments_of(arguments)
     _check(options)
-    for out in (options.html, options.record):
-        if out is not None:
-            require_place(out)
     if options.html is not None:
         return _write_page(options)
     stage = _live(options) if options.live else _watch(options)
