@@ -60,8 +60,8 @@ def errors(model: Denoiser, scene: Scene) -> dict[str, dict[str, float]]:
     """Of each precision against `reference`: share of the output, and centimetres (mean and 99 %, and of partners)."""
     truth = model.normalizer.normalize(model.tokenize(scene)[0])
     half, there = truth.shape[1] // 2, scene.present
-    each = networks(model.transformer)
-    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in each}
+    choices = networks(model.transformer)
+    found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in choices}
     for level in LEVELS:
         levels = torch.zeros(truth.shape[:3], dtype=torch.long)
         levels[:, half:] = level
@@ -69,7 +69,7 @@ def errors(model: Denoiser, scene: Scene) -> dict[str, dict[str, float]]:
         noisy = add_noise(truth, noise, model.layout.spread(model.layout.group_levels(levels)))
         whole = model.denoise(noisy, levels, there)
         exact, pairs = bodies(model, scene, whole)
-        for name, network in each.items():
+        for name, network in choices.items():
             made = model.denoise(noisy, levels, there, network=network)
             joints, other = bodies(model, scene, made)
             off = (joints - exact).norm(dim=-1)[:, 4 * half :].transpose(1, 2)[there]

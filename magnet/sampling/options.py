@@ -87,7 +87,8 @@ class SamplerOptions:
             the blocks in half precision or in 8-bit whole numbers, trades (docs/speed.md says what they cost in
             poses). On a processor without such instructions they round as much and are no faster.
         compile: the network's blocks by torch.compile, on a GPU, or on a CPU with `int8`; elsewhere it says that it
-            does not. The first evaluation waits for it, half a minute, in later runs ten seconds (docs/speed.md).
+            does not. Smoothing guidance and networks with `causal_block` go without and do not say so. The first
+            evaluation waits for it, half a minute, in later runs ten seconds (docs/speed.md).
     """
 
     steps: int = 16
