@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.export import formats
     from magnet.export.bones import BoneOptions
 
-    out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size))
+    out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size), not options.person)
     if options.context < 0:
         raise CommandError(f"--context {options.context}: expected 0 frames or more")
     given = dict(pair.partition("=")[::2] for pair in options.joint)
@@ -95,6 +95,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         scene = scene.select([options.scene])
     if options.person:
         scene = only(scene, options.person)
+    scene_files.require_unread(out, options.inputs, scene.present.sum(dim=1).tolist(), options.smplx)
     print(described(scene))
     written = formats.write(
         scene,

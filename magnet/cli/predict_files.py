@@ -90,17 +90,23 @@ def main(arguments: Sequence[str]) -> int:
     options = parser().parse_args(words)
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
-    for name, least in (("frames", 1), ("context", 0)):
+    for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
         value = getattr(options, name)
         if value is not None and value < least:
             raise CommandError(f"--{name} {value}: expected at least {least}")
-    outs = [scene_files.path_to_write(out, options.inputs, tuple(options.size)) for out in options.out]
+    size, one = tuple(options.size), options.samples == 1
+    outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     from magnet.api import Model
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.module import Denoiser
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
     recorded, body = read_files(options)  # before the model is loaded, so that what is not there is said at once
+    people = people_written(options, recorded)
+    for out in outs:
+        scene_files.require_unread(out, options.inputs, people)
+    if options.task not in (None, "generation"):  # of a crowd these are said later: it may change the task
+        task_of(options, groups["task"], ())
     model = Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
@@ -116,7 +122,7 @@ def main(arguments: Sequence[str]) -> int:
     given, plain = made.context, made.plain()
     if plain.scenes > 1 and scene.scenes == 1:
         plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
-    look: dict[str, Any] = {"style": options.style, "size": tuple(options.size), "context_frames": given}
+    look: dict[str, Any] = {"style": options.style, "size": size, "context_frames": given}
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
@@ -143,10 +149,8 @@ def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
     return empty_scene(1, TOKEN_FRAMES, 0, torch.zeros(())).replace(body=body.id), body
 
 
-def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[Scene, tuple[int, ...]]:
-    """The scene of all files with room for those who are made from nothing, and the slots of these.
-
-    A crowd is composed of the files' people, again and again, or of couples that the model makes.
+def people_written(options: argparse.Namespace, scene: Scene) -> list[int]:
+    """How many people are there in each scene that will be written.
 
     Raises:
         CommandError: no files and no people, or fewer people than files hold.
@@ -154,6 +158,19 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
     people = scene.agents if options.people is None else options.people
     if people < max(scene.agents, 1):
         raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
+    there: list[int] = scene.present.sum(dim=1).tolist()
+    return [count + people - scene.agents for count in there for _ in range(options.samples)]
+
+
+def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[Scene, tuple[int, ...]]:
+    """The scene of all files with room for those who are made from nothing, and the slots of these.
+
+    A crowd is composed of the files' people, again and again, or of couples that the model makes.
+
+    Raises:
+        CommandError: a crowd of which nothing is given.
+    """
+    people = scene.agents if options.people is None else options.people
     if people > max(model.most_people, scene.agents):
         if options.context is None:
             options.context = CONTEXT

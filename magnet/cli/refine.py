@@ -64,6 +64,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.plot and Path(options.plot).suffix.lower() != ".svg":
         raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
     got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
+    scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
     formats.require_finite(got.scene)
     if not got.scene.frames:
         raise CommandError(f"{options.inputs[0]}: holds no frames, so there is nothing to refine")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,12 +50,13 @@ PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metav
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
-def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None) -> Path:
+def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None, whole: bool = True) -> Path:
     """OUT, which can be written: known before anything is made for it.
 
     Args:
-        inputs: files that are read. One that OUT does not name, but would write, is not overwritten.
+        inputs: files that are read. Who else is in them is not known yet: `require_unread` knows.
         size: pixels of a film's panel.
+        whole: OUT holds one scene of everybody in the inputs.
 
     Raises:
         CommandError: nothing writes its suffix, or it would take the place of an input.
@@ -69,16 +69,35 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
     if path.suffix.lower() not in formats.WRITTEN:
         known = ", ".join(formats.WRITTEN)
         raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
-    also = re.compile(re.escape(path.stem) + r"(_scene\d+)?(_\d+)?\.bvh", re.IGNORECASE)
-    for each in map(Path, inputs) if path.suffix.lower() == ".bvh" else ():
-        beside = each.parent.resolve() == path.parent.resolve() and each.name != path.name
-        if beside and also.fullmatch(each.name):
-            raise CommandError(
-                f"{path}: people and scenes get a .bvh each, and {each.name}, which is read, may be one of them; give "
-                "OUT another name"
-            )
+    if whole and len(inputs) > 1:  # several files are as many people, or more
+        require_unread(path, inputs, [len(inputs)])
     formats.require_writer(path, size)
     return path
+
+
+def require_unread(path: Path, inputs: Sequence[str], people: Sequence[int], smplx: bool = False) -> None:
+    """Refuse to write over an input that OUT does not name: people and scenes may get a file each.
+
+    Args:
+        path: OUT.
+        inputs: files that are read.
+        people: how many are there in each scene that is written.
+        smplx: as for `formats.write`.
+
+    Raises:
+        CommandError: names the input.
+    """
+    from magnet.export import formats
+
+    read = [each for each in map(Path, inputs) if each.exists()]
+    for file in formats.files_of(path, people, smplx):
+        named = file == path or (path.exists() and file.exists() and file.samefile(path))
+        for each in read if file.exists() and not named else ():
+            if file.samefile(each):
+                raise CommandError(
+                    f"{path}: people and scenes get a {path.suffix.lower()} each, and {each.name}, which is read, "
+                    "would be one of them; give OUT another name"
+                )
 
 
 def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:

@@ -58,12 +58,10 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
     people = scene.people()
     if not people.scenes:
         raise ValueError("nobody is present in the scene, so there is no skeleton to write")
-    path = Path(path).with_suffix(".bvh")
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    several = people.scenes > 1
     written = []
-    for p in range(people.scenes):
-        each = path.with_name(f"{path.stem}_{p}.bvh") if several else path
+    for p, each in enumerate(paths_of(path, people.scenes)):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)
@@ -77,6 +75,12 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
         each.write_text(bvh_text(JOINT_NAMES, PARENTS, offsets, tips, ROTATIONS, rows, scene.fps))
         written.append(each)
     return written
+
+
+def paths_of(path: Path, people: int) -> list[Path]:
+    """The files of so many people: out_0.bvh, out_1.bvh ..., or the path itself for one person."""
+    path = path.with_suffix(".bvh")
+    return [path] if people == 1 else [path.with_name(f"{path.stem}_{p}.bvh") for p in range(people)]
 
 
 def offsets_of(rest: Tensor) -> Tensor:

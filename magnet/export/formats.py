@@ -12,7 +12,7 @@ from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import level
 from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
-from magnet.export.bvh import Unit, save_bvh
+from magnet.export.bvh import Unit, paths_of, save_bvh
 from magnet.export.cast import Style
 from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
@@ -315,10 +315,29 @@ def write(
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
     options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size)
-    if scene.scenes == 1 or (kind.batch and not apart):
+    places = places_of(path, scene.scenes, smplx)
+    if len(places) == 1:
         return list(kind.write(scene, path, options))
-    places = [path.with_name(f"{path.stem}_scene{b}{suffix}") for b in range(scene.scenes)]
     return [made for b, place in enumerate(places) for made in kind.write(scene.select([b]), place, options)]
+
+
+def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
+    """Where `write` puts so many scenes: in one file, or in a file each; several people of a .bvh have files of theirs.
+
+    path, smplx: as for `write`.
+    """
+    together = WRITTEN[path.suffix.lower()].batch and not (smplx and path.suffix.lower() == ".npz")
+    if scenes == 1 or together:
+        return [path]
+    return [path.with_name(f"{path.stem}_scene{b}{path.suffix.lower()}") for b in range(scenes)]
+
+
+def files_of(path: Path, people: Sequence[int], smplx: bool = False) -> list[Path]:
+    """The files that `write` writes, known before there is a scene. people: how many are there in each scene"""
+    places = places_of(path, len(people), smplx)
+    if path.suffix.lower() != ".bvh":
+        return places
+    return [file for place, count in zip(places, people, strict=True) for file in paths_of(place, count)]
 
 
 def require_finite(scene: Scene) -> None:

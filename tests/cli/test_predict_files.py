@@ -130,7 +130,20 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
     assert not meant(["generation"]) and not meant(["--help"]) and meant(["--help", "files"])
 
 
-def test_a_file_that_is_not_there_is_said_before_a_model_is_loaded(tmp_path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.npz"], "none.npz: no such file"),
+        (["OURS", "none.txt"], "expected .npz or .bvh files"),
+        (["OURS", "--people", "1"], "--people 1: expected at least 2"),
+        (["OURS", "--task", "joint_futur"], "did you mean joint_future?"),
+        (["OURS", "--task", "inbetweening", "--task.evry", "3"], "did you mean --task.every?"),
+    ],
+)
+def test_what_is_wrong_without_a_model_is_said_before_one_is_loaded(
+    words: list[str], message: str, duet, tmp_path, monkeypatch, capsys
+) -> None:
     monkeypatch.setattr(Denoiser, "load", lambda *_: pytest.fail("a model was loaded"))
-    assert cli.main(["predict", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out.npz")]) != 0
-    assert "none.npz" in capsys.readouterr().err
+    words = [duet["ours"][0] if word == "OURS" else word for word in words]
+    assert cli.main(["predict", *words, "--out", str(tmp_path / "out.npz")]) != 0
+    assert message in capsys.readouterr().err

@@ -52,6 +52,40 @@ def test_files_that_are_read_are_not_written_over_unless_they_are_named(
     assert before == [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
 
 
+@pytest.mark.parametrize("command", ["refine", "export"])
+def test_one_person_takes_out_alone_whatever_the_input_is_called(
+    command: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = Path("take_0.bvh").read_bytes()
+    assert cli.main([command, "take_0.bvh", "take.bvh"]) == 0
+    assert cli.main(["export", "take_0.bvh", "take_1.bvh", "take.bvh", "--person", "0"]) == 0
+    assert "written: take.bvh" in capsys.readouterr().out
+    assert Path("take_0.bvh").read_bytes() == before
+
+
+def test_an_input_is_safe_from_people_who_are_counted_only_when_it_is_read(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A partner is added, samples get a file each, and so do scenes of SMPL-X's keys."""
+    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    scene = Scene.load("duet.npz")
+    scene.repeat(2).replace(names=()).save("two_scene1.npz")
+    save_bvh(scene, "take_scene1.bvh", load_body())
+    for read, *words in (
+        ("take_0.bvh", "predict", "--people", "2", "--out", "take.bvh"),
+        ("take_scene1_0.bvh", "predict", "--people", "2", "--samples", "2", "--out", "take.bvh"),
+        ("two_scene1.npz", "export", "two.npz", "--smplx"),
+    ):
+        before = Path(read).read_bytes()
+        assert f"{read}, which is read" in refused(capsys, words[0], read, *words[1:])
+        assert Path(read).read_bytes() == before
+
+
+def test_a_link_to_what_is_read_is_not_written_over(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("linked_1.bvh").symlink_to("take_0.bvh")
+    assert "take_0.bvh, which is read" in refused(capsys, "refine", "take_0.bvh", "take_1.bvh", "linked.bvh")
+
+
 def test_a_file_that_is_named_may_be_written_over_and_a_numbered_npz_is_none_of_many(
     folder: Path,
 ) -> None:
@@ -68,6 +102,7 @@ def test_a_file_that_is_named_may_be_written_over_and_a_numbered_npz_is_none_of_
         (["--out", "o.npz", "--frames", "0"], "--frames 0: expected at least 1"),
         (["--out", "o.npz", "--frames", "-4"], "--frames -4: expected at least 1"),
         (["--out", "o.npz", "--context", "-4"], "--context -4: expected at least 0"),
+        (["--out", "o.npz", "--samples", "0"], "--samples 0: expected at least 1"),
         (["--out", "o.npz", "--people", "5", "--context", "0"], "--context 0: a crowd goes on"),
         (["--out", "o.npz", "--people", "201"], "got 201, expected 1 to 200"),
     ],
