@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.files import load_npz
-from magnet.motion.scene import Scene, cat_time
+from magnet.motion.scene import Scene, cat_time, require_rotations
 
 FORMAT = 1
 
@@ -88,6 +88,7 @@ class DenoisingTrace:
                 names=tuple(meta["names"]),
                 given=arrays.get("given"),
             )
+            require_rotations(scene, "its sample")
             R = len(arrays["levels"])
             estimates = scene.repeat(R).replace(
                 body_rot=arrays["estimate_body_rot"].float(), T_world_root=arrays["estimate_T_world_root"], names=()

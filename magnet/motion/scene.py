@@ -236,7 +236,12 @@ class Scene:
             raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error
         if version > SCENE_FORMAT:
             raise ValueError(f"{path}: scene format {version}, this version reads up to {SCENE_FORMAT}")
-        scene = Scene(**arrays)
+        if missing := [name for name in TENSORS[:4] if name not in arrays]:
+            raise ValueError(f"{path}: not a scene file (it lacks {', '.join(missing)}); write one with Scene.save")
+        try:
+            scene = Scene(**arrays)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
         require_rotations(scene, str(path))
         return scene
 
@@ -247,17 +252,21 @@ def require_rotations(scene: Scene, name: str) -> None:
     Raises:
         ValueError: says which is the first.
     """
-    root = scene.T_world_root[..., None, :3, :3]
-    turns = torch.cat([root, scene.body_rot], dim=3).float()  # (B, T, P, joints, 3, 3)
+    root = scene.T_world_root[..., None, :, :].float()
+    turns = torch.cat([root[..., :3, :3], scene.body_rot.float()], dim=3)  # (B, T, P, joints, 3, 3)
     off = (turns.mT @ turns - torch.eye(3, device=turns.device)).abs().amax(dim=(-2, -1))
-    wrong = (off > NO_ROTATION) | (torch.linalg.cross(turns[..., 0], turns[..., 1]) * turns[..., 2]).sum(-1).lt(0)
+    low = (root[..., 3, :] - torch.eye(4, device=root.device)[3]).abs().amax(dim=-1) > NO_ROTATION
+    wrong = ~(off <= NO_ROTATION) & turns.flatten(4).isfinite().all(dim=-1)  # also of what is too large to be squared
+    wrong |= (torch.linalg.cross(turns[..., 0], turns[..., 1]) * turns[..., 2]).sum(-1).lt(0)
+    wrong[..., :1] |= low
     wrong &= scene.present[:, None, :, None]
     if scene.valid is not None:
         wrong &= scene.valid[:, :, None, None]
     if bool(wrong.any()):
         b, frame, person, joint = wrong.nonzero()[0].tolist()
-        field = "T_world_root" if joint == 0 else f"body_rot of joint {joint}"
-        raise ValueError(f"{name}: {field} is no rotation (scene {b}, frame {frame}, person {person})")
+        field = f"body_rot of joint {joint}" if joint else "T_world_root"
+        more = ", whose last row is not 0 0 0 1," if not joint and bool(low[b, frame, person]) else ""
+        raise ValueError(f"{name}: {field}{more} is no rotation (scene {b}, frame {frame}, person {person})")
 
 
 def empty_scene(scenes: int, frames: int, agents: int, like: Tensor) -> Scene:

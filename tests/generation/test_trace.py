@@ -1,5 +1,6 @@
 """Recorded denoising steps."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,13 @@ def test_steps_may_be_left_out_but_not_the_last_of_a_window(model, start) -> Non
     few = record(model, start, JointFuture(), 16, 16, options, generator(), every=10)
     assert few.steps < record(model, start, JointFuture(), 16, 16, options, generator()).steps
     assert bool((few.levels[-1] == 0).all())
+
+
+def test_a_recording_whose_matrices_do_not_rotate_is_refused(model, start, tmp_path: Path) -> None:
+    recording = record(model, start, JointFuture(), 16, 4, SamplerOptions(steps=1), generator())
+    scaled = replace(recording, scene=recording.scene.replace(body_rot=2 * recording.scene.body_rot))
+    with pytest.raises(ValueError, match=r"steps\.npz: not a recording.*body_rot of joint 1 is no rotation"):
+        DenoisingTrace.load(scaled.save(tmp_path / "steps.npz"))
 
 
 def test_saved_and_read_back_it_is_the_same(model, start, tmp_path: Path) -> None:

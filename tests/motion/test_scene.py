@@ -178,3 +178,25 @@ def test_a_file_whose_matrices_do_not_rotate_is_refused(scene: Scene, tmp_path, 
         valid[0, 3] = nobody is not scene.present  # who is absent, and frames that do not count, hold anything
         told = scene.replace(**{field: wrong, "present": nobody, "valid": valid})
         assert Scene.load(told.save(tmp_path / "told.npz")).frames == scene.frames
+
+
+def test_other_matrices_that_no_program_meant_are_refused(scene: Scene, tmp_path) -> None:
+    huge, turned = scene.body_rot.clone(), scene.T_world_root.clone()
+    huge[0, 3, 1, 4] = 1e30  # whose square is not finite
+    turned[0, 3, 1] = turned[0, 3, 1].T.clone()
+    for field, wrong in (("body_rot", huge), ("T_world_root", turned)):
+        path = scene.replace(**{field: wrong}).save(tmp_path / "spoiled.npz")
+        with pytest.raises(ValueError, match=rf"{field}.* is no rotation \(scene 0, frame 3, person 1\)"):
+            Scene.load(path)
+    huge[0, 3, 1, 4] = torch.nan
+    assert Scene.load(scene.replace(body_rot=huge).save(tmp_path / "unknown.npz")).frames == scene.frames
+
+
+def test_a_file_that_lacks_a_field_or_has_another_shape_is_named(scene: Scene, tmp_path) -> None:
+    held = dict(np.load(scene.save(tmp_path / "whole.npz")))
+    np.savez(tmp_path / "part.npz", **{name: value for name, value in held.items() if name != "betas"})
+    with pytest.raises(ValueError, match=r"part\.npz: not a scene file \(it lacks betas\)"):
+        Scene.load(tmp_path / "part.npz")
+    np.savez(tmp_path / "cut.npz", **{**held, "betas": held["betas"][:, :1]})
+    with pytest.raises(ValueError, match=r"cut\.npz: betas: got"):
+        Scene.load(tmp_path / "cut.npz")
