@@ -95,6 +95,10 @@ def main(arguments: Sequence[str] = ()) -> int:
         scene = scene.select([options.scene])
     if options.person:
         scene = only(scene, options.person)
+    if options.context > scene.frames:
+        raise CommandError(
+            f"--context {options.context}: got {scene.frames} frames, so at most {scene.frames} were given"
+        )
     scene_files.require_unread(out, options.inputs, scene.present.sum(dim=1).tolist(), options.smplx)
     print(described(scene))
     written = formats.write(
