@@ -76,6 +76,22 @@ def _space(path: Path) -> str:
         return ""
 
 
+def require_place(path: str | Path) -> None:
+    """Refuse a path at which no file can be written, before what it is to hold is made.
+
+    Raises:
+        CannotWrite: a folder lies there, what should be its folder is a file, or it may not be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise CannotWrite(f"{path}: is a folder, expected the name of a file")
+    there = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if there is not path and not there.is_dir():
+        raise CannotWrite(f"{path}: {there} is a file, expected a folder")
+    if not os.access(there, os.W_OK):
+        raise CannotWrite(f"{path}: {there} may not be written to; give yourself the right to, or choose another place")
+
+
 class HashedFile:
     """Hashes a file while it is written, and keeps an error that a library may replace by its own."""
 

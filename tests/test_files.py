@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from magnet import files
-from magnet.files import CannotWrite, inside, load_npz, regular, write_whole, writing
+from magnet.files import CannotWrite, inside, load_npz, regular, require_place, write_whole, writing
 
 HERE = "choose another --out"
 
@@ -34,6 +34,14 @@ def test_a_place_that_takes_no_files_is_named_and_other_errors_stay_as_they_are(
         with pytest.raises(OSError) as caught, writing(tmp_path / "store", HERE):
             raise other
         assert caught.value is other
+
+
+def test_a_place_is_known_before_there_is_anything_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    require_place(tmp_path / "new" / "folder" / "file")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(CannotWrite, match=r"file: .* may not be written to; give yourself the right to"):
+        require_place(tmp_path / "new" / "file")
 
 
 def test_a_real_full_device_is_told_as_such() -> None:

@@ -83,7 +83,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     import torch
 
     from magnet.api import read
+    from magnet.files import require_place
 
+    for out in filter(None, (given.out, given.report)):  # written when it is over
+        require_place(out)
     torch.set_num_threads(given.threads)
     start = read(given.scene).plain()
     names = tuple(given.names.split(",")) if given.names else tuple(string.ascii_uppercase[: start.agents])

@@ -22,6 +22,7 @@ from magnet.evaluation.evaluator import Evaluator, aligned
 from magnet.evaluation.results import Results
 from magnet.export.picture import contact_sheet
 from magnet.export.video import render_video
+from magnet.files import require_place
 from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene
 from magnet.sampling.options import SamplerOptions
@@ -85,6 +86,7 @@ def run(options: argparse.Namespace) -> int:
     console = Console()
     began = time.perf_counter()
     out = Path(options.out)
+    require_place(out / f"{SHOWS[0].name}.npz")
     console.rule("magnet demo")
     model = Denoiser.load(options.ckpt_path)
     size = sum(p.numel() for p in model.transformer.parameters()) / 1e6

@@ -57,12 +57,15 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body.apart import APART
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.export import formats
+    from magnet.files import require_place
 
     out = scene_files.path_to_write(options.out, options.inputs)
     if not 0 <= options.slides < float("inf"):
         raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
     if options.plot and Path(options.plot).suffix.lower() != ".svg":
         raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
+    if options.plot:
+        require_place(options.plot)
     got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
     scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
     formats.require_finite(got.scene)

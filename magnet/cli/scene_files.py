@@ -60,10 +60,12 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 
     Raises:
         CommandError: nothing writes its suffix, or it would take the place of an input.
+        CannotWrite: no file can be written there.
         ValueError: the size of a film cannot be.
         ImportError: what writes it is not installed.
     """
     from magnet.export import formats
+    from magnet.files import require_place
 
     path = Path(out)
     if path.suffix.lower() not in formats.WRITTEN:
@@ -71,6 +73,7 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
         raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
     if whole and len(inputs) > 1:  # several files are as many people, or more
         require_unread(path, inputs, [len(inputs)])
+    require_place(path)
     formats.require_writer(path, size)
     return path
 

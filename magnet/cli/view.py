@@ -73,6 +73,10 @@ def main(arguments: Sequence[str]) -> int:
     """
     options = arguments_of(arguments)
     _check(options)
+    from magnet.files import require_place
+
+    for out in filter(None, (options.html, options.record)):
+        require_place(out)
     if options.html is not None:
         return _write_page(options)
     stage = _live(options) if options.live else _watch(options)

@@ -21,7 +21,7 @@ from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.retarget import load_bvh, together
 from magnet.export.usd import require_usd, save_usd
-from magnet.files import load_npz
+from magnet.files import load_npz, regular
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 
@@ -75,14 +75,18 @@ def read(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a file that cannot be read, or files that do not go together; says what to do.
+        ValueError: what cannot be read, or files that do not go together; says what to do.
     """
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     options = options or Reading()
     suffixes = {file.suffix.lower() for file in files}
     if len(suffixes) != 1 or not suffixes <= set(READ):
-        names = ", ".join(file.name for file in files) or "nothing"
+        names = ", ".join(file.name or str(file) for file in files) or "nothing"
         raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind")
+    for file in files:
+        if not file.exists():
+            raise FileNotFoundError(f"{file}: no such file")
+        regular(file)
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
     if suffixes == {".bvh"}:
         imported = load_bvh(files, body, **vars(options))
@@ -130,8 +134,6 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
 
 def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str], bool]:
     """A scene of ours or SMPL-X's keys, told apart by what they hold; notes; whether other programs wrote it."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
     try:

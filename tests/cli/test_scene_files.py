@@ -129,6 +129,41 @@ def test_a_format_whose_writer_is_not_here_is_refused_first(
         assert needs in refused(capsys, "predict", "--people", "2", "--out", f"o{suffix}")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["predict", "duet.npz", "--out", "OUT.npz"],
+        ["export", "duet.npz", "OUT.npz"],
+        ["refine", "duet.npz", "OUT.npz"],
+        ["refine", "duet.npz", "o.npz", "--plot", "OUT.svg"],
+        ["view", "duet.npz", "--html", "OUT.html"],
+        ["view", "duet.npz", "--record", "OUT.npz"],
+        ["agent", "--name", "A", "--scene", "duet.npz", "--listen", "tcp://127.0.0.1:0", "--report", "OUT.json"],
+        ["demo", "--out", "OUT"],
+    ],
+    ids=lambda words: " ".join(words[:1] + words[-2:-1]),
+)
+def test_a_place_that_takes_no_file_is_said_before_anything_is_made(
+    words: list[str], folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr("magnet.body.repair.repaired", lambda *_, **__: pytest.fail("computed"))
+    Path("file").write_text("no folder")
+    names = [word.replace("OUT", "file/out") for word in words]
+    assert "file is a file, expected a folder" in refused(capsys, *names)
+    if words[0] != "demo":
+        name = next(word for word in words if "OUT" in word)
+        Path(name).mkdir()
+        assert f"{name}: is a folder" in refused(capsys, *words)
+
+
+def test_a_folder_is_not_called_missing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("dir.npz", "dir.bvh"):
+        Path(name).mkdir()
+        assert f"{name}: is a folder, expected a file" in refused(capsys, "export", name, "o.glb")
+    assert "cannot read .:" in refused(capsys, "export", ".", "o.glb")
+
+
 BROKEN: dict[str, Callable[[Scene], Scene]] = {
     "betas": lambda scene: scene.replace(betas=scene.betas.clone().index_fill_(2, torch.tensor([3]), torch.nan)),
     "T_world_root": lambda scene: scene.replace(T_world_root=scene.T_world_root.clone().fill_(torch.nan)),
