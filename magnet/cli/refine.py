@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from magnet.body import Body
+    from magnet.export.formats import Read
     from magnet.motion.scene import Scene
 
 EPILOG = """\
@@ -27,6 +28,7 @@ for example:
   magnet refine leader.bvh follower.bvh couple.glb --keep 0
   magnet refine dance.bvh held.bvh --hands hold
   magnet refine duet.npz better.npz --plot over_time.svg
+  magnet refine duet.npz swapped.npz --shapes exchange   # on each other's bodies, with the same hands held
   magnet refine smplx.npz apart.npz --poses keep   # people are moved over the ground as a whole, and that is all
 """
 
@@ -41,6 +43,8 @@ def parser() -> argparse.ArgumentParser:
     hands = "hold: hands that met hold until they are 60 cm apart; firm alone (default: %(default)s)"
     add("--hands", choices=("keep", "hold"), default="keep", help=hands)
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
+    shapes = "people get the bodies of those in FILE, or exchange theirs; steps stay, and hands that hold"
+    add("--shapes", metavar="FILE|exchange", help=shapes)
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
     add("--poses", choices=("correct", "keep"), default="correct", help=poses)
     slides = "low toes slower than this, in m/s, shall stand still; 0: feet may slide (default: %(default)s)"
@@ -52,9 +56,11 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code."""
     options = parser().parse_args(list(arguments))
+    from dataclasses import replace
     from pathlib import Path
 
     from magnet.body.apart import APART
+    from magnet.body.other_shapes import with_shapes
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.export import formats
     from magnet.files import require_place
@@ -62,6 +68,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     out = scene_files.path_to_write(options.out, options.inputs)
     if not 0 <= options.slides < float("inf"):
         raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
+    if options.shapes and (options.keep or options.poses == "keep"):
+        raise CommandError("--shapes: changes everybody's pose; leave out --keep and --poses keep")
     if options.plot and Path(options.plot).suffix.lower() != ".svg":
         raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
     if options.plot:
@@ -82,21 +90,46 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.hands == "hold" and (options.apart, options.poses) != ("firm", "correct"):
         raise CommandError("--hands hold: goes with --apart firm and --poses correct, the defaults")
     how = "hold" if options.hands == "hold" else options.apart
+    before = got.scene
+    if options.shapes:
+        got = replace(got, scene=with_shapes(got.scene, shapes_of(options, got), got.body))
     fixed = fixed_agents(got.scene, options.keep)
     if options.poses == "keep":
         refined = moved_apart(got.scene, got.body, APART[options.apart], fixed)
     else:
         refined = repaired(got.scene, got.body, how, fixed, slides=options.slides)
-    for title, scene in (("before", got.scene), ("after", refined)):
+    for title, scene in (("before", before), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
         plot = Path(options.plot)
-        before, after = (by_frame(scene, got.body) for scene in (got.scene, refined))
+        was, now = (by_frame(scene, got.body) for scene in (before, refined))
         plot.parent.mkdir(parents=True, exist_ok=True)
-        plot.write_text(drawn(before, after, got.scene.fps), encoding="utf-8")
+        plot.write_text(drawn(was, now, got.scene.fps), encoding="utf-8")
         scene_files.say_written([plot])
     return 0
+
+
+def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
+    """The shapes that --shapes says, for everybody. -> (B, P, 10)
+
+    Raises:
+        CommandError: the file's people are too few, or its shapes are of another body.
+    """
+    from magnet.export import formats
+
+    scene = got.scene
+    if options.shapes == "exchange":
+        if scene.agents < 2 or not bool(scene.present.all()):
+            raise CommandError("--shapes exchange: expected two people or more, who are there in all scenes")
+        return scene.betas.roll(1, dims=1)
+    other = formats.read(options.shapes, options.body).scene
+    if other.body != scene.body:
+        raise CommandError(f"--shapes {options.shapes}: its shapes are of body {other.body}, not of {scene.body}")
+    betas = other.betas[0, other.present[0]]
+    if len(betas) < scene.agents:
+        raise CommandError(f"--shapes {options.shapes}: holds {len(betas)} people, expected {scene.agents} or more")
+    return betas[: scene.agents].expand(scene.scenes, -1, -1)
 
 
 def told(scene: Scene, body: Body) -> str:

@@ -20,6 +20,7 @@ BUILT_IN = (
     "synthetic",
     "cmu",
     "mixed",
+    "reshaped",
     "solo_pairs",
     "prepared",
     "duobox",

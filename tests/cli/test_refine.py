@@ -107,3 +107,25 @@ def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene
     assert all(len(points.split()) == 40 for points, _ in lines)
     heights = [float(point.partition(",")[2]) for point in lines[0][0].split()]
     assert min(heights) < 0.5 * (42 + 162), "the deepest reaches the top of its strip"
+
+
+def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = synthesize("handshake", 2, 120, torch.Generator().manual_seed(0), load_body()).scene.slice(40, 100)
+    betas = torch.zeros(1, 2, 10)
+    betas[0, 0, 0], betas[0, 1, 0] = 1.5, -1.5
+    ours, out = scene.replace(betas=betas).save(tmp_path / "ours.npz"), tmp_path / "out.npz"
+    assert cli.main(["refine", str(ours), str(out), "--shapes", "exchange"]) == 0
+    assert torch.equal(Scene.load(out).betas, betas.flip(1))
+    plain = scene.save(tmp_path / "plain.npz")
+    assert cli.main(["refine", str(plain), str(out), "--shapes", str(ours)]) == 0
+    assert torch.equal(Scene.load(out).betas, betas)
+    one = scene.permute_agents(torch.tensor([0])).save(tmp_path / "one.npz")
+    capsys.readouterr()
+    for words, message in (
+        ([str(ours), "--shapes", str(one)], "holds 1 people, expected 2 or more"),
+        ([str(one), "--shapes", "exchange"], "expected two people or more"),
+        ([str(ours), "--shapes", "exchange", "--keep", "0"], "changes everybody's pose"),
+        ([str(ours), "--shapes", str(tmp_path / "none.npz")], "no such file"),
+    ):
+        assert cli.main(["refine", words[0], str(out), *words[1:]]) != 0
+        assert message in capsys.readouterr().err
