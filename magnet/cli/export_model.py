@@ -35,6 +35,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     out = Path(options.out)
     if out.suffix.lower() != ".onnx":
         raise CommandError(f"{out.name}: got {out.suffix or 'no suffix'}, expected .onnx")
+    from magnet.files import require_place
+
+    require_place(out)
     from magnet import checkpoints
     from magnet.denoiser.module import Denoiser
     from magnet.denoiser.portable import OPSET, save_onnx

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from magnet.motion.scene import Scene
     from magnet.sampling.options import SamplerOptions
 
-READ = (".npz", ".bvh")
 CONTEXT = 32
 """Frames that are given of everybody where nothing is said, as in the tests of tasks: a second."""
 FUTURE = 150
@@ -51,7 +50,7 @@ def meant(arguments: Sequence[str]) -> bool:
     first = arguments[0] if arguments else ""
     about_help = list(arguments[:2]) == ["--help", "files"] or first == "--help=files"
     people = any(argument.partition("=")[0] == "--people" for argument in arguments)
-    return about_help or people or (not first.startswith("-") and Path(first).suffix.lower() in READ)
+    return about_help or people or (not first.startswith("-") and Path(first).suffix != "")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -246,8 +245,8 @@ def lengths(
 
     crowd = scene.agents > model.most_people
     nothing = bool(added) or not (options.inputs or crowd)
-    context = options.context if options.context is not None else 0 if nothing else CONTEXT
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
+    context = options.context if options.context is not None else 0 if nothing else min(CONTEXT, recorded)
     if options.inputs and not recorded:
         raise CommandError(f"the files hold {scene.frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
     if context > recorded:

@@ -54,7 +54,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.cli.train import quiet
     from magnet.evaluation.benchmark import Benchmark, BenchmarkTakes, write_inputs
     from magnet.evaluation.submission import Submission
+    from magnet.files import require_place
 
+    for out in filter(None, (given.inputs, given.example, given.out / "table" if given.files else None)):
+        require_place(out)
     quiet()
     benchmark = Benchmark.read()
     benchmark.task(given.task)

@@ -181,9 +181,16 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
     from magnet.cli import checkpoint_config
     from magnet.denoiser.module import Denoiser
     from magnet.generation.trace import record
+    from magnet.motion.tokens import TOKEN_FRAMES
+    from magnet.sampling.grid import Grid
     from magnet.tasks import registry
 
     task = registry.get(options.task)()
+    given = options.context // TOKEN_FRAMES
+    try:  # before a model is loaded
+        task.schedule(Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
+    except ValueError as error:
+        raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
     model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
     generator = torch.Generator().manual_seed(options.seed)
     sampler = sampler_options(options)

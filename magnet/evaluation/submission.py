@@ -80,6 +80,8 @@ class Submission:
             ValueError: it is no submission to this benchmark; says what it has and what is expected.
         """
         path = Path(path)
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such file")
         try:
             with load_npz(path, KEYS) as file:
                 lacking = [key for key in KEYS if key not in file.files]

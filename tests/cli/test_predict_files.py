@@ -68,6 +68,12 @@ def test_a_person_alone_gets_a_partner(duet, tmp_path, capsys) -> None:
     assert (body.joints(made)[0, :, 0] - body.joints(recorded)[0, :, 1]).abs().max() < 1e-3
 
 
+def test_a_short_file_is_given_whole(duet, tmp_path, capsys) -> None:
+    Scene.load(duet["ours"][0]).slice(0, 14).save(tmp_path / "short.npz")
+    said(capsys, str(tmp_path / "short.npz"), "--frames", "4", "--out", str(tmp_path / "out.npz"), *QUICK)
+    assert Scene.load(tmp_path / "out.npz").frames == 12 + 4, "in whole tokens"
+
+
 def test_the_seed_decides_and_several_kinds_are_written(duet, tmp_path, capsys) -> None:
     made = []
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -105,6 +111,7 @@ def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
             ("BVH --out a.npz --task partner_inpaintin", "did you mean partner_inpainting?"),
             ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
             ("none.bvh --out a.npz", "none.bvh"),
+            ("one.npz --task partner_inpainting --out a.npz", "`magnet predict --people 2` adds another"),
             ("--task joint_future a.bvh", "files come first"),
         ],
         4,
@@ -114,6 +121,7 @@ def test_a_mistake_is_answered_by_what_would_be_right(
     words: str, message: str, duet, tmp_path, capsys, monkeypatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Scene.load(duet["ours"][0]).permute_agents(torch.tensor([0])).save("one.npz")
     assert (
         cli.main(["predict", *[part for word in words.split() for part in (duet["bvh"] if word == "BVH" else [word])]])
         == 2
@@ -136,6 +144,7 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
         (["none.npz"], "none.npz: no such file"),
         (["OURS", "none.txt"], "expected .npz or .bvh files"),
         (["OURS", "--people", "1"], "--people 1: expected at least 2"),
+        (["motion.fbx"], "cannot read motion.fbx: expected .npz or .bvh files"),
         (["OURS", "--task", "joint_futur"], "did you mean joint_future?"),
         (["OURS", "--task", "inbetweening", "--task.evry", "3"], "did you mean --task.every?"),
     ],

@@ -140,6 +140,9 @@ def test_a_format_whose_writer_is_not_here_is_refused_first(
         ["view", "duet.npz", "--record", "OUT.npz"],
         ["agent", "--name", "A", "--scene", "duet.npz", "--listen", "tcp://127.0.0.1:0", "--report", "OUT.json"],
         ["demo", "--out", "OUT"],
+        ["export-model", "OUT.onnx"],
+        ["bench", "--out", "OUT.json"],
+        ["score", "--example", "OUT.npz"],
     ],
     ids=lambda words: " ".join(words[:1] + words[-2:-1]),
 )

@@ -14,7 +14,7 @@ from magnet import cli
     ("words", "said"),
     [
         ((), "nothing to score: name files"),
-        (("none.npz",), "none.npz"),
+        (("none.npz",), "none.npz: no such file"),
         (("--inputs", "in.npz", "--task", "dance"), "task: got 'dance', expected one of joint_future"),
         (("a.npz",), "a.npz: lacks benchmark, task, method, fps, scenes; it has joints"),
         (("--inputs", "in.npz", "--root", "nowhere"), "nowhere: no such folder"),

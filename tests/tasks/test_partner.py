@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -84,6 +86,8 @@ def test_targets_must_exist_and_leave_somebody():
         PartnerInpainting((5,)).schedule(GRID)
     with pytest.raises(ValueError, match="not none and not all"):
         PartnerInpainting((0, 1, 2)).schedule(GRID)
+    with pytest.raises(ValueError, match="--people 2` adds another"):
+        PartnerInpainting().schedule(replace(GRID, agents=1))
     with pytest.raises(ValueError, match="offset: got 2"):
         AgenticAsync(2).schedule(GRID)
     with pytest.raises(ValueError, match="at most once"):

@@ -137,6 +137,15 @@ def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_a_recording_that_needs_a_past_is_refused_before_a_model_is_loaded(
+    tmp_path: Path, duet: Scene, capsys, monkeypatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    path = duet.save(tmp_path / "a.npz")
+    assert main(["view", str(path), "--record", str(tmp_path / "r.npz"), "--port", "0"]) == 2
+    assert "--record, of which --context 0 frames are given: joint_future" in capsys.readouterr().err
+
+
 def test_live_takes_few_steps_unless_something_is_said() -> None:
     """A sampler that is named is taken as it is."""
     assert sampler_options(arguments_of(["--live"])) == SamplerOptions(steps=10, apart="light")
