@@ -43,8 +43,8 @@ def parser() -> argparse.ArgumentParser:
     hands = "hold: hands that met hold until they are 60 cm apart; firm alone (default: %(default)s)"
     add("--hands", choices=("keep", "hold"), default="keep", help=hands)
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
-    shapes = "people get the bodies of those in FILE, or exchange theirs; steps stay, and hands that hold"
-    add("--shapes", metavar="FILE|exchange", help=shapes)
+    shapes = "people get the bodies of those in these files, or exchange theirs; steps stay, and hands that hold"
+    add("--shapes", nargs="+", metavar="FILE|exchange", help=shapes)
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
     add("--poses", choices=("correct", "keep"), default="correct", help=poses)
     slides = "low toes slower than this, in m/s, shall stand still; 0: feet may slide (default: %(default)s)"
@@ -119,16 +119,17 @@ def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
     from magnet.export import formats
 
     scene = got.scene
-    if options.shapes == "exchange":
+    if options.shapes == ["exchange"]:
         if scene.agents < 2 or not bool(scene.present.all()):
             raise CommandError("--shapes exchange: expected two people or more, who are there in all scenes")
         return scene.betas.roll(1, dims=1)
-    other = formats.read(options.shapes, options.body).scene
+    named = " ".join(options.shapes)
+    other = formats.read(options.shapes, options.body, formats.Reading(trim=True)).scene  # shapes have no length
     if other.body != scene.body:
-        raise CommandError(f"--shapes {options.shapes}: its shapes are of body {other.body}, not of {scene.body}")
+        raise CommandError(f"--shapes {named}: its shapes are of body {other.body}, not of {scene.body}")
     betas = other.betas[0, other.present[0]]
     if len(betas) < scene.agents:
-        raise CommandError(f"--shapes {options.shapes}: holds {len(betas)} people, expected {scene.agents} or more")
+        raise CommandError(f"--shapes {named}: holds {len(betas)} people, expected {scene.agents} or more")
     return betas[: scene.agents].expand(scene.scenes, -1, -1)
 
 

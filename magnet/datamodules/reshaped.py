@@ -37,7 +37,7 @@ class Reshaped(Parts):
     People keep their steps and the hands that they hold (`magnet.body.other_shapes.with_shapes`); so the same poses
     come with other distances, and place cannot be learnt by heart from poses. First people of a scene exchange their
     shapes, leader and follower; further scenes draw shapes from everybody in the training clips. Scenes are made once,
-    some 150 frames a second, and kept in a cache. Sources of clips, for `weights`: "cmu-couples-reshaped" and so on.
+    some 190 frames a second, and kept in a cache. Sources of clips, for `weights`: "cmu-couples-reshaped" and so on.
 
     Args:
         data: the data sets; their scenes of two and more people are used.
