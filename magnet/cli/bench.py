@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser, taken_out
-from magnet.files import require_place
 
 if TYPE_CHECKING:
     from magnet.denoiser.module import Denoiser
@@ -74,6 +73,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         if getattr(given, name) is not None and getattr(given, name) < 1:
             raise CommandError(f"--{name} is {getattr(given, name)}, expected at least 1")
     if given.out is not None:
+        from magnet.files import require_place  # imports NumPy, which --help need not wait for
+
         require_place(given.out)
     then = None if given.compare is None else read(given.compare)
     import torch

@@ -53,6 +53,25 @@ def test_what_is_kept_is_what_would_be_said_and_imports_nothing_heavy(tmp_path: 
             assert said[:3] == answered(words, tmp_path / "empty" / "_".join(words))[:3], words
 
 
+def test_help_of_a_light_command_waits_for_nothing_heavy(tmp_path: Path) -> None:
+    """One process asks them all, so that this runs with every change; tasks and data list are kept answers, above."""
+    asked = [[command, "--help"] for command in LIGHT_COMMANDS if command != "tasks"]
+    run = f"""
+import contextlib, sys
+from magnet.cli import main
+for words in {asked}:
+    with contextlib.suppress(SystemExit):
+        main(words)
+    print("\\n#", words[0], *set(sys.modules) & {HEAVY})
+"""
+    place = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, env=place, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert [line[2:].split() for line in done.stdout.splitlines() if line.startswith("# ")] == [
+        words[:1] for words in asked
+    ]
+
+
 def test_answers_are_forgotten_with_the_code_that_they_were_made_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
