@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
 from magnet.body.drift import moved_over_ground, undrifted
+from magnet.body.jumps import unjumped
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
 from magnet.motion.scene import FPS, Scene
@@ -68,11 +69,11 @@ def repaired(
         settle: how poses are corrected.
         begun: the motion continues a past that stays, so corrections grow from 0.
         slides: m/s below which a low toe is meant to stand.
-        drifting: first stop people who slide over the ground as a whole (`undrifted`).
+        drifting: first stop people who slide over the ground as a whole (`undrifted`), or jump up or down (`unjumped`).
     """
     every = max(round(scene.fps / FPS), 1)
     if drifting:
-        scene = undrifted(scene, body, fixed, slides)
+        scene = undrifted(unjumped(scene, body, fixed), body, fixed, slides)
     few = torch.arange(0, scene.frames, every, device=scene.device)
     seen = scene.frames_at(few).replace(fps=scene.fps / every)
     stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., few, :]

@@ -21,7 +21,8 @@ EPILOG = """\
 IN is a scene (.npz of magnet or of SMPL-X) or a .bvh file; several are several people of one world. OUT's suffix says
 what is written, as for `magnet export`. Roots, legs and arms are corrected, smoothly and as little as they can be:
 nobody is in anybody's body or in their own, hands that were together stay together, low toes stand still, whoever is in
-the air without falling comes down, and soles are not under the floor. The table says how it was and how it is.
+the air without falling comes down, soles are not under the floor, and nobody jumps up or down within a frame. The table
+says how it was and how it is.
 
 for example:
   magnet refine demo/quartet.npz apart.npz

@@ -1,0 +1,58 @@
+"""Bodies that jump up or down as a whole from one frame to the next, and the scene without such jumps."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from magnet.body.base import Body
+from magnet.motion.scene import FPS, Scene
+
+JUMP = 0.04
+"""Metres that a body must move up or down beyond what is usual around that frame, for a jump. In CMU's 72 takes at 30
+frames a second no pelvis moves so by more than 0.02 m."""
+
+AROUND = 2
+"""Steps before and after whose median is what is usual."""
+
+
+def jumps(heights: Tensor, fps: float) -> Tensor:
+    """How far bodies jump up as a whole between neighbouring frames; 0 where they do not. -> (B, T - 1, P) metres
+
+    heights (B, T, P, J) of joints
+    """
+    steps = heights.diff(dim=1)
+    padded = F.pad(steps.flatten(2).transpose(1, 2), (AROUND, AROUND), mode="replicate").transpose(1, 2)
+    usual = padded.unfold(1, 2 * AROUND + 1, 1).median(dim=-1).values.unflatten(2, steps.shape[2:])
+    beyond = steps - usual
+    least = JUMP * max(FPS / fps, 1.0) ** 2  # what a body can do grows with the square of a frame's time
+    body = beyond.median(dim=-1).values
+    low, high = beyond.quantile(beyond.new_tensor([0.1, 0.9]), dim=-1)
+    together = high - low < body.abs()  # in a cut to another pose joints go different ways
+    return torch.where(together & (body.abs() > least), body, 0.0)
+
+
+def unjumped(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
+    """A scene in which nobody jumps up or down within a frame. Who does not jump stays bit-identical.
+
+    Recordings jump where markers or a camera are lost. Poses do not change, and a cut to another pose is no jump. The
+    first frame is left where it is; a scene of up to three frames is left alone.
+
+    Args:
+        scene: (B, T, P).
+        body: the body of its shape numbers.
+        fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved, if only in some frames.
+    """
+    if scene.frames < 4:
+        return scene
+    jumped = jumps(body.joints(scene)[..., 1], scene.fps)
+    if scene.valid is not None:
+        jumped = torch.where((scene.valid[:, 1:] & scene.valid[:, :-1])[..., None], jumped, 0.0)
+    if fixed is not None:
+        whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
+        jumped = torch.where(whole.to(jumped.device), 0.0, jumped)
+    height = scene.T_world_root.clone()
+    height[:, 1:, :, 1, 3] -= jumped.cumsum(dim=1)
+    moves = (jumped != 0).any(dim=1)[:, None, :, None, None]
+    return scene.replace(T_world_root=torch.where(moves, height, scene.T_world_root))
