@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -83,3 +86,23 @@ class Registry:
         """
         if name in self.failed:
             raise ValueError(f"{self.what} {name} failed to load: {self.failed[name]!r}") from self.failed[name]
+
+
+def look_here(module: str) -> bool:
+    """Let a module be imported from the working directory, too, if Python finds it nowhere else.
+
+    The command `magnet` does not look there by itself, as `python -m magnet` does.
+
+    Returns:
+        Whether there is such a module at all.
+    """
+    top = module.partition(".")[0]
+    if top in sys.modules or importlib.util.find_spec(top) is not None:
+        return True
+    here = Path.cwd()
+    if not ((here / f"{top}.py").is_file() or (here / top).is_dir()):
+        return False
+    if str(here) not in sys.path:
+        sys.path.append(str(here))  # last: nothing here takes the place of a package
+        importlib.invalidate_caches()
+    return True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import TypeVar
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Reader
-from magnet.plugins import Registered, Registry
+from magnet.plugins import Registered, Registry, look_here
 
 BUILT_IN = (
     "synthetic",
@@ -189,13 +188,8 @@ def import_local(path: str) -> None:
     top = module.partition(".")[0]
     if not top or module in sys.modules:
         return
-    if importlib.util.find_spec(top) is None:
-        here = Path.cwd()
-        if not ((here / f"{top}.py").is_file() or (here / top).is_dir()):
-            raise ValueError(f"{path}: no module {top}, neither installed nor in the working directory {here}")
-        if str(here) not in sys.path:
-            sys.path.append(str(here))  # last: nothing here takes the place of a package
-            importlib.invalidate_caches()
+    if not look_here(module):
+        raise ValueError(f"{path}: no module {top}, neither installed nor in the working directory {Path.cwd()}")
     try:
         kind = importlib.import_module(module)
     except Exception as error:  # a stranger's import may raise anything

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import is_dataclass
 from typing import TypeVar
 
-from magnet.plugins import Registered, Registry
+from magnet.plugins import Registered, Registry, look_here
 
 VARIABLE = "MAGNET_TASKS"
 
@@ -55,8 +55,10 @@ def discover(again: bool = False) -> None:
 
 
 def _load_variable(value: str) -> None:
-    """`package.module:Class`, or `package.module`, whose tasks have registered themselves."""
+    """`package.module:Class`, or `package.module`, whose tasks have registered themselves; also of this folder."""
     module, _, name = value.partition(":")
+    if module:
+        look_here(module)
     origin = f"{VARIABLE}={value}"
     if name:
         TASKS.load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)

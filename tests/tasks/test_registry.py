@@ -1,8 +1,13 @@
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
+import magnet
 from magnet import plugins
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
@@ -100,3 +105,19 @@ def test_a_variable_may_name_a_module_whose_tasks_register_themselves(clean_regi
     registry.discover(again=True)
     assert {entry.name: entry.origin for entry in registry.entries()}["stray"] == "MAGNET_TASKS=stray_tasks"
     assert "registers no task" in str(registry.failures()["no_tasks"])
+
+
+def test_a_variable_finds_a_module_in_the_working_directory(tmp_path):
+    """As the installed command is started: Python itself does not look there."""
+    (tmp_path / "wait_here.py").write_text(
+        "import dataclasses\n"
+        "from magnet.tasks.joint import JointFuture\n"
+        "@dataclasses.dataclass(frozen=True)\n"
+        "class WaitHere(JointFuture):\n"
+        "    '''Wait.'''\n"
+    )
+    code = "from magnet.tasks import registry; print(registry.get('wait_here').__doc__)"
+    said = {**os.environ, "PYTHONPATH": str(Path(magnet.__file__).parents[1]), registry.VARIABLE: "wait_here:WaitHere"}
+    command = [sys.executable, "-P", "-c", code]  # -P: without the working directory
+    done = subprocess.run(command, cwd=tmp_path, env=said, capture_output=True, text=True)
+    assert done.stdout == "Wait.\n", done.stderr
