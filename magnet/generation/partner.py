@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.inputs import check_request
+from magnet.generation.inputs import check_given, check_request
 from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -15,11 +15,15 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl, chosen
 
+SAME_SHAPE = 1e-2
+"""Shape numbers that differ by less are the same, written less precisely: it moves joints by under a millimetre."""
+
 
 class Partner:
     """Some agents of a scene, who answer what the others do as it happens (the task `motion_control`, fed live).
 
-    Answers are those that `motion_control` gives with the same seed when all is known at once. Memory does not grow.
+    Answers are those that `motion_control` gives with the same seed and the same `settle` when all is known at once.
+    Poses are corrected only where `options` say so, because that takes twice as long. Memory does not grow.
 
     Args:
         denoiser: a trained model.
@@ -50,7 +54,8 @@ class Partner:
         self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents), block=block)
         self.options, self.generator = options or SamplerOptions(), generator
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
-        self._present = past.present
+        self._present, self._betas, self._body = past.present.cpu(), past.betas.cpu().float(), past.body
+        self._given = torch.tensor([agent not in self.task.target for agent in range(past.agents)])
         whole = past.slice(past.frames % TOKEN_FRAMES).replace(valid=None, given=None)
         self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
 
@@ -69,7 +74,8 @@ class Partner:
                 of those who answer nothing is read. A whole number of blocks.
 
         Raises:
-            ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people or frame rate.
+            ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people, shapes or
+                frame rate. Nothing has been taken then: the same frames may be given again.
         """
         require_rate(frames, "frames")
         block = self.task.block * TOKEN_FRAMES
@@ -78,9 +84,27 @@ class Partner:
                 f"frames: got {frames.frames}, expected a multiple of {block}: a token is {TOKEN_FRAMES} frames"
                 + (f", and {self.task.block} are answered at a time" if self.task.block > 1 else "")
             )
-        if frames.present.shape != self._present.shape or not torch.equal(frames.present, self._present):
+        if frames.present.shape != self._present.shape or not torch.equal(frames.present.cpu(), self._present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
+        self._require_shapes(frames)
+        if frames.frames > block:  # refused half-way they could not be given again; a single block is checked when fed
+            check_given(frames, self._given.expand(frames.frames // TOKEN_FRAMES, -1), any_floor=True)
         # Block by block: what has been fed beyond a block is not to be read in it.
         answers = [self.stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
         answer = cat_time(answers).replace(names=frames.names)
         return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))
+
+    def _require_shapes(self, frames: Scene) -> None:
+        """Refuse other bodies than the past's, which would be answered as if they were the past's."""
+        if frames.body != self._body:
+            raise ValueError(f"body differ: {self._body} and {frames.body}")
+        betas = frames.betas.cpu().float()
+        if torch.equal(betas, self._betas):
+            return
+        off = ((betas - self._betas).abs().amax(dim=-1) > SAME_SHAPE) & self._present & self._given
+        if bool(off.any()):
+            agent = int(off.nonzero()[0, 1])
+            raise ValueError(
+                f"frames: agent {agent} has other betas than in the past; shapes are fixed then: give "
+                "frames.replace(betas=past.betas)"
+            )

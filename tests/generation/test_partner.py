@@ -154,6 +154,28 @@ def test_what_cannot_be_answered_is_named(model, duet):
         Partner(tiny_denoiser(noise={"pairwise": "token"}), duet.slice(0, 16))
 
 
+def test_frames_that_are_refused_may_be_given_again(model, duet):
+    """Nothing of them has been taken, though what is wrong lies in their last token."""
+    broken = duet.T_world_root.clone()
+    broken[:, 22, 1, 0, 3] = torch.nan
+    ours, theirs = (Partner(model, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(0)) for _ in range(2))
+    with pytest.raises(ValueError, match="agent 1: frame 6 is not finite"):
+        ours.answer(duet.replace(T_world_root=broken).slice(16, 24))
+    again, once = (each.answer(duet.slice(16, 24)) for each in (ours, theirs))
+    assert torch.equal(again.T_world_root, once.T_world_root)
+
+
+def test_a_body_of_another_shape_than_in_the_past_is_refused(model, duet):
+    """Of those who answer nothing is read, and half precision is no other shape."""
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    other = duet.betas.clone()
+    other[:, 0] += 1.0
+    partner.answer(duet.replace(betas=other.half().float()).slice(16, 20))
+    other[:, 1] += 1.0
+    with pytest.raises(ValueError, match="agent 1 has other betas than in the past"):
+        partner.answer(duet.replace(betas=other).slice(20, 24))
+
+
 def test_a_loaded_model_gives_a_partner(model, duet):
     partner = Model(model, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
     again = Model(model, FAST).partner(duet.slice(0, 32), agents=1, seed=3)
