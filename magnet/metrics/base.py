@@ -11,6 +11,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
+from magnet.checks import require_choice, require_number
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import bootstrap_interval
@@ -32,6 +33,9 @@ class MotionMetric(Metric):
             that were generated; None: everything of everybody present.
         fps: frames a second, for speeds and durations.
         kwargs: of `torchmetrics.Metric`, such as `compute_on_cpu`.
+
+    Raises:
+        ValueError: `of` is neither, or `fps` is not over 0.
     """
 
     full_state_update = False
@@ -42,6 +46,8 @@ class MotionMetric(Metric):
 
     def __init__(self, of: Of = "generated", agents: Tensor | None = None, fps: float = FPS, **kwargs: Any) -> None:
         super().__init__(**kwargs)
+        require_choice("of", of, Of)
+        require_number("fps", fps, over=0)
         self._empty: dict[str, Tensor] = {}  # states that are lists, as they are without a batch
         self.of, self.fps = of, fps
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
@@ -125,6 +131,9 @@ class ClipMeans(MotionMetric):
         names: what is measured; None: all of `columns`.
         confidence: such as 0.95: adds `<name>_low` and `<name>_high`, by resampling independent units of clips;
             nothing where there is only one.
+
+    Raises:
+        ValueError: `confidence` is no share between 0 and 1.
     """
 
     total: Tensor  # (K,)
@@ -134,6 +143,10 @@ class ClipMeans(MotionMetric):
 
     def __init__(self, names: Sequence[str] | None = None, confidence: float | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
+        if confidence is not None:
+            require_number("confidence", confidence, over=0)
+            if confidence >= 1:
+                raise ValueError(f"confidence: got {confidence:g}, expected a share under 1, such as 0.95")
         self.names = tuple(self.columns if names is None else names)
         self.confidence = confidence
         self.add_sum("total", len(self.names))

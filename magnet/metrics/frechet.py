@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, get_args
 import torch
 from torch import Tensor
 
+from magnet.checks import require_choice
 from magnet.metrics.base import MotionMetric
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
@@ -108,6 +109,7 @@ class FrechetDistance(MotionMetric):
 
     def __init__(self, features: Features = "world_joints", jitter: float = JITTER, **kwargs: Any) -> None:
         super().__init__(**kwargs)
+        require_choice("features", features, Features)
         self.features: Features = features
         self.jitter = jitter
         self.name = "fd" if features == "world_joints" else f"fd_{features}"

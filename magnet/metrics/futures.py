@@ -36,9 +36,12 @@ class Futures:
             units: (B,) int, which clips intervals take as one; None: each is its own.
 
         Raises:
-            ValueError: shapes do not fit, B = T leave open what two axes of `agents` are, or a joint of a present
-                agent is not finite.
+            ValueError: no tensors, no sample, shapes that do not fit, B = T leave open what two axes of `agents`
+                are, or a joint of a present agent is not finite.
         """
+        for name, given in (("generated", generated), ("truth", truth), ("present", present), ("agents", agents)):
+            if not isinstance(given, Tensor) and not (name == "agents" and given is None):
+                raise ValueError(f"{name}: got {type(given).__name__}, expected a tensor; torch.as_tensor makes one")
         if generated.ndim != 6 or truth.ndim != 5 or generated.shape[-2:] != (BODY_JOINTS, 3):
             raise ValueError(
                 f"got generated {tuple(generated.shape)} and truth {tuple(truth.shape)}, "
@@ -54,6 +57,8 @@ class Futures:
             raise ValueError(f"present: got {tuple(present.shape)} {present.dtype}, expected {(B, P)} bool")
         if units is not None and (units.shape != (B,) or units.is_floating_point()):
             raise ValueError(f"units: got {tuple(units.shape)} {units.dtype}, expected {(B,)} int")
+        if not generated.shape[0]:
+            raise ValueError("generated: got 0 samples, expected at least one")
         lengths = (generated.shape[2], truth.shape[1])
         frames = min(lengths)
         cut = Futures(

@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from magnet.body.joints import TOES
+from magnet.checks import require_choice
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import histogram_of, quantile
 from magnet.motion.scene import FPS
 
-PRESETS = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
+Preset = Literal["default", "reference"]
+
+PRESETS: dict[Preset, tuple[float, float]] = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
 """Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""
 
 
@@ -62,12 +65,13 @@ class FootSkating(ClipMeans):
 
     def __init__(
         self,
-        preset: Literal["default", "reference"] = "default",
+        preset: Preset = "default",
         height: float | None = None,
         speed: float | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(["fs", "fs_ratio", "fs_contact"], **kwargs)
+        require_choice("preset", preset, Preset)
         self.height = PRESETS[preset][0] if height is None else height
         self.speed = PRESETS[preset][1] if speed is None else speed
 

@@ -8,8 +8,11 @@ import torch
 from torchmetrics import Metric, MetricCollection
 
 from magnet.metrics import (
+    FootSkating,
+    FrechetDistance,
     Futures,
     Interpenetration,
+    MotionInteraction,
     PositionError,
     all_metrics,
     bootstrap_interval,
@@ -133,3 +136,33 @@ def test_shapes_that_do_not_fit_are_named() -> None:
         Futures.of(generated, truth, present.float())
     with pytest.raises(ValueError, match="agents"):
         Futures.of(generated, truth, present, torch.ones(2, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("message", "make"),
+    [
+        ("of: got 'recorded', expected generated or truth", lambda: PositionError(of="recorded")),
+        ("of: got 'recorded'", lambda: MotionInteraction(of="recorded")),
+        ("fps: got 0, expected over 0", lambda: all_metrics(fps=0)),
+        ("fps: got -30", lambda: ground_truth_metrics(fps=-30)),
+        ("confidence: got 95, expected a share under 1", lambda: all_metrics(confidence=95)),
+        ("features: got 'joints', expected world_joints or", lambda: FrechetDistance("joints")),
+        ("preset: got 'paper', expected default or reference", lambda: FootSkating("paper")),
+    ],
+)
+def test_an_option_that_means_nothing_is_refused_at_once(message: str, make: Callable[[], object]) -> None:
+    """`of="recorded"` measured what was generated, and 95 was found out when all was measured."""
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_arrays_and_no_samples_are_refused_by_name() -> None:
+    generated, truth, present = draw_batch()
+    with pytest.raises(ValueError, match=r"generated: got ndarray, expected a tensor; torch.as_tensor makes one"):
+        PositionError().update(generated.numpy(), truth.numpy(), present)
+    with pytest.raises(ValueError, match="present: got ndarray"):
+        PositionError().update(generated, truth, present.numpy())
+    with pytest.raises(ValueError, match="agents: got list"):
+        PositionError().update(generated, truth, present, agents=[True, False])
+    with pytest.raises(ValueError, match="got 0 samples, expected at least one"):
+        PositionError().update(generated[:0], truth, present)
