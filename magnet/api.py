@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,7 +38,7 @@ def load(
     *,
     device: str | torch.device = "cpu",
     steps: int | None = None,
-    sampler: str = "default",
+    sampler: str | SamplerOptions = "default",
 ) -> Model:
     """Load a trained model: a shipped one by name ("duet"), one of a hub ("hub:owner/name"), or a checkpoint's path.
 
@@ -45,7 +46,8 @@ def load(
         device: device to run on.
         steps: denoising steps; fewer are faster and coarser. None: the sampler's.
         sampler: preset of the sampler: `default`, the best for the model, `plain`, or another of
-            `magnet.sampling.presets`, such as `paper` for the paper's sampling.
+            `magnet.sampling.presets`, such as `paper` for the paper's sampling; or options of your own, such as
+            `SamplerOptions(settle="hold")`.
 
     Raises:
         ValueError: no such model or sampler (the message lists them), or no such device.
@@ -57,7 +59,11 @@ def load(
     (3, 60, torch.Size([22, 3]))
     """
     place = device_of(device)
-    options = SamplerOptions.preset(sampler, **({} if steps is None else {"steps": steps}))
+    said: dict[str, Any] = {} if steps is None else {"steps": steps}
+    if isinstance(sampler, SamplerOptions):
+        options = dataclasses.replace(sampler, **said)
+    else:
+        options = SamplerOptions.preset(sampler, **said)
     return Model(Denoiser.load(name_or_path).to(place), options)
 
 
@@ -382,12 +388,12 @@ class Model:
         generator = torch.Generator(self.denoiser.device)
         if seed is not None:
             require_whole("seed", seed, most=2**63 - 1)
-        generator.manual_seed(seed) if seed is not None else generator.seed()
+        generator.manual_seed(int(seed)) if seed is not None else generator.seed()  # NumPy's numbers are no int
         return generator
 
 
 def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:
     """One slot or several as a task takes them."""
-    several = (agents,) if isinstance(agents, int) else agents
+    several = (agents,) if isinstance(agents, int | np.integer) else agents
     require_wholes(name, several)
-    return tuple(several)
+    return tuple(int(agent) for agent in several)

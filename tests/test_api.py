@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +18,7 @@ from magnet.api import Model, Motion
 from magnet.body import load_body
 from magnet.export import resampled, save_bvh
 from magnet.motion.scene import Scene, cat_time, concatenate
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -265,6 +268,17 @@ CARELESS = {
     "got no scenes to put together": lambda model, duet: concatenate([]),
     "betas: got ndarray, expected a tensor": lambda model, duet: duet.replace(betas=duet.betas.numpy()),
 }
+
+
+def test_options_of_ones_own_are_taken_by_load_as_a_preset_is():
+    own = SamplerOptions(settle="hold", guidance=Guidance(cond_weight=2.0))
+    assert magnet.load("duet", sampler=own).sampler == own
+    assert magnet.load("duet", sampler=own, steps=4).sampler == dataclasses.replace(own, steps=4)
+
+
+def test_whole_numbers_of_numpy_are_numbers(model: Model, duet: Scene):
+    ours = model.inpaint(duet, np.int64(1), seed=np.int64(3))
+    assert torch.equal(ours.T_world_root, model.inpaint(duet, 1, seed=3).T_world_root)
 
 
 @pytest.mark.parametrize("message", CARELESS)
