@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, require_rotations
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -26,7 +26,8 @@ class Clip:
         split: train, val or test.
 
     Raises:
-        ValueError: several scenes, an absent agent, a NaN, no frames or no such split; the message names the clip.
+        ValueError: several scenes, an absent agent, a NaN, a matrix that does not rotate, no frames or no such split;
+            the message names the clip.
     """
 
     scene: Scene
@@ -45,6 +46,7 @@ class Clip:
         for field in ("body_rot", "T_world_root", "betas"):
             if not bool(getattr(self.scene, field).isfinite().all()):
                 raise ValueError(f"clip {self.name}: {field} holds NaN or infinity; mask such frames with `valid`")
+        require_rotations(self.scene, f"clip {self.name}")
 
     @property
     def frames(self) -> int:

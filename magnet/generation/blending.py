@@ -225,8 +225,8 @@ def smoothed_path(T_world_can: Tensor, placed: Tensor, fixed: Tensor) -> Tensor:
     """Canonical frames whose places are averaged with those of the frames before and after, 1 : 2 : 1.
 
     Networks that tell only what noise hides tremble by about a millimetre a frame in where people stand, which makes
-    the pelvis jerk thrice as much as it should; averaged it does so no more (docs/experiments.md). The first and the last
-    frame stay.
+    the pelvis jerk thrice as much as it should; averaged it does so no more (docs/experiments.md). The first and the
+    last frame stay.
 
     Args:
         T_world_can: (B, T, P, 4, 4).

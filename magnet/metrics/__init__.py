@@ -22,6 +22,7 @@ from magnet.metrics.memorisation import NearestTraining
 from magnet.metrics.partners import PartnerBearing, PartnerDistance, TurnRate, bearing, partner_distance, turn_rate
 from magnet.metrics.penetration import Interpenetration, penetration_depth, segment_distance
 from magnet.metrics.position_error import PositionError, VelocityError, joint_error, velocity_error
+from magnet.metrics.registry import other_metrics
 from magnet.metrics.skating import FootSkating, StandingToes, toe_steps
 from magnet.metrics.token_borders import TokenBorders
 from magnet.motion.scene import FPS
@@ -76,27 +77,17 @@ __all__ = [
 
 
 def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> MetricCollection:
-    """Every metric of the paper's tables and a few more, fed together: `update(generated, truth, present)`.
+    """Every metric of the paper's tables, a few more, and those of installed packages (entry points `magnet.metrics`).
+
+    They are fed together: `update(generated, truth, present)`.
 
     Args:
         scored: (P,) or (T, P) bool, what was generated: partner tasks generate the partner, in-betweening the frames
             between keyframes; None: everything. `update(..., agents=...)` says it for one batch instead.
         confidence: such as 0.95, for metrics that are means over clips; adds `_low` and `_high`.
     """
-    means: dict[str, Any] = {"agents": scored, "confidence": confidence, "fps": fps}
-    return MetricCollection(
-        {
-            "FD": FrechetDistance(fps=fps, agents=scored),
-            "FD pair": FrechetBySecond("pair", fps=fps, agents=scored),
-            "FD own pose": FrechetDistance("canonical_joints", fps=fps, agents=scored),
-            "FD own velocity": FrechetDistance("own_velocity", fps=fps, agents=scored),
-            "DIV": Diversity(**means),
-            **_of_motion(fps, "generated", scored, confidence),
-            "MPJPE": PositionError(**means),
-            "MPJVE": VelocityError(**means),
-        },
-        compute_groups=False,
-    )
+    others = other_metrics(_ours, "generated", scored, fps, confidence)
+    return MetricCollection({**_ours(fps, scored, confidence), **others}, compute_groups=False)
 
 
 def ground_truth_metrics(
@@ -106,7 +97,22 @@ def ground_truth_metrics(
 
     Fed like `all_metrics`; what is generated is not read.
     """
-    return MetricCollection(dict(_of_motion(fps, "truth", scored, confidence)), compute_groups=False)
+    others = other_metrics(_ours, "truth", scored, fps, confidence)
+    return MetricCollection({**_of_motion(fps, "truth", scored, confidence), **others}, compute_groups=False)
+
+
+def _ours(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> dict[str, Metric]:
+    means: dict[str, Any] = {"agents": scored, "confidence": confidence, "fps": fps}
+    return {
+        "FD": FrechetDistance(fps=fps, agents=scored),
+        "FD pair": FrechetBySecond("pair", fps=fps, agents=scored),
+        "FD own pose": FrechetDistance("canonical_joints", fps=fps, agents=scored),
+        "FD own velocity": FrechetDistance("own_velocity", fps=fps, agents=scored),
+        "DIV": Diversity(**means),
+        **_of_motion(fps, "generated", scored, confidence),
+        "MPJPE": PositionError(**means),
+        "MPJVE": VelocityError(**means),
+    }
 
 
 def _of_motion(fps: float, of: Of, scored: Tensor | None, confidence: float | None) -> dict[str, Metric]:

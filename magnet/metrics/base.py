@@ -89,7 +89,7 @@ class MotionMetric(Metric):
         return self._plot(val, ax)
 
     def add_sum(self, name: str, *shape: int) -> None:
-        self.add_state(name, default=torch.zeros(*shape, dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state(name, default=torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
 
     def add_list(self, name: str, empty: Tensor) -> None:
         """A state of tensors to be joined end to end; `empty` is one of no length, with their shape and dtype."""

@@ -1,0 +1,55 @@
+"""Metrics of other packages, measured beside ours: found through the entry-point group `magnet.metrics`."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch import Tensor
+from torchmetrics import Metric
+
+from magnet.metrics.base import ClipMeans, MotionMetric, Of
+from magnet.metrics.columns import columns_of
+from magnet.plugins import Registry
+
+TAKEN: set[str] = set()
+"""Names of our metrics and of their numbers."""
+
+
+def _check(name: str, kind: type) -> None:
+    if not (isinstance(kind, type) and issubclass(kind, MotionMetric)):
+        raise TypeError(f"metric {name}: {kind!r} is no MotionMetric; see docs/metrics.md")
+    if not kind.columns:
+        raise TypeError(f"metric {name}: {kind.__name__} has no columns, which say how its numbers are shown")
+    others = [other.kind for other in METRICS.known.values() if other.kind is not kind]
+    taken = TAKEN.union(*(other.columns for other in others if issubclass(other, MotionMetric)))
+    twice = sorted(taken & {name, *kind.columns})
+    if twice:
+        raise ValueError(f"metric {name}: something called {twice[0]} is measured already")
+
+
+METRICS = Registry("metric", "magnet.metrics", (), _check)
+
+
+def other_metrics(
+    ours: Callable[[], Mapping[str, Metric]], of: Of, agents: Tensor | None, fps: float, confidence: float | None
+) -> dict[str, Metric]:
+    """Metrics of installed packages, by name; those that fail to load are left out, with a warning.
+
+    Args:
+        ours: makes our metrics, whose names nothing else may have.
+        of, agents, fps: as for MotionMetric.
+        confidence: as for ClipMeans.
+    """
+    if not METRICS.discovered:
+        known = ours()
+        TAKEN.update(known, columns_of(*known.values()))
+        METRICS.discover()
+        for name, error in METRICS.failed.items():
+            warnings.warn(f"metric {name} is left out, it failed to load: {error}", stacklevel=2)
+    made: dict[str, Metric] = {}
+    for name, each in sorted(METRICS.known.items()):
+        means: dict[str, Any] = {"confidence": confidence} if issubclass(each.kind, ClipMeans) else {}
+        made[name] = each.kind(of=of, agents=agents, fps=fps, **means)
+    return made

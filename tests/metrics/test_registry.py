@@ -1,0 +1,85 @@
+"""Metrics of other packages are measured beside ours, and a broken one is in nobody's way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from typing import ClassVar
+
+import pytest
+import torch
+
+from magnet import plugins
+from magnet.metrics import ClipMeans, Column, MotionMetric, all_metrics, columns_of, ground_truth_metrics
+from magnet.metrics.base import clip_sums
+from magnet.metrics.registry import METRICS
+from tests.metrics.batches import draw_batch
+
+
+class Heads(ClipMeans):
+    columns: ClassVar = {"head_height": Column("head", "m", "real", "how high heads are", main=True)}
+
+    def measure(self, futures):
+        return [clip_sums(futures.generated[..., 15, 1], futures.scored)]
+
+
+class Calls(MotionMetric):
+    columns: ClassVar = {"calls": Column("calls", "", "", "how often it was fed")}
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.add_sum("calls")
+
+    def add(self, futures):
+        self.calls += 1
+
+    def compute(self):
+        return {"calls": self.calls}
+
+
+class Nameless(ClipMeans):
+    pass
+
+
+class Taken(Heads):
+    columns: ClassVar = {"mpjpe": Column("mine", "m", "low", "another one")}
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    points = {
+        "heads": "Heads",
+        "calls": "Calls",
+        "nameless": "Nameless",
+        "mine": "Taken",
+        "gone": "Gone",
+        "FS": "Heads",
+    }
+    found = [EntryPoint(name, f"{__name__}:{kind}", "magnet.metrics") for name, kind in points.items()]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: found if group == "magnet.metrics" else [])
+    for field, fresh in (("known", {}), ("failed", {}), ("discovered", False)):
+        monkeypatch.setattr(METRICS, field, fresh)
+    yield
+
+
+def test_they_are_measured_of_samples_and_of_recordings(installed: None) -> None:
+    generated, truth, present = draw_batch()
+    with pytest.warns(UserWarning, match="metric .* is left out, it failed to load") as warned:
+        made = all_metrics(confidence=0.95)
+    assert {str(each.message).split()[1] for each in warned} == {"nameless", "mine", "gone", "FS"}
+    recorded = ground_truth_metrics()
+    for metrics in (made, recorded):
+        metrics.update(generated, truth, present)
+    everybody = present[None, :, None].expand(generated.shape[:4])
+    assert torch.isclose(made.compute()["head_height"].float(), generated[..., 15, 1][everybody].mean(), atol=1e-5)
+    assert torch.isclose(recorded.compute()["head_height"].float(), truth[..., 15, 1][everybody[0]].mean(), atol=1e-5)
+    assert made.compute()["calls"] == 1
+    assert columns_of(made)["head_height"].main
+    assert "mine" not in made and "fs" in made.compute()
+
+
+def test_nothing_is_added_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [])
+    for field, fresh in (("known", {}), ("failed", {}), ("discovered", False)):
+        monkeypatch.setattr(METRICS, field, fresh)
+    assert "head_height" not in columns_of(all_metrics()) and METRICS.discovered
