@@ -10,12 +10,15 @@ from typing import Any
 from magnet.cli import checkpoint_config, class_options, config_files, run_folder
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
+from magnet.cli.errors import CommandError
 from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
 from magnet.datamodules import registry
 
 DEFAULT_TASK = "joint_future"
 SAMPLING = ("test", "predict")
 RUNS = Path("runs")
+FILES = {".bvh", ".ckpt", ".csv", ".gif", ".glb", ".html", ".json", ".mp4", ".npz", ".webp"}
+"""Suffixes of files; a folder that is named so is a mistake."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
     elif command == "fit" and (start := given.option("model", "start_from")):
         layer = checkpoint_config.started(start, given, models, registry.default_path())
+    if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():
+        raise CommandError(f"--out {out}: is a file's name, expected that of a folder; {command} writes several files")
     folder = run_folder.run_folder(runs / name, out)
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers

@@ -157,6 +157,13 @@ def test_a_finished_run_is_not_overwritten(trained: Path, capsys: pytest.Capture
     assert (trained / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
+@pytest.mark.parametrize("command", ["fit", "test", "predict"])
+def test_a_folder_is_not_named_as_a_file(command: str, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([command, "--model", "ToyModel", "--out", "made.npz", *CPU]) == 2
+    assert "--out made.npz: is a file's name, expected that of a folder" in capsys.readouterr().err
+    assert not Path("made.npz").exists()
+
+
 @pytest.mark.parametrize(("command", "start"), [("validate", "validation"), ("test", "test"), ("predict", "predict")])
 def test_a_run_that_never_began_leaves_nothing_behind(
     trained: Path, toy: Path, monkeypatch: pytest.MonkeyPatch, command: str, start: str
