@@ -39,6 +39,10 @@ def draw_list(console: Console, name: str | None) -> bool:
     from magnet.datamodules import registry
 
     if name:
+        for entry in registry.unprepared():
+            if entry.name.lower() == name.lower():
+                show_data(console, entry)
+                return True
         show_reader(console, registry.reader(name))
         return True
     for kind in registry.readers().values():

@@ -151,7 +151,7 @@ def readers() -> dict[str, type[Reader]]:
 
 
 def reader(name: str) -> type[Reader]:
-    """The reader of a name.
+    """The reader of a name: its own, or that of the data set that trains on its stores, in letters of any case.
 
     Raises:
         ValueError: no such data set, with the closest one; or one that needs no preparing, with what to do instead.
@@ -159,6 +159,9 @@ def reader(name: str) -> type[Reader]:
     known = readers()
     if name in known:
         return known[name]
+    for kind in known.values():
+        if name.lower() in (kind.name, data_of(kind).lower()) and name.lower() != "prepared":
+            return kind
     for entry in entries():
         if entry.name.lower() == name.lower() and reader_of(entry.kind) is None:
             raise ValueError(f"{name} has no files to prepare: {fit_command(entry.name)} trains on it")

@@ -136,7 +136,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("lst", "did you mean data list?"),
         ("prepare", "name is missing"),
         ("prepare dd100", "--root is missing (folder of the download, or of your own recordings)"),
-        ("prepare interX", "did you mean interx"),
+        ("prepare interXX", "did you mean interx"),
         ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
         ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),

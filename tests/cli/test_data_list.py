@@ -7,7 +7,9 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from magnet.cli.data_shown import draw_list
 from magnet.datamodules import registry
 from tests.cases import few
 
@@ -40,3 +42,10 @@ def test_a_download_lies_as_it_is_listed(name: str, tmp_path: Path) -> None:
         for path in take.files:
             file = path.relative_to(tmp_path).as_posix()
             assert any(fnmatchcase(file, glob) for glob in listed), file
+
+
+@pytest.mark.parametrize(("name", "title"), [("Synthetic", "Synthetic"), ("synthetic", "Synthetic"), ("CMU", "cmu")])
+def test_one_is_told_of_by_the_name_of_its_files_or_of_its_class(name: str, title: str) -> None:
+    console = Console(record=True, width=120)
+    assert draw_list(console, name)
+    assert console.export_text().startswith(f"{title}  ")
