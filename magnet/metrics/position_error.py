@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from magnet.checks import require_number
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures, without_pelvis
@@ -53,6 +54,8 @@ class PositionError(ClipMeans):
     }
 
     def __init__(self, fps: float = FPS, seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0), **kwargs: Any) -> None:
+        for until in seconds:
+            require_number("seconds", until, over=0)
         horizons = ["", *(f"@{s:g}s" for s in seconds)]
         names = [f"{name}{horizon}" for horizon in horizons for name in ("mpjpe", "mpjpe_best", "mpjpe_mean")]
         super().__init__(names, fps=fps, **kwargs)

@@ -148,6 +148,7 @@ def test_shapes_that_do_not_fit_are_named() -> None:
         ("confidence: got 95, expected a share under 1", lambda: all_metrics(confidence=95)),
         ("features: got 'joints', expected world_joints or", lambda: FrechetDistance("joints")),
         ("preset: got 'paper', expected default or reference", lambda: FootSkating("paper")),
+        ("seconds: got 0, expected over 0", lambda: PositionError(seconds=(1.0, 0))),
     ],
 )
 def test_an_option_that_means_nothing_is_refused_at_once(message: str, make: Callable[[], object]) -> None:
