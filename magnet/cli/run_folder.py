@@ -99,33 +99,39 @@ def progress_bar(sampling: bool = False) -> ProgressBar:
 
 
 class ProgressLines(ProgressBar):
-    """Progress for logs: a line every `seconds`, with what is left.
+    """Progress for logs: a line every `seconds`, with what is left, reckoned from the second step on.
+
+    What the first step waits for, such as data that are read and weights that are packed, no other waits for.
 
     Args:
         seconds: at least so much time between two lines.
     """
 
+    begun: tuple[float, int] | None
+    """When the first step ended, and how many were done then."""
+
     def __init__(self, seconds: float = 30.0) -> None:
         super().__init__()
         self.seconds = seconds
-        self.began = self.said = time.monotonic()
+        self._start()
 
     def disable(self) -> None:
         self.seconds = float("inf")
 
     def _start(self, *_: Any, **__: Any) -> None:
-        self.began = self.said = time.monotonic()
+        self.said, self.begun = time.monotonic(), None
 
     on_test_start = on_predict_start = _start
 
     def _step(self, what: str, done: int, total: float, more: str = "") -> None:
         now = time.monotonic()
+        if done and self.begun is None:
+            self.begun = now, done
         if now - self.said < self.seconds or not done:
             return
-        self.said = now
-        left = ""
-        if total != float("inf"):
-            left = f", {clock((now - self.began) * (total - done) / done)} left"
+        self.said, left = now, ""
+        if self.begun is not None and done > self.begun[1] and total != float("inf"):
+            left = f", {clock((now - self.begun[0]) * (total - done) / (done - self.begun[1]))} left"
         print(f"{what} {done}/{total:g}{left}{more}", flush=True)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from magnet.cli import run_folder
+
 FLAGS = {
     "data.train_clips": 4, "data.val_clips": 2, "data.batch_size": 2, "data.epoch_size": 8, "data.window_frames": 16,
     "model.network.width": 8, "model.network.depth": 1, "model.quantizer.codebook_dim": 8,
@@ -29,3 +31,16 @@ def test_two_processes_share_the_folder_that_the_first_one_names(tmp_path: Path)
     names = {path.name for path in folder.rglob("*") if path.is_file()}
     assert {"config.yaml", "run.json", "metrics.csv", "last.ckpt", "best.ckpt"} <= names
     assert done.stdout.count("the run is in ") == 1
+
+
+def test_what_is_left_is_reckoned_from_the_second_step_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first step waited 40 seconds for data; 2 seconds each are what is to come."""
+    now = iter([0.0, 40.0, 42.0, 80.0])
+    monkeypatch.setattr(run_folder.time, "monotonic", lambda: next(now))
+    lines = run_folder.ProgressLines(seconds=30.0)
+    for done in (1, 2, 21):
+        lines._step("test: denoising step", done, 64)
+    said = capsys.readouterr().out.splitlines()
+    assert said == ["test: denoising step 1/64", "test: denoising step 21/64, 0:01:26 left"]
