@@ -41,6 +41,16 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
     require_rate(scene)
 
 
+def check_task(task: object) -> None:
+    """Refuse a task's name or class where the task itself is meant.
+
+    Raises:
+        ValueError: says how a task is had.
+    """
+    if isinstance(task, type) or not hasattr(task, "schedule"):
+        raise ValueError(f'task: got {task!r}, expected a task, such as magnet.tasks.registry.get("joint_future")()')
+
+
 def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     """Refuse given motion that is not valid; what is not given may hold anything. known (N, P) bool
 

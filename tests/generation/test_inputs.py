@@ -270,3 +270,9 @@ def test_sampling_a_model_in_training_mode_drops_nothing_out(duet):
     expected = sampled()
     model.train()
     assert torch.equal(sampled(), expected) and model.training and model.transformer.training
+
+
+@pytest.mark.parametrize("task", ["joint_future", JointFuture])
+def test_a_name_or_a_class_in_place_of_a_task_is_told_how_one_is_had(task: object, generator: torch.Generator) -> None:
+    with pytest.raises(ValueError, match=r"task: got .*oint.*, expected a task, such as magnet\.tasks\.registry\.get"):
+        generate(tiny_denoiser(), random_scene(1, 16, 2, generator), task, 16, 8)  # type: ignore[arg-type]
