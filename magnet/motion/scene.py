@@ -324,16 +324,13 @@ def cat_time(pieces: Sequence[Scene]) -> Scene:
     """Consecutive pieces of the same scenes as one; what was given is kept if all of them say it.
 
     Raises:
-        ValueError: there are none, or scenes, slots, fps, body or who is present differ.
+        ValueError: there are none, or scenes, slots, fps or body differ.
 
     >>> scene = empty_scene(1, 60, 2, like=torch.zeros(()))
     >>> cat_time([scene.slice(0, 20), scene.slice(20)]).frames
     60
     """
     _require_alike(pieces, ("scenes", "agents", "fps", "body"))
-    there = pieces[0].present
-    if any(each.present is not there and not torch.equal(each.present.to(there.device), there) for each in pieces):
-        raise ValueError("present differs: a piece has people who are not in the first, or lacks some")
     if len(pieces) == 1:
         return pieces[0]
     valid = None

@@ -103,9 +103,6 @@ def test_pieces_joined_are_the_whole(scene: Scene):
     assert torch.equal(whole.T_world_root, scene.T_world_root) and torch.equal(whole.body_rot, scene.body_rot)
     half = scene.replace(valid=torch.rand(2, 64) > 0.5).slice(0, 10)
     assert cat_time([half, scene.slice(10)]).valid[:, 10:].all()
-    fewer = scene.slice(10).replace(present=torch.zeros_like(scene.present))
-    with pytest.raises(ValueError, match="present differs"):
-        cat_time([scene.slice(0, 10), fewer])
 
 
 def test_absent_agents_are_not_moved(generator):
