@@ -123,7 +123,8 @@ class ProgressLines(ProgressBar):
 
     on_test_start = on_predict_start = _start
 
-    def _step(self, what: str, done: int, total: float, more: str = "") -> None:
+    def tell(self, what: str, done: int, total: float, more: str = "") -> None:
+        """Print a line if it is time."""
         now = time.monotonic()
         if done and self.begun is None:
             self.begun = now, done
@@ -142,13 +143,13 @@ class ProgressLines(ProgressBar):
         total = float(trainer.estimated_stepping_batches) - self.first
         numbers = {key: value for key, value in self.get_metrics(trainer, pl_module).items() if key != "v_num"}
         more = "".join(f", {key} {value:.4g}" for key, value in numbers.items() if isinstance(value, float))
-        self._step("train: step", trainer.global_step - self.first, total, more)
+        self.tell("train: step", trainer.global_step - self.first, total, more)
 
     def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
-        self._step("test: batch", args[2] + 1, float(sum(trainer.num_test_batches)))
+        self.tell("test: batch", args[2] + 1, float(sum(trainer.num_test_batches)))
 
     def on_predict_batch_end(self, trainer: Trainer, pl_module: LightningModule, *args: Any) -> None:
-        self._step("predict: batch", args[2] + 1, float(sum(trainer.num_predict_batches)))
+        self.tell("predict: batch", args[2] + 1, float(sum(trainer.num_predict_batches)))
 
 
 class SamplingProgress(ProgressBar):
@@ -180,7 +181,7 @@ class SamplingProgress(ProgressBar):
         if self.bar is not None:
             self.bar.advance(self.task, steps)
         elif self.enabled:
-            self.lines._step(f"{self.what}: denoising step", self.done, self.total)
+            self.lines.tell(f"{self.what}: denoising step", self.done, self.total)
 
     def _end(self, *_: Any, **__: Any) -> None:
         if self.bar is not None:

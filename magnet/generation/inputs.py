@@ -16,13 +16,17 @@ ROUNDED = 0.05
 """What a rotation's columns may be off: half precision and careless interpolation are not refused, scales are."""
 
 
-def check_request(model: Denoiser, scene: Scene, context: int, frames: int | None, samples: int) -> None:
-    """Refuse what cannot be sampled whatever the task.
+def check_request(
+    model: Denoiser, scene: Scene, context: int, frames: int | None, samples: int, task: object = None
+) -> None:
+    """Refuse what cannot be sampled whatever the task, and a task's name or class in its place.
 
     Raises:
         ValueError: a model that was not trained, no scenes, people or frames that fit the model, another frame rate,
             or counts that are none.
     """
+    if isinstance(task, type) or not (task is None or hasattr(task, "schedule")):
+        raise ValueError(f'task: got {task!r}, expected a task, such as magnet.tasks.registry.get("joint_future")()')
     model.require_tokenizer()
     if not model.normalizer.ready:
         raise ValueError("the denoiser is not trained: its normalizer is not fitted; load a checkpoint")
@@ -39,16 +43,6 @@ def check_request(model: Denoiser, scene: Scene, context: int, frames: int | Non
     if scene.agents > model.layout.agents:
         raise ValueError(f"the scene has {scene.agents} agents, the model was built for {model.layout.agents}")
     require_rate(scene)
-
-
-def check_task(task: object) -> None:
-    """Refuse a task's name or class where the task itself is meant.
-
-    Raises:
-        ValueError: says how a task is had.
-    """
-    if isinstance(task, type) or not hasattr(task, "schedule"):
-        raise ValueError(f'task: got {task!r}, expected a task, such as magnet.tasks.registry.get("joint_future")()')
 
 
 def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:

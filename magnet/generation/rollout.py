@@ -24,7 +24,7 @@ from magnet.generation.conditioning import (
     require_people,
     task_lookahead_limit,
 )
-from magnet.generation.inputs import check_given, check_request, check_task, whole_tokens
+from magnet.generation.inputs import check_given, check_request, whole_tokens
 from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
@@ -150,8 +150,7 @@ class Rollout:
         chunk: int | None,
         cond: Tensor | None = None,
     ) -> None:
-        check_task(task)
-        check_request(model, scene, context, frames, samples)
+        check_request(model, scene, context, frames, samples, task)
         layout = model.layout
         self.model, self.options, self.chunk = model, (options or SamplerOptions()).filled(model.sampling), chunk
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)

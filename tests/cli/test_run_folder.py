@@ -41,6 +41,6 @@ def test_what_is_left_is_reckoned_from_the_second_step_on(
     monkeypatch.setattr(run_folder.time, "monotonic", lambda: next(now))
     lines = run_folder.ProgressLines(seconds=30.0)
     for done in (1, 2, 21):
-        lines._step("test: denoising step", done, 64)
+        lines.tell("test: denoising step", done, 64)
     said = capsys.readouterr().out.splitlines()
     assert said == ["test: denoising step 1/64", "test: denoising step 21/64, 0:01:26 left"]
