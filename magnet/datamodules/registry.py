@@ -159,11 +159,11 @@ def reader(name: str) -> type[Reader]:
     known = readers()
     if name in known:
         return known[name]
-    for kind in known.values():
-        if name.lower() in (kind.name, data_of(kind).lower()) and name.lower() != "prepared":
-            return kind
     for entry in entries():
-        if entry.name.lower() == name.lower() and reader_of(entry.kind) is None:
+        if entry.name.lower() == name.lower():
+            kind = reader_of(entry.kind)
+            if kind is not None:
+                return kind
             raise ValueError(f"{name} has no files to prepare: {fit_command(entry.name)} trains on it")
     DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
