@@ -1,10 +1,11 @@
-"""The shipped model from recordings to weights in one go: tokenizer, denoiser, decoder, release.
+"""The shipped model from recordings to weights in one go: tokenizer, denoiser twice, decoder, release.
 
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
-`--out`. Stopped at any moment, by hand or by a power cut, it goes on from the last checkpoint when it is run again; a
-stage that has its steps is not run again. `--steps tokenizer=2 denoiser=2 decoder=2` rehearses all of it, to the end.
+`--out`. The stage `on` goes on from the denoiser, and the mean of the weights before and after is released. Stopped at
+any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage that has its
+steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 decoder=2` rehearses it to the end.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from magnet import checkpoints
 from magnet.callbacks.narrow_codes import NAME as NARROW
 
 ROOT = Path(__file__).resolve().parents[1]
-STAGES = ("tokenizer", "denoiser", "decoder")
+STAGES = ("tokenizer", "denoiser", "on", "decoder")
 
 
 def config_of(stage: str) -> Path:
@@ -47,7 +48,8 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
 
     Args:
         stage: of `STAGES`.
-        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers.
+        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, and `on` with
+            the denoiser.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
@@ -56,6 +58,8 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
     tokenizer = str(last_checkpoint(out / "tokenizer").with_name(NARROW))
     if stage == "denoiser":
         command += ["--model.tokenizer", tokenizer]
+    if stage == "on":
+        command += ["--model.start_from", str(last_checkpoint(out / "denoiser"))]
     if stage == "decoder":
         command += ["--model.start_from", tokenizer]
     if last_checkpoint(out / stage).is_file():
@@ -116,7 +120,10 @@ def main(arguments: list[str] | None = None) -> None:
         run(fit_command(stage, out, steps[stage], given.fit), f"{stage}, step {done} to {steps[stage]}")
         if steps_done(out / stage) < steps[stage]:  # stopped by a signal, it ends without an error
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
-    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(last_checkpoint(out / "denoiser"))]
+    mean = str(last_checkpoint(out / "on").with_name("mean.ckpt"))
+    both = [str(last_checkpoint(out / stage)) for stage in ("on", "denoiser")]
+    run([sys.executable, str(ROOT / "scripts" / "average_weights.py"), mean, *both], "mean")
+    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), mean]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(given.weights or out / "weights")]
     run(release, "release")

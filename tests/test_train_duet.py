@@ -42,6 +42,9 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
         assert command[command.index(flag) + 1] == tokenizer
         assert command[command.index("--trainer.max_steps") + 1] == "9"
         assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
+    before = str(recipe.last_checkpoint(tmp_path / "denoiser"))
+    command = recipe.fit_command("on", tmp_path, 9, [])
+    assert command[command.index("--model.start_from") + 1] == before and "--model.tokenizer" not in command
     assert recipe.steps_done(tmp_path / "denoiser") == 0
     save(tmp_path / "denoiser", 5)
     assert recipe.steps_done(tmp_path / "denoiser") == 5
@@ -61,13 +64,15 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
     with monkeypatch.context() as stopped:
         stopped.setattr(recipe, "run", lambda command, what: None)
         with pytest.raises(SystemExit, match="denoiser was stopped"):
-            recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "decoder=5"])
+            recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "decoder=5"])
     monkeypatch.setattr(recipe, "run", whole)
     capsys.readouterr()
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "decoder=5"])
-    configs = [command[command.index("--config") + 1] for command in ran[:-1]]
-    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_decoder"]
-    assert "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "decoder=5"])
+    configs = [command[command.index("--config") + 1] for command in ran[:-2]]
+    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_on", "duet_decoder"]
+    made, *averaged = (Path(name) for name in ran[-2][2:])
+    assert averaged == [recipe.last_checkpoint(tmp_path / stage) for stage in ("on", "denoiser")]
+    assert str(made) in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="run the same command again"):
@@ -94,8 +99,8 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "decoder=1", *small])
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "decoder=1", *small])
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "decoder=1", *small])
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "on=1", "decoder=1", *small])
     said = capfd.readouterr().out
     assert "tokenizer: has its 1 steps already" in said and "denoiser, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")

@@ -62,21 +62,27 @@ class OnlineRollout(Rollout):
         """Rows whose bodies are final."""
         return self.first + self.world.finalized
 
+    def check(self, frames: Scene) -> None:
+        """Refuse what is given in frames that come next, where it is not finite or no rotation.
+
+        Raises:
+            ValueError: names agent and frame.
+        """
+        known = self._known(self.made, self.made + frames.frames // TOKEN_FRAMES)[:, : frames.agents]
+        # The floor was checked in the past; later frames may leave it, because somebody jumps or is carried.
+        check_given(frames, known, any_floor=True)
+
     def feed(self, frames: Scene) -> Scene:
         """The same frames with what the task generates in them, final.
 
         Args:
-            frames: (B, 4 n), a whole number of the task's blocks; of whoever is generated nothing is read.
-
-        Raises:
-            ValueError: motion that is not finite, or no rotation.
+            frames: (B, 4 n), a whole number of the task's blocks, which `check` takes; of whoever is generated
+                nothing is read.
         """
         begins, ends = self.made, self.made + frames.frames // TOKEN_FRAMES
         fed = frames.replace(given=None, valid=None, names=()).to_float32().to(self.model.device)
         fed = fed.pad_agents(self.model.layout.agents)
-        # The floor was checked in the past; later frames may leave it, because somebody jumps or is carried.
         known = self._known(begins, ends)
-        check_given(fed, known, any_floor=True)
         self.scene = cat_time([self.scene.replace(valid=None, names=()), mask_unknown(fed, known)])
         self.there = ends
         return self._advance(begins)
@@ -101,5 +107,5 @@ class OnlineRollout(Rollout):
 
     def _known(self, first: int, stop: int) -> Tensor:
         """What is given after the context is given throughout."""
-        rows = self.known[first:stop]
-        return torch.cat([rows, self.known[-1:].expand(stop - first - len(rows), -1)])
+        rows = torch.arange(first, stop, device=self.known.device).clamp(max=len(self.known) - 1)
+        return self.known[rows]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from magnet.denoiser.module import Denoiser
-from magnet.generation.inputs import check_given, check_request
+from magnet.generation.inputs import check_request
 from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -17,6 +19,14 @@ from magnet.tasks.partner import MotionControl, chosen
 
 SAME_SHAPE = 1e-2
 """Shape numbers that differ by less are the same, written less precisely: it moves joints by under a millimetre."""
+
+FASTEST = 1.0
+"""Metres that somebody given moves from one frame to the next, at most: 30 m/s. Whoever moves further has jumped."""
+
+
+def places(scene: Scene) -> NDArray[np.float32]:
+    """Where people are, in NumPy, where so little costs less. (B, T, P, 3) metres"""
+    return scene.T_world_root.cpu().float().numpy()[..., :3, 3]
 
 
 class Partner:
@@ -56,6 +66,8 @@ class Partner:
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present, self._betas, self._body = past.present.cpu(), past.betas.cpu().float(), past.body
         self._given = torch.tensor([agent not in self.task.target for agent in range(past.agents)])
+        self._followed = (self._present & self._given).numpy()
+        self._places = places(past)[:, -1]  # in the last frame that was taken
         whole = past.slice(past.frames % TOKEN_FRAMES).replace(valid=None, given=None)
         self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
 
@@ -74,8 +86,8 @@ class Partner:
                 of those who answer nothing is read. A whole number of blocks.
 
         Raises:
-            ValueError: not a whole number of blocks, motion that is not finite, or other scenes, people, shapes or
-                frame rate. Nothing has been taken then: the same frames may be given again.
+            ValueError: not a whole number of blocks, motion that is not finite or jumps by over `FASTEST`, or other
+                scenes, people, shapes or frame rate. Nothing has been taken then: the same frames may be given again.
         """
         require_rate(frames, "frames")
         block = self.task.block * TOKEN_FRAMES
@@ -87,12 +99,25 @@ class Partner:
         if frames.present.shape != self._present.shape or not torch.equal(frames.present.cpu(), self._present):
             raise ValueError("frames: expected the scenes and people of the past, in the same slots")
         self._require_shapes(frames)
-        if frames.frames > block:  # refused half-way they could not be given again; a single block is checked when fed
-            check_given(frames, self._given.expand(frames.frames // TOKEN_FRAMES, -1), any_floor=True)
+        self.stream.check(frames)  # all of them at first: refused half-way they could not be given again
+        now = places(frames)
+        self._require_steps(now)
         # Block by block: what has been fed beyond a block is not to be read in it.
         answers = [self.stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        self._places = now[:, -1]
         answer = cat_time(answers).replace(names=frames.names)
         return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))
+
+    def _require_steps(self, now: NDArray[np.float32]) -> None:
+        """Refuse who is given and was elsewhere a frame before: nobody can answer that. now (B, T, P, 3)"""
+        steps = np.linalg.norm(np.diff(now, axis=1, prepend=self._places[:, None]), axis=-1)
+        far = (steps > FASTEST) & self._followed[:, None]
+        if far.any():
+            b, frame, agent = np.argwhere(far)[0].tolist()
+            raise ValueError(
+                f"frames: agent {agent} moves {steps[b, frame, agent]:.1f} m to frame {frame}, expected at most "
+                f"{FASTEST:g}: leave such frames out, or begin a new Partner from a past behind the jump"
+            )
 
     def _require_shapes(self, frames: Scene) -> None:
         """Refuse other bodies than the past's, which would be answered as if they were the past's."""

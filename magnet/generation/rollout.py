@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from magnet.checks import require_whole
 from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import Sampling
@@ -114,14 +115,14 @@ def stream(
             which is off here unless they do.
 
     Raises:
-        ValueError: as `generate`; or the task cannot go on without end, or a chunk has no tokens.
+        ValueError: as `generate`; or the task cannot go on without end, or a chunk is no whole number of tokens.
     """
     options = options or SamplerOptions()
     if chunk is None:
         options = options.filled(Sampling(settle="off"))
         chunk = None if options.settle == "off" else CHUNK
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk: got {chunk}, expected at least 1 token step")
+    if chunk is not None:
+        require_whole("chunk", chunk, 1)
     more = (options, generator, progress, stats, chunk, cond)
     return Rollout(model, scene, task, context, frames, samples, *more).chunks()
 

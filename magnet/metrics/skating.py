@@ -82,7 +82,8 @@ class FootSkating(ClipMeans):
         return [clip_sums(speed, slides), clip_sums(slides.double(), scored), clip_sums(stands.double(), scored)]
 
     def compute(self) -> dict[str, Tensor]:
-        return {"fs": torch.zeros_like(self.total[0]), **super().compute(), "fs_contacts": self.total[2].clone()}
+        nobody_slid = {} if self.count[1] == 0 else {"fs": torch.zeros_like(self.total[0])}
+        return {**nobody_slid, **super().compute(), "fs_contacts": self.total[2].clone()}
 
 
 class StandingToes(ClipMeans):

@@ -17,10 +17,12 @@ def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
     """Which agents are generated. (P,) bool
 
     Raises:
-        ValueError: no such agent, or nobody is left to be given.
+        ValueError: no such agent, one named twice, or nobody is left to be given.
     """
     require_wholes("target", target)
     mask = torch.zeros(grid.agents, dtype=torch.bool)
+    if len(set(target)) != len(target):
+        raise ValueError(f"target {target}: name each agent once")
     for agent in target:
         if not 0 <= agent < grid.agents:
             raise ValueError(f"target {agent}: the grid has agents 0 to {grid.agents - 1}")

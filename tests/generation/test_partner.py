@@ -59,7 +59,7 @@ def test_nothing_of_those_who_answer_is_read_from_what_is_fed(model, duet):
 def test_an_answer_is_there_before_what_comes_next(model, duet):
     """What is fed later changes nothing that was answered; what was fed before does."""
     later = duet.T_world_root.clone()
-    later[:, 40:, 1, :3, 3] += 1.0
+    later[:, 40:, 1, :3, 3] += 0.5
     moved = duet.replace(T_world_root=later)
     ours, theirs = answered(model, duet), answered(model, moved)
     assert torch.equal(ours.T_world_root[:, :24], theirs.T_world_root[:, :24])
@@ -163,6 +163,20 @@ def test_frames_that_are_refused_may_be_given_again(model, duet):
         ours.answer(duet.replace(T_world_root=broken).slice(16, 24))
     again, once = (each.answer(duet.slice(16, 24)) for each in (ours, theirs))
     assert torch.equal(again.T_world_root, once.T_world_root)
+
+
+def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet):
+    """From the frame before as within the frames; of those who answer nothing is read."""
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    for first in (16, 18):
+        moved = duet.T_world_root.clone()
+        moved[:, first:, :, 0, 3] += 50.0
+        with pytest.raises(ValueError, match=rf"agent 1 moves (49|50|51)\.\d m to frame {first - 16},"):
+            partner.answer(duet.replace(T_world_root=moved).slice(16, 20))
+    moved = duet.T_world_root.clone()
+    moved[:, :, 0, 0, 3] += 50.0
+    partner.answer(duet.replace(T_world_root=moved).slice(16, 20))
+    partner.answer(duet.slice(20, 24))
 
 
 def test_a_body_of_another_shape_than_in_the_past_is_refused(model, duet):

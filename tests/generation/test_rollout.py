@@ -323,6 +323,8 @@ def test_a_plan_that_does_not_repeat_itself_needs_an_end():
 def test_bad_requests_are_named_before_anything_is_sampled(model, recording):
     with pytest.raises(ValueError, match="chunk: got 0"):
         streamed(model, recording, JointFuture(), 8, 20, 0)
+    with pytest.raises(ValueError, match=r"chunk: got 1\.5, expected a whole number"):
+        streamed(model, recording, JointFuture(), 8, 20, 1.5)
     with pytest.raises(ValueError, match="context of 7 frames"):
         streamed(model, recording, JointFuture(), 7, 20, 4)
     with pytest.raises(ValueError, match="the task needs 400 frames, the scene has 144"):

@@ -274,6 +274,12 @@ def test_still_coordinates_are_left_out_of_interaction_and_counted() -> None:
     assert all(map(math.isfinite, got.values()))
 
 
+def test_feet_of_no_frame_skate_at_no_speed_rather_than_at_zero() -> None:
+    batch = draw_batch()
+    nobody = torch.zeros(3, 20, 3, dtype=torch.bool)
+    assert result(FootSkating(), *batch, agents=nobody) == {"fs_contacts": 0.0}
+
+
 def test_standing_or_flying_feet_skate_at_zero_and_say_which() -> None:
     generated, truth, present = draw_batch()
     still = generated.clone()

@@ -82,6 +82,8 @@ def test_at_the_full_offset_turns_are_stages():
 
 
 def test_targets_must_exist_and_leave_somebody():
+    with pytest.raises(ValueError, match=r"target \(1, 1\): name each agent once"):
+        PartnerInpainting(target=(1, 1)).schedule(Grid(4, 3, 0))
     with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 2"):
         PartnerInpainting((5,)).schedule(GRID)
     with pytest.raises(ValueError, match="not none and not all"):
