@@ -13,7 +13,7 @@ from magnet.motion.tokens import TokenLayout
 
 ENTER, LEAVE = 1.5, 2.2
 """Metres over the ground: who comes nearer than the first becomes a partner, who is further than the second stops being
-one. With 2.5 and 3.5 strangers crowd together, because the model learned from couples (docs/tasks.md, "Crowds")."""
+one. With 2.5 and 3.5 strangers crowd together, because the model learned from couples (docs/crowds.md)."""
 
 
 @dataclass(frozen=True)

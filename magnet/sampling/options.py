@@ -50,7 +50,7 @@ class SamplerOptions:
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
-            (docs/results.md): deltas are far more certain than pairwise transforms, so a little is enough.
+            (docs/experiments.md): deltas are far more certain than pairwise transforms, so a little is enough.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
@@ -58,7 +58,7 @@ class SamplerOptions:
         settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
             themselves, hands held, feet still and on the floor. `light` lets people lean on each other, `firm` leaves
             them touch; with `hold`, firm too, hands that met hold until they are 60 cm apart. None: as the model
-            is best sampled, or `off`, as in crowds, live runs and streams.
+            is best sampled, or `off`, as in streams and for a live partner (docs/corrections.md).
         smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
             the one after the last is as it is expected. And people go on from what is given as fast as they went.
@@ -69,11 +69,11 @@ class SamplerOptions:
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
         blend: frames over which a seam is blended, after given frames and before them; 20 were chosen on take 3.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
-            `solver`, `spacing` and `steps` chosen on validation scenes (docs/results.md).
+            `solver`, `spacing` and `steps` chosen on validation scenes (docs/experiments.md).
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
             beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
-            models learned from couples (docs/tasks.md).
+            models learned from couples (docs/crowds.md).
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step share one level; `independent`: each token of each agent has

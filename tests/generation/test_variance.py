@@ -44,7 +44,7 @@ def test_the_options_that_ship_keep_the_variance(variance, steps):
     [(6, (0.96, 0.83, 0.68)), (4, (0.65, 0.35, 0.55)), (2, (0.21, 0.03, 0.00))],
 )
 def test_with_fewer_than_eight_steps_this_much_is_left_and_docs_say_so(steps, left):
-    """What a second order cannot reach, by number: docs/results.md, Solvers."""
+    """What a second order cannot reach, by number: docs/tasks.md, "Solver and levels"."""
     for variance, share in zip((1.0, 0.1, 0.01), left, strict=True):
         assert share_left(replace(SamplerOptions(), steps=steps), variance) == pytest.approx(share, abs=0.015)
 
