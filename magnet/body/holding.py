@@ -15,7 +15,8 @@ from magnet.motion.runs import true_runs
 HELD = 0.20
 """Metres between the middles of two hands that hold each other, as in the metric."""
 PARTED = 0.60
-"""Metres between two hands that held each other and do no longer; chosen on CMU's salsa (docs/experiments.md)."""
+"""Metres between two hands that held each other and do no longer; chosen on CMU's salsa
+(docs/experiments_corrections.md)."""
 GRIP = 0.10
 """Metres between the middles of hands that hold: half of those held in CMU's salsa are nearer."""
 BREAK = 0.27

@@ -41,7 +41,7 @@ RATE = 30.0
 PANEL = (480, 400)
 """Pixels of a moving picture's panel."""
 STEADY = 100
-"""Noise level at which what is finished is shown in a long scene (docs/experiments.md)."""
+"""Noise level at which what is finished is shown in a long scene (docs/experiments_duet1.md)."""
 COLUMNS = 9
 MADE = "duet"
 """A scene that the model made from nothing, and that comes with it."""

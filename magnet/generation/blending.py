@@ -18,10 +18,11 @@ SPRING = 5.0
 put elsewhere slide for longer. With `blend` 20 a difference is halved in 7 frames."""
 
 GAINS = 2.0
-"""Frames within which people who go on stop to gain or lose speed as they did (docs/experiments.md)."""
+"""Frames within which people who go on stop to gain or lose speed as they did (docs/experiments_sampling.md)."""
 
 GOES_ON = 18
-"""Frames in which people who were given come from the speed they had to the one predicted (docs/experiments.md)."""
+"""Frames in which people who were given come from the speed they had to the one predicted
+(docs/experiments_sampling.md)."""
 
 QUICK = 0.03
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
@@ -225,8 +226,8 @@ def smoothed_path(T_world_can: Tensor, placed: Tensor, fixed: Tensor) -> Tensor:
     """Canonical frames whose places are averaged with those of the frames before and after, 1 : 2 : 1.
 
     Networks that tell only what noise hides tremble by about a millimetre a frame in where people stand, which makes
-    the pelvis jerk thrice as much as it should; averaged it does so no more (docs/experiments.md). The first and the
-    last frame stay.
+    the pelvis jerk thrice as much as it should; averaged it does so no more (docs/experiments_sampling.md). The first
+    and the last frame stay.
 
     Args:
         T_world_can: (B, T, P, 4, 4).

@@ -25,7 +25,7 @@ BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 
 FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
-rather than by moving people about (docs/experiments.md)."""
+rather than by moving people about (docs/experiments_corrections.md)."""
 
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""

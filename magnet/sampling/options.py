@@ -50,7 +50,7 @@ class SamplerOptions:
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
-            (docs/experiments.md): deltas are far more certain than pairwise transforms, so a little is enough.
+            (docs/experiments_duet1.md): deltas are far more certain than pairwise transforms, so a little is enough.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
@@ -69,7 +69,7 @@ class SamplerOptions:
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
         blend: frames over which a seam is blended, after given frames and before them; 20 were chosen on take 3.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
-            `solver`, `spacing` and `steps` chosen on validation scenes (docs/experiments.md).
+            `solver`, `spacing` and `steps` chosen on validation scenes (docs/experiments_duet1.md).
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
             beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
