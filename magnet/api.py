@@ -204,7 +204,7 @@ class NotebookView:
 class Model:
     """A trained model with its sampler.
 
-    Every method takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
+    What samples whole scenes takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
     b * samples + s of the result, which includes the given frames. `cond` is the condition of each scene, for models
     with conditions, as in `magnet.generation.rollout.generate`; `sampler.guidance.cond_weight` is its weight.
     """
@@ -231,7 +231,8 @@ class Model:
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
-        """Generate a scene of people of average shape; a crowd of more than `most_people` begins as couples.
+        """Generate a scene of people of average shape. A crowd of more than `most_people` begins as couples of other
+        shapes, whose first second is given to all samples.
 
         Raises:
             ValueError: more than 200 people, or too few frames for a crowd.

@@ -56,6 +56,16 @@ def require_choice(name: str, value: object, choices: object) -> None:
         raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(choices))}")
 
 
+def require_flag(name: str, value: object, unsaid: bool = False) -> None:
+    """Refuse what is neither True nor False; None is accepted where it may be left `unsaid`.
+
+    Raises:
+        ValueError: names the field, and what was got.
+    """
+    if not isinstance(value, bool) and not (unsaid and value is None):
+        raise ValueError(f"{name}: got {value!r}, expected True or False")
+
+
 def _require(
     name: str, value: object, kind: str, least: float | None, most: float | None, over: float | None = None
 ) -> None:

@@ -53,7 +53,7 @@ class SamplePictures(Callback):
     ) -> None:
         for name, value in (("scenes", scenes), ("every", every), ("columns", columns)):
             require_whole(name, value, 1)
-        self.task, self.sampler = registry.get(task)(), SamplerOptions(steps=steps)
+        self.task, self.sampler = registry.get(task)(), SamplerOptions(steps=steps, any_floor=True)
         self.scenes, self.every, self.columns, self.seed = scenes, every, columns, seed
         self.validations = 0
 

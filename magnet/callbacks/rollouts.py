@@ -67,7 +67,7 @@ class RollOuts(Callback):
         if frames[1] < frames[0]:
             raise ValueError(f"frames: got {frames}, expected the fewest first")
         self.share, self.every, self.scenes, self.frames, self.stretches = share, every, scenes, frames, stretches
-        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False)  # what it makes by itself
+        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False, any_floor=True)  # what it makes
         self.return_frames = return_frames
         self.task = registry.get("joint_future")()
         self.kept: list[Scene] = []
@@ -112,6 +112,8 @@ class RollOuts(Callback):
         """
         frames = batch.frames
         past = frames // 2 // TOKEN_FRAMES * TOKEN_FRAMES
+        if past < COMPARED:
+            raise ValueError(f"RollOuts: got windows of {frames} frames, expected at least {2 * COMPARED}")
         near = NearestNeighbour(concatenate(self.kept).slice(0, COMPARED + frames - past))
         people = torch.tensor([int(n) in near.stretches for n in batch.present.sum(dim=1)])
         whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()

@@ -12,6 +12,8 @@ from magnet.cli.errors import CommandError
 if TYPE_CHECKING:
     from magnet.motion.scene import Scene
 
+USD = (".usdc", ".usda", ".usdz")
+
 EPILOG = """\
 OUT's suffix:
   .npz    the scene itself; with --smplx, SMPL-X's conventional keys
@@ -71,6 +73,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.export.bones import BoneOptions
 
     out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size), not options.person)
+    refuse_unused(options, out.suffix.lower())
     if options.context < 0:
         raise CommandError(f"--context {options.context}: expected 0 frames or more")
     given = dict(pair.partition("=")[::2] for pair in options.joint)
@@ -117,6 +120,24 @@ def main(arguments: Sequence[str] = ()) -> int:
     )
     scene_files.say_written(written)
     return 0
+
+
+def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
+    """Refuse options that a format has no use for.
+
+    Raises:
+        CommandError: names the option and what it is for.
+    """
+    bones = (".glb", ".fbx", *USD)
+    for flag, plain, takes in (
+        ("unit", "m", (".bvh",)),
+        ("smplx", False, (".npz",)),
+        ("names", "smplx", bones),
+        ("root", "floor", bones),
+        ("clips", "scene", (".glb",)),
+    ):
+        if getattr(options, flag) != plain and suffix not in takes:
+            raise CommandError(f"--{flag}: is for {', '.join(takes)}, and does nothing in {suffix}")
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:

@@ -107,7 +107,9 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
     name, out = given.value("ckpt_path"), given.value("out")
     if name is None and (command == "fit" or given.only_shown):
         return None
-    folders = [Path(out)] if out and command == "fit" else [Path(out or runs), runs / run, runs]
+    if command == "fit":
+        return checkpoint_config.find_checkpoint(name, [Path(out) if out else runs / run])
+    folders = [Path(out or runs), runs / run, runs]
     return checkpoint_config.find_checkpoint(name, folders)
 
 

@@ -41,7 +41,8 @@ class MotionDataModule(LightningDataModule):
         max_agents: slots P of every batch; smaller scenes leave slots empty (paper 4, 2 to 4 people).
         augment: what happens to training windows.
         test: scenes to test on.
-        weights: share of each source of clips among training windows; None: as many as it has frames.
+        weights: share of each source of clips among training windows; what is not named is not trained on, which a
+            warning says unless its share is 0. None: as many as it has frames.
         epoch_size: training windows per epoch over all processes; None: four times as many as fit side by side into
             the training frames.
         val_batch_size: scenes a validation batch.

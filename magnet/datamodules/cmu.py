@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -186,7 +187,7 @@ class CMU(Prepared):
         **kwargs: as for Prepared.
 
     Raises:
-        ValueError: a take is in two splits, or a store is to be played at other speeds.
+        ValueError: a take is in two splits, or a store is given beside what is for recordings.
     """
 
     reader: ClassVar[type[Reader] | None] = CMUReader
@@ -208,9 +209,6 @@ class CMU(Prepared):
         **kwargs: Any,
     ) -> None:
         super().__init__(path=path, device_resident=device_resident, **kwargs)
-        if path and (root or speeds):
-            also = "root" if root else "speeds"
-            raise ValueError(f"path: got the store {path} beside {also}, which is for recordings; leave one out")
         self.root, self.cache, self.speeds = root, cache, tuple(speeds)
         self.read_options: Mapping[str, Any] = {
             "singles": singles,
@@ -221,6 +219,14 @@ class CMU(Prepared):
             "fps": fps,
             "trim": trim,
         }
+        given = {"root": root, "cache": cache, "speeds": self.speeds or None, **self.read_options}
+        plain = inspect.signature(CMU.__init__).parameters
+        also = [name for name, value in given.items() if value is not None and value != plain[name].default]
+        if path and also:
+            raise ValueError(
+                f"path: got the store {path} beside {also[0]}, which is for recordings: leave it out; what a store "
+                "holds is chosen when it is made, magnet data prepare cmu --help"
+            )
 
     # -- recordings ----------------------------------------------------------------------------
 

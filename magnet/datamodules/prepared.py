@@ -27,8 +27,8 @@ class Prepared(MotionDataModule):
         root: another name of `path`, as the folders of other data sets are called.
         spread: let each process read its own part if there are enough clips; False: all draw from all clips.
         roles: words such as leader and follower; people whose names in the store hold the first word get the first
-            slots, and so on; others follow in the order of the recording. Without effect unless `augment.shuffle` is
-            off.
+            slots, and so on; others follow in the order of the recording. In training it has no effect unless
+            `augment.shuffle` is off; in tests it always says who is agent 0.
         device_resident: keep all frames decoded in memory, on the trainer's device; for stores that fit there.
         body_model: "open", or the path of the body file that the store was prepared with.
         max_agents: slots P of every batch; at least the store's largest group.

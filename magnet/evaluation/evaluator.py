@@ -212,7 +212,7 @@ class Evaluator(L.LightningModule):
             "task": type(self.task).__name__,
             "task options": repr(self.task),
             "samples": self.samples,
-            "sampler": repr(self.sampler),
+            "sampler": repr(self.sampler.filled(self.denoiser.sampling)),
             "test scenes": self.scenes,
             "context frames": self.context,
             "horizon frames": self.horizon,

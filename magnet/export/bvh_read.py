@@ -88,7 +88,7 @@ def read_bvh(path: str | Path) -> Bvh:
         if moved:
             place[:, k] = _placed(offsets[k], moved, T)
     names = tuple(joint.name for joint in joints)
-    return Bvh(names, parents, offsets, place, local, _rate(header.seconds), path)
+    return Bvh(names, parents, offsets, place, local, _rate(header.seconds, header.digits), path)
 
 
 def _placed(offset: Floats, moved: dict[int, Floats], frames: int) -> Floats:
@@ -137,10 +137,13 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
     return values
 
 
-def _rate(step: float) -> float:
-    """Frames a second of a Frame Time that may have been rounded to few digits."""
-    fps = 1 / step
+def _rate(seconds: float, digits: int) -> float:
+    """Frames a second of a Frame Time that may have been rounded to few digits, such as 0.033."""
+    fps = 1 / seconds
     nearest = min(RATES, key=lambda rate: abs(rate - fps))
     if abs(nearest - fps) < 5e-4 * fps:
         return nearest
-    return float(round(fps)) if abs(round(fps) - fps) < 1e-3 * fps else fps
+    if abs(round(fps) - fps) < 1e-3 * fps:
+        return float(round(fps))
+    rounded = [rate for rate in RATES if digits > 2 and round(1 / rate, digits) == seconds]
+    return min(rounded, key=lambda rate: (rate != round(rate), abs(rate - fps)), default=fps)

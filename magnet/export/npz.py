@@ -34,10 +34,12 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
         The paths written.
 
     Raises:
-        ValueError: more than one scene, or another body's.
+        ValueError: more than one scene, nobody present, or another body's.
     """
     require_one(scene)
     require_body(scene, body.id)
+    if not bool(scene.present.any()):
+        raise ValueError("nobody is present in the scene, so there is nobody to write")
     scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
     rotations = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)

@@ -73,7 +73,7 @@ def contact_sheet(
         if row:
             draw.line((0, top + row * cell[1], page.width, top + row * cell[1]), fill=(226, 229, 235))
     path = Path(path)
-    if path.suffix != ".png":
+    if path.suffix.lower() != ".png":
         raise ValueError(f"{path.name}: pictures are written as .png")
     path.parent.mkdir(parents=True, exist_ok=True)
     page.save(path)

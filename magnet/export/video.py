@@ -80,7 +80,7 @@ def render_video(
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         with _reporting(progress, path.name) as report:
-            {".mp4": _write_mp4, ".gif": _write_gif, ".webp": _write_webp}[path.suffix](film, part, report)
+            {".mp4": _write_mp4, ".gif": _write_gif, ".webp": _write_webp}[path.suffix.lower()](film, part, report)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -30,6 +30,7 @@ class BvhHeader:
     frames: int
     seconds: float  # a frame lasts
     first: int  # line of the first frame, from 0
+    digits: int  # behind the point, that `seconds` is written with
 
     @property
     def width(self) -> int:
@@ -68,7 +69,7 @@ def bvh_header(lines: Sequence[str], path: object) -> BvhHeader:
         raise ValueError(f"{path}:{begin + 2}: expected the lines 'Frames: N' and 'Frame Time: SECONDS'") from error
     if not 0 < seconds < 10 or frames < 1:
         raise ValueError(f"{path}:{begin + 2}: {frames} frames of {seconds:g} s; expected at least one of 0 to 10 s")
-    return BvhHeader(tuple(joints), frames, seconds, at)
+    return BvhHeader(tuple(joints), frames, seconds, at, len(head["frame time"].partition(".")[2]))
 
 
 class _Hierarchy:

@@ -39,11 +39,11 @@ def slerp_quat(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 
 def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:
     """The two frames that new frame i, at time i / target, lies between, and how far on: before, after, share."""
-    count = math.floor((frames - 1) * target / fps + 1e-9) + 1
+    count = math.floor((frames - 1) * target / fps + 1e-6) + 1
     place = torch.arange(count, dtype=torch.float64) * (fps / target)
-    before = (place + 1e-9).floor().long().clamp_max(frames - 1)
+    before = (place + 1e-6).floor().long().clamp_max(frames - 1)
     share = (place - before).clamp(0.0, 1.0)
-    share[share < 1e-9] = 0.0  # exact frames stay exact, and need no valid neighbour
+    share[share < 1e-6] = 0.0  # exact frames stay exact, and need no valid neighbour
     return before, (before + 1).clamp_max(frames - 1), share
 
 
@@ -82,19 +82,7 @@ def at_speed(scene: Scene, speed: float) -> Scene:
         raise ValueError(f"speed: got {speed}, expected a positive number such as 0.9 or 1.1")
     if speed == 1 or scene.frames < 2:
         return scene
-    frames = int((scene.frames - 1) / speed) + 1
-    time = (torch.arange(frames, dtype=torch.float64, device=scene.device) * speed).clamp(max=scene.frames - 1)
-    before = time.long().clamp(max=scene.frames - 2)
-    share = (time - before).to(scene.T_world_root.dtype)
-    rotations = torch.cat([scene.T_world_root[..., None, :3, :3], scene.body_rot], dim=-3)  # (B, T, P, 22, 3, 3)
-    first, second = rotations[:, before], rotations[:, before + 1]
-    turned = slerp(first, second, share[:, None, None])
-    ground = scene.T_world_root[..., :3, 3]
-    position = torch.lerp(ground[:, before], ground[:, before + 1], share[:, None, None])
-    valid = None if scene.valid is None else scene.valid[:, before] & scene.valid[:, before + 1]
-    return scene.replace(
-        body_rot=turned[..., 1:, :, :], T_world_root=rigid(turned[..., 0, :, :], position), valid=valid
-    )
+    return resampled(scene.replace(fps=scene.fps * speed), scene.fps)
 
 
 def resampled(scene: Scene, fps: float) -> Scene:
@@ -115,13 +103,8 @@ def resampled(scene: Scene, fps: float) -> Scene:
         return scene
     if not scene.frames:
         return scene.replace(fps=float(fps))
-    frames = math.floor((scene.frames - 1) / scene.fps * fps + 1e-6) + 1
-    at = torch.arange(frames, dtype=torch.float64) * (scene.fps / fps)
-    low = (at + 1e-9).floor().long().clamp(max=scene.frames - 1)
-    high = (low + 1).clamp(max=scene.frames - 1)
-    share = (at - low).clamp(0.0, 1.0).to(scene.T_world_root)
-    share = torch.where(share < 1e-6, torch.zeros_like(share), share)  # a frame that is there comes back as it is
-    low, high = low.to(scene.device), high.to(scene.device)
+    low, high, share = times(scene.frames, scene.fps, fps)
+    low, high, share = low.to(scene.device), high.to(scene.device), share.to(scene.T_world_root)
     place = scene.T_world_root[..., :3, 3]
     moved = torch.lerp(place[:, low], place[:, high], share[:, None, None])
     turned = _slerp_frames(scene.T_world_root[..., :3, :3], low, high, share)

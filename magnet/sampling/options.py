@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
-from magnet.checks import require_choice, require_number, require_whole
+from magnet.checks import require_choice, require_flag, require_number, require_whole
 from magnet.motion.neighbours import ENTER, LEAVE
 from magnet.motion.placement import Placement
 from magnet.sampling.guidance import Guidance
@@ -120,10 +120,12 @@ class SamplerOptions:
         if not isinstance(self.guidance, Guidance):
             raise ValueError(f"guidance: got {self.guidance!r}, expected a Guidance, such as Guidance(kind='history')")
         choices = {"placement": Placement, "solver": Solver, "precision": Precision}
-        choices |= {"apart": Separation, "body_guidance": Separation}
+        choices |= {"apart": Separation, "body_guidance": Separation, "noise_sampling": NoiseSampling}
         choices |= {} if self.settle is None else {"settle": Settling}
         for name, known in choices.items():
             require_choice(name, getattr(self, name), known)
+        for name in ("settle_blocks", "keep_given", "any_floor", "compile", "smooth_path", "requantize"):
+            require_flag(name, getattr(self, name), unsaid=name in ("smooth_path", "requantize"))
         require_whole("steps", self.steps, 1, LEVELS)
         if self.stride is not None:
             require_whole("stride", self.stride, 1)

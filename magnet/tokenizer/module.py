@@ -272,7 +272,7 @@ class Tokenizer(L.LightningModule):
 
     def augmented(self, scene: Scene, batch_idx: int) -> Scene:
         augment = self.augment
-        generator = self._generator("augment", self.global_step, batch_idx)
+        generator = self._generator("augment", self.global_step, batch_idx, self.global_rank)
         if augment.limb_swap_prob:
             scene = swap_limbs(scene, augment.limb_swap_prob, generator)
         return joint_noise(scene, augment.joint_noise, generator) if augment.joint_noise else scene
@@ -299,7 +299,8 @@ class Tokenizer(L.LightningModule):
         quantized = self.quantizer(embedded, seen.tokens, self._generator("codebook", self.global_step, batch_idx))
         deltas = seen.deltas
         if self.training and self.augment.root_noise:
-            deltas = root_noise(deltas, self.augment.root_noise, self._generator("drift", self.global_step, batch_idx))
+            generator = self._generator("drift", self.global_step, batch_idx, self.global_rank)
+            deltas = root_noise(deltas, self.augment.root_noise, generator)
         pose = self._reconstruct(quantized.latent, seen.betas, by_token(deltas), seen.valid)
         with torch.autocast(pose.device.type, enabled=False):
             joints = self._canonical_joints(seen) if any(getattr(self.loss, name) for name in JOINT_LOSSES) else None

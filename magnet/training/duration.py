@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Timer
 
 from magnet.training.step_rate import WARM_UP, now
 
@@ -18,15 +19,19 @@ class Duration(Callback):
     """Prints, after the first eight steps, how long the rest will take here, and how to make it shorter."""
 
     def __init__(self) -> None:
-        self.seen = 0
+        self.seen, self.step = 0, -1
         self.begun = 0.0
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        if trainer.global_step == self.step:  # of a step's several batches (accumulate_grad_batches) the first counts
+            return
+        self.step = trainer.global_step
         if self.seen in (WARM_UP, WARM_UP + MEASURED):
             if self.seen > WARM_UP:  # from start to start: waiting for data counts, too
                 seconds = (now(pl_module.device) - self.begun) / MEASURED
                 if trainer.is_global_zero:
-                    print(announced(seconds, steps_left(trainer), where(pl_module.device)), flush=True)
+                    steps = min(steps_left(trainer), seconds_left(trainer) / seconds)
+                    print(announced(seconds, steps, where(pl_module.device)), flush=True)
             self.begun = now(pl_module.device)
         self.seen += 1
 
@@ -37,6 +42,13 @@ def steps_left(trainer: Trainer) -> float:
     if trainer.max_steps >= 0:
         limits.append(float(trainer.max_steps))
     return max(min(limits) - trainer.global_step, 0.0)
+
+
+def seconds_left(trainer: Trainer) -> float:
+    """Seconds until `max_time` ends a training; infinite where none was given."""
+    timers = [each for each in trainer.callbacks if isinstance(each, Timer)]  # type: ignore[attr-defined]
+    left = [time for time in (each.time_remaining() for each in timers) if time is not None]
+    return max(min(left, default=math.inf), 0.0)
 
 
 def announced(seconds: float, steps: float, place: str) -> str:

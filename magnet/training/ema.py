@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
@@ -26,3 +29,17 @@ class WeightEMA(WeightAveraging):
             return torch.lerp(averaged, current, 1 - young)
 
         super().__init__(use_buffers=False, avg_fn=average)
+        self._own: dict[str, Tensor] | None = None  # weights of a training that has ended, before the average took over
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._own = None
+        super().on_train_start(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._own = {name: value.clone() for name, value in pl_module.state_dict().items()}
+        super().on_train_end(trainer, pl_module)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(trainer, pl_module, checkpoint)
+        if self._own is not None and "current_model_state" in checkpoint:
+            checkpoint["current_model_state"] = self._own

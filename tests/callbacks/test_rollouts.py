@@ -44,6 +44,25 @@ def test_the_past_is_made_and_what_follows_is_recorded(made):
     assert found(pasts.scenes.body_rot[0, -1, 0, 0])
 
 
+def test_windows_that_are_too_short_for_a_past_are_refused(made):
+    batch, _, model = made
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
+    rolling.keep(batch)
+    with pytest.raises(ValueError, match="windows of 28 frames, expected at least 32"):
+        rolling.rolled_out(model, batch.slice(0, 28), torch.Generator().manual_seed(1))
+
+
+def test_people_far_from_the_floor_are_rolled_out_too(made):
+    """On stairs or a stage: a training does not end there."""
+    batch, _, model = made
+    high = batch.T_world_root.clone()
+    high[..., 1, 3] += 3.0
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
+    rolling.keep(batch.replace(T_world_root=high))
+    pasts = rolling.rolled_out(model, batch.replace(T_world_root=high), torch.Generator().manual_seed(1))
+    assert pasts is not None and pasts.scenes.T_world_root.isfinite().all()
+
+
 def test_nothing_is_rolled_out_where_nobody_has_been_seen(made):
     batch, _, model = made
     rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)

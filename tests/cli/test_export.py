@@ -36,6 +36,22 @@ def test_one_scene_of_several_becomes_one_file(stored: Path, capsys: pytest.Capt
     assert out.read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.parametrize(
+    ("suffix", "words", "flag"),
+    [
+        ("glb", ["--unit", "cm"], "--unit: is for .bvh"),
+        ("bvh", ["--smplx"], "--smplx: is for .npz"),
+        ("bvh", ["--names", "mixamo"], "--names: is for .glb, .fbx"),
+        ("usda", ["--clips", "person"], "--clips: is for .glb"),
+    ],
+)
+def test_what_a_format_has_no_use_for_is_refused(
+    suffix: str, words: list[str], flag: str, stored: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["export", str(stored), str(stored.with_suffix(f".{suffix}")), *words]) == 2
+    assert flag in capsys.readouterr().err
+
+
 def test_one_person_of_several_is_written_alone(stored: Path, capsys: pytest.CaptureFixture[str]):
     out = stored.with_name("second.npz")
     assert cli.main(["export", str(stored), str(out), "--person", "1"]) == 0

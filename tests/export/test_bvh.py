@@ -79,7 +79,13 @@ def test_euler_angles_do_not_jump():
     assert np.abs(np.diff(euler_zxy(turning), axis=0)).max() < 11
 
 
-@pytest.mark.parametrize(("step", "fps"), [("0.033333", 30.0), ("0.00833333", 120.0), ("0.0417", 23.976), ("0.1", 10)])
+@pytest.mark.parametrize(
+    ("step", "fps"),
+    [
+        *(("0.033333", 30.0), ("0.00833333", 120.0), ("0.0417", 23.976), ("0.1", 10), ("0.03", 33.333)),
+        *(("0.033", 30.0), ("0.0083", 120.0), ("0.017", 60.0), ("0.042", 24.0), ("0.008", 125.0), ("0.0333", 30.0)),
+    ],
+)
 def test_a_rounded_frame_time_is_the_rate_it_stands_for(step, fps, trio: Scene, body: Body, tmp_path: Path):
     path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
     path.write_text(re.sub(r"Frame Time: \S+", f"Frame Time: {step}", path.read_text()))

@@ -38,6 +38,12 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
+@pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb"])
+def test_a_suffix_may_be_in_capitals(suffix, duet: Scene, body: Body, tmp_path: Path):
+    (path,) = formats.write(duet.slice(0, 2), tmp_path / f"a{suffix}", body, style="skeleton")
+    assert path.stat().st_size > 100
+
+
 @pytest.mark.slow
 def test_a_page_and_a_film_can_be_light_and_a_film_is_of_the_size_asked_for(duet: Scene, body: Body, tmp_path: Path):
     (page,) = formats.write(duet, tmp_path / "a.html", body, style="light")

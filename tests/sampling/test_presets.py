@@ -30,6 +30,14 @@ def test_the_default_preset_is_the_class_itself():
     assert SamplerOptions.preset("default") == SamplerOptions()
 
 
+def test_flags_and_choices_that_are_none_are_refused():
+    for name, value in {"keep_given": "no", "smooth_path": "x", "requantize": 1, "compile": None}.items():
+        with pytest.raises(ValueError, match=f"{name}: got .*, expected True or False"):
+            SamplerOptions(**{name: value})
+    with pytest.raises(ValueError, match="noise_sampling: got 'independant', expected joint or independent"):
+        SamplerOptions(noise_sampling="independant")
+
+
 @pytest.mark.parametrize("name", registry.names())
 def test_the_papers_sampler_takes_thirty_even_steps_a_stride_and_adds_no_noise(name: str):
     """Paper A.3 and 3.3, for every task: levels evenly spaced, the tokens of a segment begun together."""

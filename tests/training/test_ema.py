@@ -34,6 +34,8 @@ def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_
     loaded = Denoiser.load(tmp_path / "ema.ckpt")
     assert torch.allclose(loaded.transformer.out_proj.weight, expected, atol=1e-6)
     assert not torch.allclose(loaded.transformer.out_proj.weight, watch.seen[-1], atol=1e-6)
+    own = checkpoints.read(tmp_path / "ema.ckpt")["current_model_state"]["transformer.out_proj.weight"]
+    assert torch.equal(own, watch.seen[-1])  # what a longer training goes on from
     assert all(torch.equal(value, before[name]) for name, value in loaded.tokenizer.state_dict().items())
     assert loaded.normalizer.ready
 

@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,6 +79,9 @@ def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
     """Files whose names differ in the last word alone, such as dance_A and dance_B; in a folder, A and B alone.
 
     Everybody else is alone in a scene.
+
+    Raises:
+        DataError: two files are of one person of a scene.
     """
     told = [_told(root, path) for path in files]
     members = Counter(scene for scene, person, _ in told if person)
@@ -94,7 +97,23 @@ def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
         together[whole] = [PersonFile("", path)]
         if person:
             alone.add(whole)
+    _require_names_once(together, "take one of them away")
     return [SceneFiles(scene, tuple(people), scene in alone) for scene, people in together.items()]
+
+
+def _require_names_once(together: Mapping[str, Sequence[PersonFile]], advice: str) -> None:
+    """Refuse a scene with two files of one person, who would be two people.
+
+    Raises:
+        DataError: names the scene, the person and both files.
+    """
+    for scene, people in together.items():
+        seen: dict[str, Path] = {}
+        for each in people:
+            if each.person and each.person in seen:
+                both = f"{seen[each.person]} and {each.file}"
+                raise DataError(f"{both} are both {each.person!r} of the scene {scene!r}: {advice}")
+            seen[each.person] = each.file
 
 
 def _label(root: Path, path: Path) -> str:
@@ -122,6 +141,7 @@ def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Sc
 
     Raises:
         ValueError: the pattern lacks {scene} or {person}, or holds one twice.
+        DataError: two files are of one person of a scene.
     """
     if any(pattern.count(word) != 1 for word in ("{scene}", "{person}")):
         raise ValueError(
@@ -137,6 +157,7 @@ def by_pattern(root: Path, files: Iterable[Path], pattern: str) -> tuple[list[Sc
             together.setdefault(match["scene"], []).append(PersonFile(match["person"], path))
         else:
             strangers.append(path)
+    _require_names_once(together, "let {scene} take in the folder, as {scene}_{person} does without */ before it")
     return [SceneFiles(scene, tuple(people)) for scene, people in together.items()], strangers
 
 
@@ -162,6 +183,7 @@ def by_table(root: Path, table: Path, suffixes: Sequence[str]) -> list[SceneFile
         together.setdefault(row["scene"], []).append(PersonFile(person, file, _seconds(where, row.get("start", ""))))
     if not together:
         raise DataError(f"{table}: lists no file; expected a row a file with {', '.join(COLUMNS)}: write them")
+    _require_names_once(together, f"name another scene or person in {table}")
     return [SceneFiles(scene, tuple(people)) for scene, people in together.items()]
 
 

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from lightning.pytorch.utilities import rank_zero_warn
 from numpy.typing import NDArray
 
 from magnet.checks import require_whole
@@ -93,6 +94,8 @@ class RandomWindows:
             raise ValueError(f"weights: no training clip has the source {unknown}; there are {sorted(set(source))}")
         if min(weights.values()) < 0:
             raise ValueError(f"weights: got {dict(weights)}, expected no negative number")
+        if left := sorted(set(source) - set(weights)):
+            rank_zero_warn(f"weights: nothing of {', '.join(left)} is trained on: say a weight, or 0", stacklevel=2)
         windows = {s: self.count[source == s].sum() for s in weights}
         return np.array([weights.get(s, 0.0) / max(windows.get(s, 1), 1) for s in source])
 

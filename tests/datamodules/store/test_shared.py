@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,6 +173,19 @@ def test_shares_are_a_function_of_seed_epoch_sample_rank_and_world(store):
     assert np.array_equal(whole.starts, np.concatenate([part.starts for part in parts]))
     assert not np.array_equal(whole.starts, make(2, 4)(2, 0, 12).starts)
     assert not np.array_equal(whole.starts, make(1, 4, seed=2)(2, 0, 12).starts)
+
+
+def test_sources_that_weights_do_not_name_are_told(store):
+    """They are not trained on: who adds a data set to weighted ones would not see it."""
+    mapped, plain = data(store).store("train"), Augmentation(drop=0.0, compose=0.0)
+    mapped.sources = mapped.sources.astype(object)
+    mapped.sources[0] = "another"
+    weights = {source: 1.0 for source in mapped.sources if source != "another"}
+    with pytest.warns(UserWarning, match="nothing of another is trained on: say a weight, or 0"):
+        RandomWindows(mapped, 64, weights, plain, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RandomWindows(mapped, 64, weights | {"another": 0.0}, plain, 1)
 
 
 def test_too_few_clips_are_drawn_from_by_everybody(store):
