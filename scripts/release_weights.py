@@ -3,7 +3,8 @@
     python scripts/release_weights.py runs/duet_denoiser/latest/checkpoints/last.ckpt duet
 
 writes magnet/weights/duet: tensors in float16 safetensors, and config.json with how to build the model, what it was
-trained on, and a hash of every part. `--decoder CHECKPOINT` takes the decoder of a tokenizer that went on alone.
+trained on, and a hash of every part. `--decoder CHECKPOINT` takes the decoder of a tokenizer that went on alone. What
+it was trained on is known of the data of configs/duet_*.yaml; of others `--trained_on` says it.
 """
 
 from __future__ import annotations
@@ -22,11 +23,6 @@ RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
 HELD_OUT = ("03", "05", "10", "15")
 SUBJECTS = ("02", "05", "17", "18", "55", "60", "61", "90", "131", "135", "143")
 ABOUT = {
-    "trained on": {
-        "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
-        "CMU motion capture, single people": "subjects 02 05 17 18 55 90 131 135 143, without 02_03, 05_12 and 135_08",
-        "synthetic scenes": "magnet.datamodules.synthetic, training seeds",
-    },
     "acknowledgement": (
         "The data used in this project was obtained from mocap.cs.cmu.edu. "
         "The database was created with funding from NSF EIA-0196217."
@@ -34,6 +30,26 @@ ABOUT = {
     "licence": "Apache-2.0",
     "body": "open-1",
 }
+
+TRAINED_ON = {
+    "CMU motion capture, salsa couple (60, 61)": "takes 01 02 06 07 08 09 11; 05 10 15 held out, 03 for validation",
+    "CMU motion capture, single people": "subjects 02 05 17 18 55 90 131 135 143, without 02_03, 05_12 and 135_08",
+    "synthetic scenes": "magnet.datamodules.synthetic, training seeds",
+}
+"""What configs/duet_*.yaml train on."""
+
+
+def ours(data: Any) -> bool:
+    """Whether a data configuration holds nothing but the data sets of configs/duet_*.yaml, with their held-out takes."""
+    if isinstance(data, list):
+        return all(map(ours, data))
+    if not isinstance(data, dict) or "class_path" not in data:
+        return False
+    name, said = data["class_path"].rpartition(".")[2], data.get("init_args") or {}
+    if name == "CMU":
+        takes = {f"{take:02d}" for key in ("test_takes", "val_takes") for take in said.get(key, ())}
+        return takes == set(HELD_OUT) and not said.get("path")
+    return name == "Synthetic" or (name in ("Mixed", "Reshaped", "SoloPairs") and ours(said.get("data")))
 
 
 def without_folders(value: Any) -> Any:
@@ -87,9 +103,16 @@ def main() -> None:
     options.add_argument("name")
     options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
     options.add_argument("--folder", type=Path, default=checkpoints.FOLDER, help="where the model's folder is made")
+    options.add_argument("--trained_on", help="what other data than those of configs/duet_*.yaml were")
     given = options.parse_args()
-    about = ABOUT | {"recordings": manifest()} | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
     checkpoint = checkpoints.read(given.checkpoint)
+    known = ours((checkpoint.get("magnet_config") or {}).get("data"))
+    if not known and not given.trained_on:
+        options.error("these weights were trained on other data than configs/duet_*.yaml: say --trained_on 'WHAT'")
+    data = (
+        {"trained on": given.trained_on} if given.trained_on else {"trained on": TRAINED_ON, "recordings": manifest()}
+    )
+    about = data | ABOUT | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
     if given.decoder:
         checkpoint = with_decoder(checkpoint, checkpoints.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:

@@ -106,3 +106,16 @@ def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoi
         other = tokenizer["state_dict"] | {name: torch.randn(3)}
         with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
             with_decoder(checkpoint, tokenizer | {"state_dict": other})
+
+
+def test_what_weights_were_trained_on_is_only_told_of_the_data_that_it_is_known_of() -> None:
+    ours = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").ours
+    cmu = {"class_path": "magnet.datamodules.CMU", "init_args": {"test_takes": [5, 10, 15], "val_takes": [3]}}
+    synthetic = {"class_path": "magnet.datamodules.Synthetic", "init_args": {}}
+    others = {"class_path": "magnet.datamodules.reshaped.Reshaped", "init_args": {"data": [cmu]}}
+    mixed = {"class_path": "magnet.datamodules.Mixed", "init_args": {"data": [cmu, others, synthetic]}}
+    assert all(map(ours, (cmu, synthetic, others, mixed)))
+    taken = {**cmu, "init_args": {"test_takes": [5], "val_takes": [3]}}
+    store = {**cmu, "init_args": {**cmu["init_args"], "path": "store"}}
+    duobox = {"class_path": "magnet.datamodules.DuoBox", "init_args": {"path": "store"}}
+    assert not any(map(ours, (taken, store, duobox, [cmu, duobox], None, {})))
