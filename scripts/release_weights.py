@@ -40,7 +40,7 @@ TRAINED_ON = {
 
 
 def ours(data: Any) -> bool:
-    """Whether a data configuration holds nothing but the data sets of configs/duet_*.yaml, with their held-out takes."""
+    """Whether a data configuration holds only data sets of configs/duet_*.yaml, with their held-out takes."""
     if isinstance(data, list):
         return all(map(ours, data))
     if not isinstance(data, dict) or "class_path" not in data:
