@@ -35,7 +35,9 @@ class RollOuts(Callback):
     A model that has seen only recorded pasts does not know how to continue its own. So the sampler continues some
     scenes of the batch over several windows. The training clip whose beginning is nearest to the end of this past is
     moved there and appended, and the remaining difference fades out. Such scenes replace a share of the batch. The
-    generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.)
+    generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.) A
+    training that is gone on with rolls out at the steps at which it would have; until then it has no generated pasts,
+    for clips and roll-outs are not in its checkpoint.
 
     Args:
         share: share of the batch's scenes that are replaced.
@@ -86,6 +88,12 @@ class RollOuts(Callback):
         generator = torch.Generator(device=pl_module.device).manual_seed(seed)
         precision = trainer.precision_plugin.forward_context()
         pl_module.made_pasts = self.rolled_out(pl_module, batch, generator, precision)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"filled": self.filled}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.filled = state_dict["filled"]
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.kept, self.filled = [], -1

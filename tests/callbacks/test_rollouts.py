@@ -63,6 +63,13 @@ def test_people_far_from_the_floor_are_rolled_out_too(made):
     assert pasts is not None and pasts.scenes.T_world_root.isfinite().all()
 
 
+def test_a_training_that_is_gone_on_with_rolls_out_at_the_same_steps():
+    one, other = RollOuts(every=50), RollOuts(every=50)
+    one.filled = 100
+    other.load_state_dict(one.state_dict())
+    assert other.filled == 100
+
+
 def test_nothing_is_rolled_out_where_nobody_has_been_seen(made):
     batch, _, model = made
     rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
