@@ -20,10 +20,10 @@ from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
 from magnet.generation.crowd import generate_crowd
-from magnet.generation.crowd_start import MOST, SPACING, START, start_crowd
+from magnet.generation.crowd_start import MOST, SPACING, crowd_from_nothing, start_crowd
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
-from magnet.motion.scene import FPS, Scene, empty_scene, require_rate
+from magnet.motion.scene import FPS, Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions
@@ -231,19 +231,16 @@ class Model:
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
-        """Generate a scene of people of average shape. A crowd of more than `most_people` begins as couples of other
-        shapes, whose first second is given to all samples.
+        """Generate a scene of people of average shape, or a crowd of more than `most_people`, who differ.
 
         Raises:
-            ValueError: more than 200 people, or too few frames for a crowd.
+            ValueError: more than 200 people.
         """
         require_whole("people", people, 1, MOST)
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
-        if people > self.most_people:
-            require_whole(f"frames of a crowd, which begins with {START}", frames, START + 1)
-            return self.predict(self.start_crowd(people, seed=seed), context=START, frames=frames - START, **said)
-        empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
-        scene = empty.replace(present=torch.ones(1, people, dtype=torch.bool))
+        scene = crowd_from_nothing(people, torch.Generator().manual_seed(self._generator(seed).initial_seed()))
+        if people <= self.most_people:
+            scene = scene.replace(betas=torch.zeros_like(scene.betas))
         return self.predict(scene, "generation", context=0, frames=frames, **said)
 
     def start_crowd(

@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
     add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
     add("--task.FIELD", metavar="VALUE", help="an option of the task")
     add("--people", type=int, metavar="P", help="people in all, up to 200; those without a file are generated")
-    add("--spacing", type=float, default=3.0, metavar="M", help="metres between the groups of a crowd (default: 3)")
+    add("--spacing", type=float, metavar="M", help="metres between the groups of a crowd (default: 3)")
     add("--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)")
     frames = f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})"
     add("--frames", type=int, metavar="T", help=frames)
@@ -100,6 +100,8 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.denoiser.module import Denoiser
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
+    if options.spacing is not None:
+        sampler = dataclasses.replace(sampler, crowd_spacing=options.spacing)
     recorded, body = read_files(options)  # before the model is loaded, so that what is not there is said at once
     people = people_written(options, recorded)
     for out in outs:
@@ -169,8 +171,14 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
     Raises:
         CommandError: a crowd of which nothing is given.
     """
+    import torch
+
+    from magnet.generation.crowd_start import crowd_from_nothing
+
     people = scene.agents if options.people is None else options.people
     if people > max(model.most_people, scene.agents):
+        if not options.inputs and not options.context and options.task in (None, "generation"):
+            return crowd_from_nothing(people, torch.Generator().manual_seed(options.seed)), ()
         if options.context is None:
             options.context = CONTEXT
         if not options.context:
@@ -178,9 +186,7 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
                 f"--context 0: a crowd goes on from frames of everybody; it begins with {CONTEXT} by itself"
             )
         groups = [scene.slice(0, options.context)] if options.inputs else []
-        if options.task == "generation" and not groups:
-            options.task = None  # a crowd from nothing: couples that the model makes, from which it goes on
-        return model.start_crowd(people, groups, options.spacing, seed=options.seed), ()
+        return model.start_crowd(people, groups, model.sampler.crowd_spacing, seed=options.seed), ()
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)
     present = scene.present.clone()
@@ -243,7 +249,7 @@ def lengths(
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
 
-    crowd = scene.agents > model.most_people
+    crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
     context = options.context if options.context is not None else 0 if nothing else min(CONTEXT, recorded)

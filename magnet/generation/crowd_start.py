@@ -20,7 +20,7 @@ from magnet.tasks.joint import Generation
 MOST = 200
 """People of a crowd: more were not tried."""
 
-SPACING = 3.0
+SPACING = SamplerOptions.crowd_spacing
 """Metres from the middle of a group to that of the next, where nothing is said."""
 
 START = 32
@@ -61,13 +61,28 @@ def start_crowd(
     if not groups:
         couples = -(-people // 2)
         empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros(()))
-        shapes = (SHAPES * torch.randn(couples, 2, 10, generator=turns)).clamp(-2, 2)
+        shapes = shapes_by_chance(2 * couples, turns)
         if betas is not None:
-            shapes.view(-1, 10)[:people] = betas.cpu()
-        scene = empty.replace(present=torch.ones(couples, 2, dtype=torch.bool), betas=shapes)
+            shapes[:people] = betas.cpu()
+        scene = empty.replace(present=torch.ones(couples, 2, dtype=torch.bool), betas=shapes.view(couples, 2, 10))
         made = generate(model, scene, Generation(), 0, START, 1, options, generator).to("cpu")
         groups = [made.select([number]) for number in range(couples)]
     return compose(groups, people, turns, spacing)
+
+
+def shapes_by_chance(people: int, generator: torch.Generator | None = None) -> Tensor:
+    """Shapes of people who differ. (people, 10); generator: on the CPU"""
+    return (SHAPES * torch.randn(people, 10, generator=generator)).clamp(-2, 2)
+
+
+def crowd_from_nothing(people: int, generator: torch.Generator | None = None) -> Scene:
+    """A scene of people who differ in shape and of whom nothing else is known, for the task `generation`.
+
+    generator: of the shapes, on the CPU.
+    """
+    empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
+    there = torch.ones(1, people, dtype=torch.bool)
+    return empty.replace(present=there, betas=shapes_by_chance(people, generator)[None])
 
 
 def start_from_nothing(
@@ -79,7 +94,8 @@ def start_from_nothing(
     """
     there = scene.present[0].cpu()
     count = int(there.sum())
-    made = start_crowd(model, count, options, generator, betas=scene.betas[0, there.to(scene.device)])
+    spacing, betas = (options or SamplerOptions()).crowd_spacing, scene.betas[0, there.to(scene.device)]
+    made = start_crowd(model, count, options, generator, (), spacing, betas)
     slots = torch.where(there, there.cumsum(0) - 1, count + (~there).cumsum(0) - 1)
     made = made.pad_agents(scene.agents).permute_agents(slots).to(scene.device)
     return made.replace(body=scene.body, betas=scene.betas)

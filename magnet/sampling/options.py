@@ -74,6 +74,7 @@ class SamplerOptions:
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
             beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
             models learned from couples (docs/crowds.md).
+        crowd_spacing: metres between the couples with which a crowd from nothing begins.
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step share one level; `independent`: each token of each agent has
@@ -108,6 +109,7 @@ class SamplerOptions:
     shift: float = 1.0
     crowd_enter: float = ENTER
     crowd_leave: float = LEAVE
+    crowd_spacing: float = 3.0
     any_floor: bool = False
     guidance: Guidance = field(default_factory=Guidance)
     noise_sampling: NoiseSampling = "joint"
@@ -135,6 +137,7 @@ class SamplerOptions:
         require_whole("blend", self.blend, 0)
         require_number("crowd_enter", self.crowd_enter, over=0)
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
+        require_number("crowd_spacing", self.crowd_spacing, over=0)
         require_number("eta", self.eta, 0, 1)
         require_spacing(self.spacing, self.shift)
         if self.compile and self.precision == "reference":

@@ -42,6 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "compile": False,
         "crowd_enter": 1.5,  # the paper has no crowds
         "crowd_leave": 2.2,
+        "crowd_spacing": 3.0,
         "apart": "off",  # the paper moves nobody out of another
         "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose

@@ -97,6 +97,16 @@ def test_people_come_from_nothing_without_files(tmp_path, capsys) -> None:
     assert Scene.load(tmp_path / "trio.npz").present.tolist() == [[True] * 3]
 
 
+@pytest.mark.slow
+def test_a_crowd_comes_from_nothing_as_far_apart_as_is_said(tmp_path, capsys) -> None:
+    words = ("--people", "6", "--frames", "8", "--spacing", "8", "--out", str(tmp_path / "crowd.npz"), *QUICK)
+    said(capsys, *words)
+    made = Scene.load(tmp_path / "crowd.npz")
+    assert (made.frames, made.agents, bool(made.given.any())) == (8, 6, False)
+    middles = made.T_world_root[0, 0, :, [0, 2], 3].view(3, 2, 2).mean(dim=1)
+    assert (torch.cdist(middles, middles) + 99 * torch.eye(3)).min() > 6.0
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     few(

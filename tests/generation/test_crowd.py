@@ -239,6 +239,13 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
     assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
 
 
+def test_each_sample_of_a_crowd_from_nothing_begins_anew_and_nothing_was_given(model: Denoiser) -> None:
+    made = magnet.api.Model(model, QUICK).generate(5, 12, samples=2, seed=0)
+    assert (made.scenes, made.frames, made.agents, made.context) == (2, 12, 5, 0)
+    assert not torch.equal(made.T_world_root[0, 0], made.T_world_root[1, 0])
+    assert len(made.betas[0].unique(dim=0)) == 5 and torch.equal(made.betas[0], made.betas[1])
+
+
 @pytest.mark.slow
 @each_model("frames", [16, 40], (False, 16))
 def test_a_crowd_is_made_from_nothing_in_its_slots_and_of_its_shapes(model: Denoiser, frames: int) -> None:
