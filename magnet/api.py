@@ -20,7 +20,7 @@ from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.module import Denoiser
 from magnet.export import formats
 from magnet.generation.crowd import generate_crowd
-from magnet.generation.crowd_start import MOST, SPACING, crowd_from_nothing, start_crowd
+from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
 from magnet.motion.scene import FPS, Scene, require_rate
@@ -236,7 +236,6 @@ class Model:
         Raises:
             ValueError: more than 200 people.
         """
-        require_whole("people", people, 1, MOST)
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         scene = crowd_from_nothing(people, torch.Generator().manual_seed(self._generator(seed).initial_seed()))
         if people <= self.most_people:

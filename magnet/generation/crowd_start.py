@@ -79,7 +79,11 @@ def crowd_from_nothing(people: int, generator: torch.Generator | None = None) ->
     """A scene of people who differ in shape and of whom nothing else is known, for the task `generation`.
 
     generator: of the shapes, on the CPU.
+
+    Raises:
+        ValueError: nobody, or more people than `MOST`.
     """
+    require_whole("people", people, 1, MOST)
     empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
     there = torch.ones(1, people, dtype=torch.bool)
     return empty.replace(present=there, betas=shapes_by_chance(people, generator)[None])

@@ -216,7 +216,7 @@ def test_people_who_really_are_up_there_are_taken_if_one_says_so(model, duet):
 
 def test_a_jump_does_not_end_an_answer(model, duet):
     partner = Partner(model, duet.slice(0, CONTEXT), (1,), FAST)
-    assert partner.answer(lifted(duet, 1.2).slice(CONTEXT, CONTEXT + 4)).frames == 4
+    assert partner.answer(lifted(duet, 0.9).slice(CONTEXT, CONTEXT + 4)).frames == 4
 
 
 def test_only_those_who_are_given_are_asked_where_their_floor_is(model, duet):

@@ -97,7 +97,7 @@ def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
         together[whole] = [PersonFile("", path)]
         if person:
             alone.add(whole)
-    _require_names_once(together, "take one of them away")
+    _require_names_once(together, "name it otherwise")
     return [SceneFiles(scene, tuple(people), scene in alone) for scene, people in together.items()]
 
 
@@ -112,7 +112,7 @@ def _require_names_once(together: Mapping[str, Sequence[PersonFile]], advice: st
         for each in people:
             if each.person and each.person in seen:
                 both = f"{seen[each.person]} and {each.file}"
-                raise DataError(f"{both} are both {each.person!r} of the scene {scene!r}: {advice}")
+                raise DataError(f"{both} are both {each.person!r} of the scene {scene!r}: leave one out, or {advice}")
             seen[each.person] = each.file
 
 
