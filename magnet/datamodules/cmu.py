@@ -219,9 +219,9 @@ class CMU(Prepared):
             "fps": fps,
             "trim": trim,
         }
-        given = {"root": root, "cache": cache, "speeds": self.speeds or None, **self.read_options}
+        said = {"root": root, "cache": cache, "speeds": speeds, **self.read_options}
         plain = inspect.signature(CMU.__init__).parameters
-        also = [name for name, value in given.items() if value is not None and value != plain[name].default]
+        also = [name for name, value in said.items() if _tuple(value) != _tuple(plain[name].default)]
         if path and also:
             raise ValueError(
                 f"path: got the store {path} beside {also[0]}, which is for recordings: leave it out; what a store "
@@ -302,3 +302,8 @@ class CMU(Prepared):
     def open_store(self, split: Split) -> MemoryStore:
         """The split by memory map where it is a store that is not `device_resident`, else in memory."""
         return super().open_store(split) if self.path else MotionDataModule.open_store(self, split)
+
+
+def _tuple(value: object) -> object:
+    """A list as the tuple it stands for: a configuration file knows no tuples."""
+    return tuple(value) if isinstance(value, list) else value

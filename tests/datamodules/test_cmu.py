@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from magnet.datamodules import cmu
-from magnet.datamodules.cmu import CMU, CMUReader, is_couple
+from magnet.datamodules.cmu import CMU, VAL_SINGLES, CMUReader, is_couple
 from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
@@ -302,6 +302,7 @@ def test_a_prepared_store_holds_the_fits_of_the_cache_on_a_floor_of_its_own(fill
     assert batch.T_world_root.shape[1:3] == (data.window_frames, 2)
     with pytest.raises(ValueError, match=r"got the store .* beside speeds, which is for recordings"):
         CMU(path=str(tmp_path / "store"), speeds=(0.9,))
+    CMU(path=str(tmp_path / "store"), test_takes=[5, 10, 15], val_singles=list(VAL_SINGLES), speeds=[])
     for name, value in {"test_takes": [3], "val_singles": [], "singles": False, "trim": True, "cache": "c"}.items():
         with pytest.raises(ValueError, match=rf"beside {name}, which .* is chosen when it is made"):
             CMU(path=str(tmp_path / "store"), **{name: value})
