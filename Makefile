@@ -48,7 +48,7 @@ demo: $(READY)  ## run the main job on the embedded default: several people move
 	@echo "demo: magnet demo"
 	@$(PY) -m magnet demo
 
-train-duet: $(READY)  ## the shipped model from recordings (MAGNET_CMU) to weights; again: goes on
+train-duet: $(READY)  ## a model like the shipped one, from recordings (MAGNET_CMU) to weights; again: goes on
 	@echo "train-duet: scripts/train_duet.py, into runs/train_duet; DUET='--steps denoiser=100' hands it options"
 	@$(PY) scripts/train_duet.py $(DUET)
 

@@ -1,4 +1,4 @@
-"""The shipped model from recordings to weights in one go: tokenizer, denoiser twice, decoder, release.
+"""A model like the shipped one, from recordings to weights in one go: tokenizer, denoiser twice, decoder, release.
 
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 

@@ -12,8 +12,6 @@ from magnet.cli.errors import CommandError
 if TYPE_CHECKING:
     from magnet.motion.scene import Scene
 
-USD = (".usdc", ".usda", ".usdz")
-
 EPILOG = """\
 OUT's suffix:
   .npz    the scene itself; with --smplx, SMPL-X's conventional keys
@@ -128,6 +126,8 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
     Raises:
         CommandError: names the option and what it is for.
     """
+    from magnet.export.formats import USD
+
     bones = (".glb", ".fbx", *USD)
     for flag, plain, takes in (
         ("unit", "m", (".bvh",)),

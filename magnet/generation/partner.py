@@ -25,8 +25,8 @@ FASTEST = 1.0
 
 
 def places(scene: Scene) -> NDArray[np.float32]:
-    """Where people are, in NumPy, where so little costs less. (B, T, P, 3) metres"""
-    return scene.T_world_root.cpu().float().numpy()[..., :3, 3]
+    """Where people are, in NumPy, where so little costs less; a copy, for frames may be written over. (B, T, P, 3) m"""
+    return scene.T_world_root.cpu().float().numpy()[..., :3, 3].copy()
 
 
 class Partner:
