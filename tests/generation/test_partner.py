@@ -179,6 +179,15 @@ def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet
     partner.answer(duet.slice(20, 24))
 
 
+def test_frames_that_were_answered_may_be_written_over(model, duet):
+    """A buffer that is filled again and again, as live input is."""
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    buffer = duet.T_world_root[:, 16:20].clone()
+    partner.answer(duet.slice(16, 20).replace(T_world_root=buffer))
+    buffer[..., 0, 3] += 50.0
+    partner.answer(duet.slice(20, 24))
+
+
 def test_a_body_of_another_shape_than_in_the_past_is_refused(model, duet):
     """Of those who answer nothing is read, and half precision is no other shape."""
     partner = Partner(model, duet.slice(0, 16), (0,), FAST)
