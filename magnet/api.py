@@ -365,7 +365,7 @@ class Model:
         if frames is not None:
             require_whole("frames", frames, 1)
         else:
-            frames = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES - context
+            frames = scene.frames - context
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
         known = [field.name for field in dataclasses.fields(kind)]
@@ -384,7 +384,7 @@ class Model:
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)
         if seed is not None:
-            require_whole("seed", seed, most=2**63 - 1)
+            require_whole("seed", seed, -(2**63), 2**63 - 1)
         generator.manual_seed(int(seed)) if seed is not None else generator.seed()  # NumPy's numbers are no int
         return generator
 

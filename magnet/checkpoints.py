@@ -92,7 +92,7 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
         ValueError: neither a model of the package nor a file, or as `from_hub`.
     """
     path = named(DEFAULT if name_or_path is None else name_or_path)
-    if path.exists():
+    if path.exists() and str(name_or_path):
         return path
     there = ", ".join(names()) or "none"
     raise ValueError(f"no checkpoint {name_or_path}: not a file, nor a model that comes with the package ({there})")
@@ -191,13 +191,16 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
         raise ValueError(f"{folder}: a folder without config.json is no released model")
     try:
         config = json.loads((folder / "config.json").read_bytes())
-        version, parts = config["format"], [(part["file"], part["sha256"]) for part in config["parts"]]
+        whole = config.get("sha256", own := _config_hash(config)) == own
+        version, parts = int(config["format"]), [(part["file"], part["sha256"]) for part in config["parts"]]
         kept = {name: config[name] for name in ("steps", *KEPT)}
-    except (ValueError, KeyError, TypeError) as error:
+        if not isinstance(kept["hyper_parameters"], dict):
+            raise TypeError("it says no options of the model")
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / 'config.json'} is damaged ({error}): fetch the release again") from error
     if version > FORMAT:
         raise ValueError(f"{folder}: weights format {version}, this version reads up to {FORMAT}")
-    if config.get("sha256", own := _config_hash(config)) != own:
+    if not whole:
         raise ValueError(f"{folder / 'config.json'} is damaged: its hash is not the one in it: fetch the release again")
     state: dict[str, Tensor] = {}
     for name, digest in parts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import get_args
+from typing import Any, get_args
 
 
 def require_number(
@@ -70,18 +70,22 @@ def _require(
     name: str, value: object, kind: str, least: float | None, most: float | None, over: float | None = None
 ) -> None:
     if _fits(value, kind == "a whole number"):
-        number = float(value)  # type: ignore[arg-type]
+        number: Any = value  # a float would round seeds
         high = (least is None or number >= least) and (over is None or number > over)
         if high and (most is None or number <= most):
             return
         kind = ""
     if least is not None and most is not None:
-        wanted = f"{least:g} to {most:g}"
+        wanted = f"{_shown(least)} to {_shown(most)}"
     else:
         bounds = (("at least", least), ("over", over), ("at most", most))
-        wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
+        wanted = " and ".join(f"{word} {_shown(bound)}" for word, bound in bounds if bound is not None)
     shown = f"{value:g}" if isinstance(value, float) and kind != "a whole number" else f"{value!r}"
     raise ValueError(f"{name}: got {shown}, expected {', '.join(part for part in (kind, wanted) if part)}")
+
+
+def _shown(bound: float) -> str:
+    return f"{bound}" if isinstance(bound, int) else f"{bound:g}"
 
 
 def _fits(value: object, whole: bool) -> bool:

@@ -127,7 +127,8 @@ def main(arguments: list[str] | None = None) -> None:
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(given.weights or out / "weights")]
     run(release, "release")
-    print(f"try it: magnet test --task joint_future --ckpt_path {(given.weights or out / 'weights') / given.name}")
+    weights = shlex.quote(str((given.weights or out / "weights") / given.name))
+    print(f"try it: magnet test --task joint_future --ckpt_path {weights}")
 
 
 if __name__ == "__main__":

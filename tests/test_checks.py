@@ -96,6 +96,9 @@ def test_whole_numbers_are_no_fractions():
     with pytest.raises(ValueError, match=r"^block: got 9, expected 1 to 8$"):
         require_whole("block", 9, 1, 8)
     require_whole("block", np.int64(8), 1, 8)
+    require_whole("seed", 2**63 - 1, -(2**63), 2**63 - 1)
+    with pytest.raises(ValueError, match=f"got {2**63}, expected {-(2**63)} to {2**63 - 1}"):
+        require_whole("seed", 2**63, -(2**63), 2**63 - 1)
 
 
 def test_lists_of_whole_numbers_show_how_they_are_written():

@@ -78,6 +78,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError("--scene START and --listen ADDRESS say what to begin with and where the others hear it")
     if not 0 < given.speed <= 1:
         raise CommandError(f"--speed is {given.speed:g}, expected over 0 and at most 1, real time")
+    if given.seconds is not None and not given.seconds > 0:
+        raise CommandError(f"--seconds is {given.seconds:g}, expected over 0")
     if given.threads < 1:
         raise CommandError(f"--threads is {given.threads}, expected at least 1")
     import torch

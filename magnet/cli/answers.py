@@ -125,7 +125,8 @@ def code_digest() -> str:
     folders = {OURS}
     for group in PLUGINS:
         for point in entry_points(group=group):
-            digest.update(f"{point.group} {point.name} {point.value}\n".encode())
+            of = f" {point.dist.name} {point.dist.version}" if point.dist else ""
+            digest.update(f"{point.group} {point.name} {point.value}{of}\n".encode())
             folders |= _home(point)
     for home in sorted(folders):
         for file in sorted(home.rglob("*.py")) if home.is_dir() else [home]:

@@ -72,6 +72,11 @@ def main(arguments: Sequence[str] = ()) -> int:
     for name in ("frames", "rounds", "steps", "threads"):
         if getattr(given, name) is not None and getattr(given, name) < 1:
             raise CommandError(f"--{name} is {getattr(given, name)}, expected at least 1")
+    for name in ("people", "batch"):
+        if min(getattr(given, name) or [1]) < 1:
+            raise CommandError(f"--{name} is {min(getattr(given, name))}, expected at least 1")
+    if given.live is not None and not 0 <= given.live < float("inf"):
+        raise CommandError(f"--live is {given.live:g}, expected seconds, 0 for none")
     if given.out is not None:
         from magnet.files import require_place  # imports NumPy, which --help need not wait for
 
@@ -147,12 +152,18 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     model = load(given.model).to(given.device)
     asked = {"steps": given.steps, "precision": given.precision, "compile": given.compile or None}
     options = SamplerOptions.preset(given.sampler, **{name: v for name, v in asked.items() if v is not None})
-    people = [P for P in given.people or usual["people"] if model.layout.agents >= P]
+    most = model.layout.agents
+    if given.people and max(given.people) > most:
+        raise CommandError(f"--people is {max(given.people)}, expected at most the model's {most}")
+    people = [P for P in given.people or usual["people"] if most >= P]
+    wanted = cases(tasks, people, given.batch or usual["batch"], options_of)
+    if not wanted:
+        raise CommandError(f"none of {', '.join(tasks)} is for {' or '.join(map(str, people))} people")
     threads = torch.get_num_threads()
     print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads} threads")
     print(row("", list(COLUMNS.values())), flush=True)
     found: dict[str, Any] = {"cases": {}, "live": None}
-    for case in cases(tasks, people, given.batch or usual["batch"], options_of):
+    for case in wanted:
         speed = dataclasses.asdict(measure(model, case, options, given.frames, given.rounds, clock=clock))
         found["cases"][str(case)] = speed
         print(row(str(case), [shown(speed[name]) for name in COLUMNS]), flush=True)

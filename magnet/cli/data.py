@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -291,13 +292,13 @@ def run_prepare(given: argparse.Namespace) -> int:
     show_gaps(m["splits"])
     takes = sum(split["takes"] for split in m["splits"].values())
     kind = registry.reader(name)
-    body = "" if given.body == "open" else f" --data.body_model {given.body}"
+    body = "" if given.body == "open" else f" --data.body_model {shlex.quote(given.body)}"
+    place = shlex.quote(str(out))
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
     if kind.own:
-        print(
-            f"  magnet fit --config configs/finetune.yaml --data.path {out}{body}   # the shipped model goes on with it"
-        )
-    print(f"  {registry.fit_command(registry.data_of(kind))} --data.path {out}{body}")
+        tuned = f"magnet fit --config configs/finetune.yaml --data.path {place}{body}"
+        print(f"  {tuned}   # the shipped model goes on with it")
+    print(f"  {registry.fit_command(registry.data_of(kind))} --data.path {place}{body}")
     return 0
 
 
@@ -315,9 +316,9 @@ def run_fake(given: argparse.Namespace) -> int:
     with writing(folder, "choose another --out"):
         kind.write_fake(folder, given.takes, given.frames, given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
-    body = f" --body {folder / 'body.npz'}" if (folder / "body.npz").is_file() else ""
+    body = f" --body {shlex.quote(str(folder / 'body.npz'))}" if (folder / "body.npz").is_file() else ""
     print(f"{len(files)} files of a made-up {name} are in {folder}. To prepare it:")
-    print(f"  magnet data prepare {name} --root {folder} --out STORE{body}")
+    print(f"  magnet data prepare {name} --root {shlex.quote(str(folder))} --out STORE{body}")
     return 0
 
 
@@ -340,7 +341,7 @@ def run_download(given: argparse.Namespace) -> int:
     print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
     if got.unlike:
         print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")
-    print(f"to train on them: magnet fit --model Tokenizer --data CMU --data.root {out}")
+    print(f"to train on them: magnet fit --model Tokenizer --data CMU --data.root {shlex.quote(str(out))}")
     return 0
 
 

@@ -178,11 +178,14 @@ class Parser(LightningArgumentParser):
         if unknown and not unknown[1].startswith("-"):
             meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
             hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
-            hint = "files come first" if unknown[1].endswith((".bvh", ".npz")) and self.command == "predict" else hint
             return f"got {unknown[1]}, expected an option; {hint}"
         if unknown or refused:
             field = refused[1] if refused else ""
-            name = unknown[1].partition("=")[0] if unknown else self._written(field, field)
+            if unknown:
+                name = unknown[1].partition("=")[0]
+                name = self._written(name.lstrip("-"), name)
+            else:
+                name = self._written(field, field)
             return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:

@@ -25,6 +25,8 @@ CONTEXT = 32
 FUTURE = 150
 """Frames that are sampled where nothing is said and nothing recorded is read: five seconds."""
 HELP = "magnet predict --help files"
+READ = (".npz", ".bvh")
+"""`magnet.export.formats.READ`, which would import torch."""
 
 EPILOG = """\
 IN is a .bvh of any skeleton, an SMPL-X .npz or a scene of ours; several are several people of one world, in the order
@@ -50,7 +52,20 @@ def meant(arguments: Sequence[str]) -> bool:
     first = arguments[0] if arguments else ""
     about_help = list(arguments[:2]) == ["--help", "files"] or first == "--help=files"
     people = any(argument.partition("=")[0] == "--people" for argument in arguments)
-    return about_help or people or (not first.startswith("-") and Path(first).suffix != "")
+    return about_help or people or (not first.startswith("-") and Path(first).suffix != "") or _names_files(arguments)
+
+
+def _names_files(arguments: Sequence[str]) -> bool:
+    """Whether files to read stand behind options: words with such suffixes that are no option's value."""
+    flag, values = "", 0
+    for word in arguments:
+        if word.startswith("--"):
+            flag, values = word, int("=" in word)
+        elif values and flag != "--out" and Path(word).suffix.lower() in READ:
+            return True
+        else:
+            values += 1
+    return False
 
 
 def parser() -> argparse.ArgumentParser:

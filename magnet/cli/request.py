@@ -31,6 +31,7 @@ class Request:
         layers: options below them as YAML or files of it, lowest first: the checkpoint's, then those of files.
         checkpoint: to start from.
         folder: of this run.
+        timed: the folder is named by the time.
         classes: those that the layers and flags name under `model` and `data`.
         task: what is sampled, by commands that sample.
         topic: of help, where that is asked for.
@@ -41,6 +42,7 @@ class Request:
     layers: list[str] = field(default_factory=list)
     checkpoint: Path | None = None
     folder: Path = Path()
+    timed: bool = False
     classes: dict[str, str] = field(default_factory=dict)
     task: TaskChoice | None = None
     topic: str = ""
@@ -87,7 +89,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         named = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
         task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
     layers = [each.text() for each in settled.layers if each.options]
-    return Request(command, words, layers, checkpoint, folder, settled.classes, task)
+    return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task)
 
 
 def run_name(command: str, files: list[str]) -> str:

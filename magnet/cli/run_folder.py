@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import json
+import os
 import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +19,8 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.loggers.logger import rank_zero_experiment
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from magnet.cli.checkpoint_config import CONFIG_KEY
@@ -27,8 +33,38 @@ MONITOR = "val/loss"
 LATEST = "latest"
 
 
+def first_process() -> bool:
+    """Whether this is the only process, or the first of all; told by what torchrun, SLURM and Lightning say."""
+    said = (os.environ[name] for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK") if name in os.environ)
+    return next(said, "0") == "0"
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[Path]:
+    """The folder, made so that no run that begins in the same second takes it, too; gone if nothing came into it."""
+    above = [each for each in (folder.parent, folder.parent.parent) if not each.exists()]
+    number, name = 1, folder.name
+    with contextlib.suppress(OSError):  # where nothing may be written, that is said once something is to be
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                folder.mkdir()
+                break
+            except FileExistsError:
+                number += 1
+                folder = folder.with_name(f"{name}-v{number}")
+    try:
+        yield folder
+    finally:
+        for each in (folder, *above):
+            with contextlib.suppress(OSError):
+                each.rmdir()
+
+
 def run_folder(root: Path, out: str | None) -> Path:
-    """Folder of this run: `out`, else a new one under `root` named by the time. `Record` tells it to other processes.
+    """Folder of this run: `out`, else one under `root` named by the time, to be `claimed`.
+
+    `Record` tells it to other processes.
 
     Raises:
         CommandError: `out` is a file.
@@ -39,14 +75,29 @@ def run_folder(root: Path, out: str | None) -> Path:
             f"--out {out}: got a file, expected a folder for what the run leaves behind; of files to predict from, the "
             "first comes first: magnet predict FILE ... --out FILE"
         )
-    number = 1
-    while out is None and folder.exists():
-        number += 1
-        folder = folder.with_name(f"{folder.name.partition('-v')[0]}-v{number}")
     return folder
 
 
-def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
+class Curves(CSVLogger):
+    """metrics.csv; where a training goes on in its own folder, so does the file, which Lightning's would delete."""
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        if self._experiment is None:
+            file = Path(self.log_dir) / "metrics.csv"
+            before = file.with_suffix(".part")
+            if file.is_file():
+                file.replace(before)
+            writer: Any = super().experiment
+            if before.is_file():
+                before.replace(file)
+                with file.open(newline="") as rows:
+                    writer.metrics_keys = next(csv.reader(rows), [])
+        return self._experiment
+
+
+def loggers(folder: Path, wandb: str | None, fit: bool, goes_on: bool = False) -> list[Logger]:
     """CSV always, TensorBoard where it is installed, wandb on request; only training is logged by default.
 
     Raises:
@@ -57,7 +108,7 @@ def loggers(folder: Path, wandb: str | None, fit: bool) -> list[Logger]:
     if fit:
         if find_spec("tensorboard") or find_spec("tensorboardX"):
             chosen.append(TensorBoardLogger(root, "", name, default_hp_metric=False))
-        chosen.append(CSVLogger(root, "", name))
+        chosen.append((Curves if goes_on else CSVLogger)(root, "", name))
     if wandb is not None:
         if find_spec("wandb") is None:
             raise CommandError('--wandb needs the package wandb: pip install "magnet-motion[wandb]"')
@@ -213,13 +264,20 @@ class Record(Callback):
         options: {"model": ..., "data": ...} in plain values, for checkpoints.
         facts: what else run.json says.
         latest: keep a link `latest` beside the folder that leads to it once there is a checkpoint.
+        goes_on: in the folder of the training that it goes on with, whose record is kept under another name.
     """
 
     def __init__(
-        self, folder: Path, config: str, options: dict[str, Any], facts: dict[str, Any], latest: bool = False
+        self,
+        folder: Path,
+        config: str,
+        options: dict[str, Any],
+        facts: dict[str, Any],
+        latest: bool = False,
+        goes_on: bool = False,
     ) -> None:
         self.folder, self.config, self.options, self.facts, self.latest = folder, config, options, facts, latest
-        self.begun = False
+        self.goes_on, self.begun = goes_on, False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Take the first process's folder: each names one by its own clock."""
@@ -231,6 +289,11 @@ class Record(Callback):
             return
         self.begun = True
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self.goes_on:
+            before = len(list(self.folder.glob("run-*.json"))) + 1
+            for name, suffix in (("config", "yaml"), ("run", "json")):
+                if (self.folder / f"{name}.{suffix}").is_file():
+                    (self.folder / f"{name}.{suffix}").replace(self.folder / f"{name}-{before}.{suffix}")
         (self.folder / "config.yaml").write_text(self.config)
         (self.folder / "run.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
 
@@ -239,8 +302,9 @@ class Record(Callback):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Say how an interrupted training goes on."""
         last = self.folder / "checkpoints" / "last.ckpt"
-        if isinstance(exception, KeyboardInterrupt) and trainer.is_global_zero and last.exists():
-            print(f"interrupted; the same command with --ckpt_path {last} goes on", file=sys.stderr)
+        stopped = isinstance(exception, KeyboardInterrupt | SIGTERMException)
+        if stopped and trainer.is_global_zero and last.exists():
+            print(f"interrupted; the same command with --ckpt_path {shlex.quote(str(last))} goes on", file=sys.stderr)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[CONFIG_KEY] = self.options

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import io
 import itertools
 import logging
 import os
+import shlex
 import warnings
 from typing import Any, Literal
 
@@ -16,6 +18,7 @@ os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
 from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_folder
@@ -69,9 +72,15 @@ def run_trainer(command: str, arguments: list[str]) -> int:
     named_classes()
     request = read_request(command, arguments, MODELS)
     goes_on = "; then go on with --ckpt_path last, if there is one" if command == "fit" else ""
+    new = request.timed and run_folder.first_process()  # others take the first one's
     try:
-        with writing(request.folder, f"choose another --out{goes_on}"):
-            MagnetCLI(request)
+        with (
+            run_folder.claimed(request.folder) if new else contextlib.nullcontext(request.folder) as folder,
+            writing(folder, f"choose another --out{goes_on}"),
+        ):
+            MagnetCLI(dataclasses.replace(request, folder=folder))
+    except SIGTERMException:
+        return 143
     except SystemExit:
         if answers.recall(f"{command} flags") is None:  # the next mistyped flag is answered at once
             answers.keep(flag_answers(help_parser(command)))
@@ -247,7 +256,7 @@ class MagnetCLI(LightningCLI):
             callbacks.append(run_folder.progress_bar(sampling))
         logger = config.get("logger")
         if logger is None or logger is True:
-            logger = run_folder.loggers(self.folder, self._option("wandb"), fit)
+            logger = run_folder.loggers(self.folder, self._option("wandb"), fit, self._goes_on)
             if fit and logger:
                 callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
@@ -275,11 +284,16 @@ class MagnetCLI(LightningCLI):
         return taken
 
     def _refuse_overwriting(self) -> None:
-        own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents
-        if (self.folder / "checkpoints").exists() and not own and "LOCAL_RANK" not in os.environ:
+        if (self.folder / "checkpoints").exists() and not self._goes_on and run_folder.first_process():
             raise CommandError(
                 f"{self.folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
             )
+
+    @property
+    def _goes_on(self) -> bool:
+        """Whether a training goes on in its own folder: with a checkpoint of its own, or as a requeued SLURM job."""
+        own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents
+        return self.command == "fit" and (own or any(self.folder.glob("hpc_ckpt_*.ckpt")))
 
     def _record(self) -> run_folder.Record:
         self._dump_config()
@@ -290,7 +304,7 @@ class MagnetCLI(LightningCLI):
             "checkpoint": None if self.checkpoint is None else str(self.checkpoint),
         }
         latest = self.command == "fit" and self._option("out") is None
-        return run_folder.Record(self.folder, config, options, facts, latest)
+        return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on)
 
     def _option(self, name: str) -> Any:
         return self.config[self.command].get(name)
@@ -371,7 +385,7 @@ class MagnetCLI(LightningCLI):
         first = sorted((self.folder / "scenes").glob("*.npz"))[:1]
         if not first or not self.trainer.is_global_zero:
             return
-        print(f"watch it: magnet view {first[0]}")
+        print(f"watch it: magnet view {shlex.quote(str(first[0]))}")
         if self._option("view"):
             from magnet.cli.view import show_at_the_end
 

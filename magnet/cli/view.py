@@ -237,7 +237,12 @@ def _live(options: argparse.Namespace) -> Any:
     elif options.people is None:
         start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
     model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
-    live = Live(model, options.people or 2, start, generator=torch.Generator().manual_seed(options.seed))
+    live = Live(
+        model,
+        2 if options.people is None else options.people,
+        start,
+        generator=torch.Generator().manual_seed(options.seed),
+    )
     live.settings.task, live.settings.sampler = options.task, sampler_options(options)
     live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
     render = RenderOptions(style=options.style or "body", shadows=not options.no_shadows)

@@ -93,18 +93,50 @@ class CMUReader(Reader):
         held = (("test", test_takes, test_singles), ("val", val_takes, val_singles))
         self.couples_in: dict[int, Split] = {number: split for split, numbers, _ in held for number in numbers}
         self.singles_in: dict[str, Split] = {name: split for split, _, names in held for name in names}
-        self.fps, self.trim = {**RATES, **(fps or {})}, trim
+        self.trim = trim
+        self.fps: dict[int, float] = dict(RATES)
+        for subject, rate in (fps or {}).items():
+            if not re.fullmatch(r"\d+", str(subject)):
+                raise ValueError(f"fps: got subject {subject!r}, expected a number such as 60")
+            self.fps[int(subject)] = rate
 
     def found(self) -> list[Take]:
         """Every take; one that lacks the partner's file is listed too, and refused when it is read."""
-        takes = [take for take in self._all() if self.singles or is_couple(take)]
+        everything = self._all()
+        takes = [take for take in everything if self.singles or is_couple(take)]
         if not takes:
             raise DataError(f"{self.root}: holds no files named NN_TT.amc, but {listing(self.root)}: no takes. {WHERE}")
+        self._require_known(everything)
         return takes
 
+    def _require_known(self, takes: Sequence[Take]) -> None:
+        """Refuse options about what is not there: a mistyped take that is to be held out would be trained on."""
+        alone = [take.name for take in takes if not is_couple(take)]
+        numbers = sorted({int(take.name.rpartition("_")[2]) for take in takes if is_couple(take)})
+        subjects = sorted({int(path.name.split("_")[0]) for take in takes for path in amc_files(take)})
+        for option, said, usual, there in (
+            ("test_takes, val_takes", self.couples_in, {*TEST_TAKES, *VAL_TAKES}, numbers),
+            ("test_singles, val_singles", self.singles_in, {*VAL_SINGLES}, alone),
+            ("fps", self.fps, {*RATES}, subjects),
+        ):
+            unknown = [one for one in said if one not in usual and one not in there]
+            if unknown:
+                some = ", ".join(map(str, there[:8])) + (", ..." if len(there) > 8 else "")
+                raise DataError(f"{option}: got {unknown[0]}; give one of those in {self.root}: {some or 'none'}")
+
+    def _files(self) -> dict[str, Path]:
+        """Skeletons and takes by name in lower case."""
+        files: dict[str, Path] = {}
+        for path in sorted(self.root.rglob("*")):
+            if path.suffix.lower() not in (".asf", ".amc"):
+                continue
+            other = files.setdefault(path.name.lower(), path)
+            if other != path and other.read_bytes() != path.read_bytes():
+                raise DataError(f"{other} and {path} have one name and differ; move one elsewhere")
+        return files
+
     def _all(self) -> list[Take]:
-        endings = (".asf", ".amc")
-        files = {path.name.lower(): path for path in sorted(self.root.rglob("*")) if path.suffix.lower() in endings}
+        files = self._files()
         matches = [match for name in files if (match := re.fullmatch(r"(\d+)_(\d+)\.amc", name))]
         there = {int(match[1]) for match in matches}
         there |= {int(name[:-4]) for name in files if re.fullmatch(r"\d+\.asf", name)}
@@ -123,7 +155,7 @@ class CMUReader(Reader):
 
     def rates(self, take: Take) -> list[float]:
         """Frames a second of each person's file."""
-        return [self.fps.get(path.name.split("_")[0], USUAL_RATE) for path in amc_files(take)]
+        return [self.fps.get(int(path.name.split("_")[0]), USUAL_RATE) for path in amc_files(take)]
 
     def read(self, take: Take) -> Recording:
         """Joints of everybody at 30 fps, y up, with rotations as hints for the fit."""

@@ -89,6 +89,7 @@ class Prepared(MotionDataModule):
                 f"{self.body_model!r} is {self.body.id!r} ({body_hash(self.body)[:8]}): give the same file with "
                 f"--data.body_model FILE, or prepare again with this one"
             )
+        folder.require_roles(self.roles)
         folder.body = self.body.id  # the same joints, whatever the file is called now
         return folder
 

@@ -87,9 +87,18 @@ class Reshaped(Parts):
         wanted = self._wanted()
         self._fill(wanted)
         return [
-            Clip(Scene.load(file), f"{clip.name} reshaped {number}", f"{clip.source}-reshaped", split)
+            Clip(self._loaded(file, wanted), f"{clip.name} reshaped {number}", f"{clip.source}-reshaped", split)
             for clip, number, _, file in wanted
         ]
+
+    def _loaded(self, file: Path, wanted: list[tuple[Clip, int, Tensor, Path]]) -> Scene:
+        """The scene in a file of the cache; made again where the file is damaged."""
+        try:
+            return Scene.load(file)
+        except ValueError:
+            file.unlink()
+            self._fill(wanted)
+            return Scene.load(file)
 
     def _wanted(self) -> list[tuple[Clip, int, Tensor, Path]]:
         """Each clip with the number of its variant, shapes (1, P, 10) and the file where the scene lies or will lie."""

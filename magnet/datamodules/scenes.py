@@ -32,8 +32,9 @@ ORIENT, BODY = ("root_orient", "global_orient", "poses_root"), ("pose_body", "bo
 PLACE = ("trans", "transl", "smpl_trans", "translation")
 RATE = ("mocap_frame_rate", "mocap_framerate", "fps", "framerate", "frame_rate")
 SHAPE = ("betas", "shape", "beta")
-INSIDE = ("smplx", "smpl", "smplh", "person", "data")
 """Keys that files may have for the same thing."""
+PERSON = "name of the person"
+"""Our key for what somebody is called in a dict of people."""
 OPTIONAL = ("gender", "smpl_scaling", "body", "valid")
 
 
@@ -122,9 +123,15 @@ class ScenesReader(OwnReader[PosedTrack]):
             held: Any = load_pickle(path)
         else:
             keys = _keys(path)
-            if "meta" in keys:
+            if "meta" in keys and not _posed(dict.fromkeys(keys)):
                 return _ours(path), []
             held = open_npz(path, (), tuple(keys))
+            if len(held) < len(keys) and not any(_posed(one) for one in (held, *held.values())):
+                pickled = ", ".join(key for key in keys if key not in held)
+                raise DataError(
+                    f"{path}: {pickled} holds pickled objects, which are not read in a npz; save a dict or a list of "
+                    "people as .pkl, and arrays of one person, or people first, as .npz"
+                )
         people = list(_people(path, held))
         notes: list[str] = []
         tracks = [track for where, one in people for track in self._tracks(where, one, notes)]
@@ -168,7 +175,8 @@ class ScenesReader(OwnReader[PosedTrack]):
                 place=places[p],
                 betas=shape,
                 shapes_of="" if betas is None else FAMILIES.get(width, ""),
-                body=str(held.get("body", "")),
+                name=str(held.get(PERSON, "")),
+                body=_body_of(held),
                 valid=np.ones(poses.shape[1], dtype=bool),
                 gender=gender_of(_one_of(held.get("gender"), p)),
             )
@@ -185,6 +193,12 @@ class ScenesReader(OwnReader[PosedTrack]):
                 f"{', '.join(sorted(b or 'SMPL' for b in bodies))}; export them for one body"
             )
         ((body, at_pelvis),) = kinds
+        families = sorted({track.shapes_of for track in tracks} - {""})
+        if len(families) > 1:
+            raise DataError(
+                f"{self.root / where}: people whose shape numbers are of different bodies: {', '.join(families)}; "
+                "export them for one body"
+            )
         poses = np.stack([track.poses for track in tracks], axis=1)
         place = np.stack([track.place for track in tracks], axis=1)
         genders = tuple(track.gender or "neutral" for track in tracks) if any(track.gender for track in tracks) else ()
@@ -195,7 +209,7 @@ class ScenesReader(OwnReader[PosedTrack]):
             transl=None if at_pelvis else place,
             pelvis=place if at_pelvis else None,
             body=body,
-            shapes_of=max(track.shapes_of for track in tracks),
+            shapes_of=families[0] if families else "",
             betas=np.stack([track.betas for track in tracks]),
             valid=np.stack([track.valid for track in tracks], axis=1),
             persons=tuple(
@@ -260,24 +274,32 @@ def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         held = held.item() if held.ndim == 0 else held.tolist()
     if isinstance(held, list | tuple):
         held = {f"person{p + 1}": one for p, one in enumerate(held)}
+    if isinstance(held, Mapping):
+        held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
     held = mapping(path, held)
     if any(key in held for key in (*WHOLE, *ORIENT)):
         yield str(path), held
         return
     shared = {key: value for key, value in held.items() if key in (*RATE, *OPTIONAL)}
-    inside = {key: value for key, value in held.items() if isinstance(value, Mapping) and _posed(value)}
+    inside = {key: value for key, value in held.items() if _posed(value)}
     if not inside:
         has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
         raise DataError(
             f"{path}: has neither {WHOLE[0]} nor {ORIENT[0]} and {BODY[0]}, alone or for each person; it has {has}; "
             f"save motion of SMPL's family with these keys, {PLACE[0]}, betas and {RATE[0]}"
         )
-    for key, value in inside.items():
-        yield f"{path}, {key}", {**shared, **mapping(f"{path}, {key}", value)}
+    for p, (key, value) in enumerate(inside.items()):
+        mine = {shared_key: _one_of(said, p) for shared_key, said in shared.items()}
+        yield f"{path}, {key}", {**mine, PERSON: key, **mapping(f"{path}, {key}", value)}
 
 
-def _posed(held: Mapping[str, Any]) -> bool:
-    return any(key in held for key in (*WHOLE, *ORIENT))
+def _posed(held: Any) -> bool:
+    return isinstance(held, Mapping) and any(key in held for key in (*WHOLE, *ORIENT))
+
+
+def _body_of(held: Mapping[str, Any]) -> str:
+    """The body that shape numbers are of, where `magnet.export.npz.save_smplx` says it; others mean something else."""
+    return str(held["body"]) if "body" in held and "surface_model_type" in held else ""
 
 
 def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise: Any) -> Any:
@@ -329,7 +351,8 @@ def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doub
     with np.errstate(over="ignore", invalid="ignore"):
         array = array.astype(np.float64)
     if array.ndim >= 4 and array.shape[-2:] == (3, 3):
-        if not np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2):
+        square = np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2)
+        if not square or (np.linalg.det(array) < 0).any():
             raise DataError(f"{where}: matrices that are no rotations; {AGAIN}")
         array = roma.rotmat_to_rotvec(torch.from_numpy(array)).numpy()
     if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):

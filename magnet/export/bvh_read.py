@@ -140,10 +140,12 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
 def _rate(seconds: float, digits: int) -> float:
     """Frames a second of a Frame Time that may have been rounded to few digits, such as 0.033."""
     fps = 1 / seconds
+    if abs(round(fps) - fps) < 1e-6 * fps:
+        return float(round(fps))
+    rounded = [rate for rate in RATES if 2 < digits < 5 and round(1 / rate, digits) == seconds]
+    if rounded:
+        return min(rounded, key=lambda rate: (rate != round(rate), abs(rate - fps)))
     nearest = min(RATES, key=lambda rate: abs(rate - fps))
     if abs(nearest - fps) < 5e-4 * fps:
         return nearest
-    if abs(round(fps) - fps) < 1e-3 * fps:
-        return float(round(fps))
-    rounded = [rate for rate in RATES if digits > 2 and round(1 / rate, digits) == seconds]
-    return min(rounded, key=lambda rate: (rate != round(rate), abs(rate - fps)), default=fps)
+    return float(round(fps)) if abs(round(fps) - fps) < 1e-3 * fps else fps

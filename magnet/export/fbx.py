@@ -49,7 +49,7 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ValueError: what `save_glb` refuses, or Blender's own words where it fails.
     """
     command = blender()
-    path = Path(path).with_suffix(".fbx")
+    path = Path(path) if Path(path).suffix.lower() == ".fbx" else Path(path).with_suffix(".fbx")
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         glb, made = save_glb(scene, Path(folder) / "scene.glb", body, bones), Path(folder) / "scene.fbx"

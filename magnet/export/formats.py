@@ -18,12 +18,12 @@ from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
-from magnet.export.npz import load_smplx, save_smplx
+from magnet.export.npz import read_smplx, save_smplx
 from magnet.export.retarget import load_bvh, together
 from magnet.export.usd import require_usd, save_usd
 from magnet.files import load_npz, regular
 from magnet.motion.resample import resampled
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, require_rotations
 
 if TYPE_CHECKING:
     from magnet.export.video import Report
@@ -141,7 +141,7 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
             keys = set(file.files)
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    if "meta" in keys:
+    if "meta" in keys and not {"poses", "root_orient"} & keys:
         if up not in (None, "y"):
             raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
         scene = Scene.load(path)
@@ -150,13 +150,15 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
             )
         return scene, [], False
-    scene = load_smplx(path, body, up)
-    note = []
-    if "body" not in keys and body.id.startswith("open"):
+    scene, found = read_smplx(path, body, up)
+    note, ours = [], {"body", "surface_model_type"} <= keys
+    if up is None and found not in ("y", "z"):
+        note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
+    if not ours and body.id.startswith("open"):
         note.append(
             f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
         )
-    return scene, note, "body" not in keys
+    return scene, note, not ours
 
 
 @dataclass(frozen=True)
@@ -352,3 +354,7 @@ def require_finite(scene: Scene) -> None:
     if bad:
         b, frame, agent = bad[0]
         raise ValueError(f"scene {b}, agent {agent}: frame {frame} is not finite; cut such frames out, or write .npz")
+    try:
+        require_rotations(scene.replace(valid=None), "a frame that is not valid")
+    except ValueError as error:
+        raise ValueError(f"{error}; cut such frames out, or write .npz") from error

@@ -67,7 +67,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
             gltf.document["animations"].append(clip)
     if bones.clips == "scene":
         gltf.document["animations"].append(whole)
-    path = Path(path).with_suffix(".glb")
+    path = Path(path) if Path(path).suffix.lower() == ".glb" else Path(path).with_suffix(".glb")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(gltf.packed())
     return path

@@ -25,7 +25,7 @@ def save_csv(scene: Scene, path: str | Path, body: Body) -> Path:
     >>> len(table), table[1].split(",")[:4]  # a line of names, then 8 frames of 2 people
     (17, ['0', '0', '0.000000', '0'])
     """
-    path = Path(path).with_suffix(".csv")
+    path = Path(path) if Path(path).suffix.lower() == ".csv" else Path(path).with_suffix(".csv")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")

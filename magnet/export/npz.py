@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.export.rig import UP
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
@@ -70,15 +71,25 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
 
 
 def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
-    """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several. -> Scene with B = 1, float32
+    """As `read_smplx`, the scene alone."""
+    return read_smplx(path, body, up)[0]
+
+
+def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Scene, str]:
+    """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several.
 
     Also read: AMASS's names (`trans`, `mocap_framerate`, `root_orient` and `pose_body`), more or fewer than ten betas
     (the first ten count), no betas (zero). A file that does not name its body is SMPL-X's: its betas are taken if
     `body` is not the open one, and are zero otherwise.
 
     Args:
-        up: axis of the file that points up, `y` or `z`. None: y in files of ours, in others the axis along which
-            pelvises stand.
+        path: the file.
+        body: whose shapes the scene will have.
+        up: axis of the file that points up, one of `magnet.export.rig.UP`. None: y in files of ours, in others the
+            axis along which pelvises stand.
+
+    Returns:
+        The scene, B = 1, float32; and the axis of the file that points up.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -102,13 +113,11 @@ def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
     pelvis = transl + body.rest_joints(betas.float())[:, 0].double()[:, None]
     T_world_root = rigid(rotations[:, :, 0], pelvis)
     if up is None:
-        standing = T_world_root[..., :3, 1].mean(dim=(0, 1))
-        up = "z" if written_for is None and standing[2] > standing[1].abs() else "y"
-    if up not in ("y", "z"):
-        raise ValueError(f"up axis {up!r}: expected y or z in a npz")
-    if up == "z":
-        T_world_root = Z_UP @ T_world_root
-    return Scene(
+        up = "y" if written_for is not None else _standing(T_world_root)
+    if up not in UP:
+        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
+    T_world_root = T_world_root.new_tensor(np.block([[UP[up], np.zeros((3, 1))], [np.eye(4)[3:]]])) @ T_world_root
+    scene = Scene(
         body_rot=rotations[:, :, 1:].transpose(0, 1)[None].float(),
         T_world_root=T_world_root.transpose(0, 1)[None].float(),
         betas=betas[None].float(),
@@ -118,10 +127,15 @@ def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
         names=(name,) if name else (),
         given=None if "given" not in arrays else arrays["given"].view(P, T).T[None],
     )
+    return scene, up
 
 
-Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
-"""From a world whose z points up to ours."""
+def _standing(T_world_root: Tensor) -> str:
+    """The axis of a file's world that points up, by where pelvises do. (P, T, 4, 4) -> a key of `UP`"""
+    up = T_world_root[..., :3, 1].mean(dim=(0, 1))
+    axis = int(up.abs().argmax())
+    return "-" * bool(up[axis] < 0) + "xyz"[axis]
+
 
 ALSO = {"transl": ("transl", "trans"), "mocap_frame_rate": ("mocap_frame_rate", "mocap_framerate", "fps")}
 """Our keys, and those that mean the same."""
@@ -143,11 +157,12 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
     try:
         with load_npz(path) as file:
             there = set(file.files)
-            key = {ours: next((k for k in keys if k in there), ours) for ours, keys in ALSO.items()}
+            key = {name: next((k for k in keys if k in there), name) for name, keys in ALSO.items()}
             parts = ["poses"] if "poses" in there else ["root_orient", "pose_body"]
             missing = [part for part in parts if part not in there] and ["poses"]
-            missing += [ours for ours, its in key.items() if its not in there]
-            if "body" in there and "betas" not in there:
+            missing += [name for name, its in key.items() if its not in there]
+            ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
+            if ours and "betas" not in there:
                 missing.append("betas")
             if missing:
                 has = ", ".join(sorted(there))
@@ -158,7 +173,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
             poses = np.concatenate([file[part] for part in parts], axis=-1)
             transl, fps = file[key["transl"]], _rate(path, key["mocap_frame_rate"], file)
             betas = file["betas"] if "betas" in there else np.zeros((*poses.shape[:-2], 10))
-            written_for = str(file["body"]) if "body" in there else None
+            written_for = str(file["body"]) if ours else None
             name = str(file["name"]) if "name" in there else ""
             given = file["given"] if written_for is not None and "given" in there else None
     except (OSError, EOFError, zipfile.BadZipFile) as error:

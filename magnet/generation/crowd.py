@@ -142,6 +142,7 @@ class CrowdRollout(Rollout):
         self._present = scene.present[0].to(self.viewer.device)
         if self.crowd:
             stood = scene.slice(0, context).T_world_root[0][..., [0, 2], 3].to(self.viewer.device)  # (T, P, 2)
+            stood = torch.where(self._present[:, None], stood, 0.0)
             away = (stood[:, :, None] - stood[:, None]).norm(dim=-1).mean(dim=0)
             both = self._present[:, None] & self._present & (person[:, None] != person)
             self._bonds = (away < BOND) & both

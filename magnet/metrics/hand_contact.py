@@ -94,4 +94,4 @@ class HandContact(ClipMeans):
             shares += [clip_sums(both, held & counts), clip_sums(both, recorded & counts)]
         length, begins = (x.movedim(-1, 2) for x in holds(held.movedim(2, -1), counts.movedim(1, -1)))
         long = (length > self.fps).double()
-        return [*shares, clip_sums(length / self.fps, begins), clip_sums(long, held & counts)]
+        return [*shares, clip_sums(length.double() / self.fps, begins), clip_sums(long, held & counts)]

@@ -24,9 +24,16 @@ def _check(name: str, kind: type) -> None:
         raise TypeError(f"metric {name}: {kind.__name__} has no columns, which say how its numbers are shown")
     others = [other.kind for other in METRICS.known.values() if other.kind is not kind]
     taken = TAKEN.union(*(other.columns for other in others if issubclass(other, MotionMetric)))
-    twice = sorted(taken & {name, *kind.columns})
+    # A number has variants, such as mpjpe@2s, and bounds of its interval, such as fs_low: none of them is free.
+    twice = sorted(each for each in (name, *kind.columns) if {each, *_stems(each)} & taken)
     if twice:
         raise ValueError(f"metric {name}: something called {twice[0]} is measured already")
+
+
+def _stems(number: str) -> set[str]:
+    """Names that a number's name may be a variant of: turn_rate of turn_rate@agent0_low."""
+    bare = number.partition("@")[0]
+    return {bare, bare.removesuffix("_mean"), *(bare.removesuffix(bound) for bound in ("_low", "_high"))}
 
 
 METRICS = Registry("metric", "magnet.metrics", (), _check)

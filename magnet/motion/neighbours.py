@@ -84,8 +84,10 @@ def nearest_partners(
     person = torch.arange(P, device=ground.device)
     away = (ground[:, None] - ground[None]).norm(dim=-1)
     away = away - (leave - enter) * torch.zeros_like(away).scatter(1, before, 1.0)
-    away = torch.where(bonds, away - 2 * away.amax().clamp_min(1.0), away)
-    away = torch.where(present[:, None] & present & (person[:, None] != person), away, torch.inf)
+    both = present[:, None] & present & (person[:, None] != person)  # who is absent may be anywhere
+    farthest = torch.where(both, away, 0.0).amax()
+    away = torch.where(bonds, away - 2 * farthest.clamp_min(1.0), away)
+    away = torch.where(both, away, torch.inf)
     near, wanted = away.topk(min(K, P), dim=1, largest=False)
     wanted = torch.where(near <= enter, wanted, person[:, None])
     if K > P:

@@ -57,7 +57,9 @@ class Inbetweening:
         steps = self.keys
         if not self.keys and not self.pairs:
             steps = (*range(max(grid.context - 1, 0), grid.tokens, self.every), grid.tokens - 1)
-        wanted = {(agent, step) for agent in self.agents or range(grid.agents) for step in steps} | set(self.pairs)
+        wanted = {(agent, step) for agent in self.agents or range(grid.agents) for step in steps} | {
+            tuple(pair) for pair in self.pairs
+        }
         for agent, step in sorted(wanted):
             if not 0 <= agent < grid.agents:
                 raise ValueError(f"keyframe of agent {agent}: the grid has agents 0 to {grid.agents - 1}")

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from magnet.checks import require_wholes
+from magnet.checks import require_flag, require_wholes
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
@@ -48,6 +48,7 @@ class PartnerInpainting:
     own_past: bool = False
 
     def schedule(self, grid: Grid) -> MaskSchedule:
+        require_flag("own_past", self.own_past)
         unknown = chosen(grid, self.target).expand(grid.tokens, -1)
         if self.own_past:
             if grid.context == 0:

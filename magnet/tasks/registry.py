@@ -66,7 +66,7 @@ def _load_variable(value: str) -> None:
     before = set(TASKS.known)
     try:
         importlib.import_module(module)
-        own = [entry.name for entry in TASKS.known.values() if entry.kind.__module__.startswith(module)]
+        own = [entry.name for entry in TASKS.known.values() if f"{entry.kind.__module__}.".startswith(f"{module}.")]
         if not own:
             raise ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
     except Exception as error:  # a stranger's import may raise anything

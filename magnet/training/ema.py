@@ -31,6 +31,13 @@ class WeightEMA(WeightAveraging):
         super().__init__(use_buffers=False, avg_fn=average)
         self._own: dict[str, Tensor] | None = None  # weights of a training that has ended, before the average took over
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if stage == "fit":
+            pl_module.setup(
+                stage
+            )  # Lightning sets callbacks up first, and a copy would lack what the model makes there
+        super().setup(trainer, pl_module, stage)
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._own = None
         super().on_train_start(trainer, pl_module)

@@ -65,6 +65,22 @@ def test_the_command_writes_what_it_measured_and_compares_it(tmp_path: Path, cap
     assert cli.main([*words[:-1], "0"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--people 0", "--people is 0, expected at least 1"),
+        ("--batch 0", "--batch is 0, expected at least 1"),
+        ("--live -1", "--live is -1, expected seconds"),
+        ("--people 5", "--people is 5, expected at most the model's 2"),
+        ("--people 1 --task motion_control", "none of motion_control is for 1 people"),
+    ],
+)
+def test_what_would_measure_nothing_is_refused(words: str, said: str, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("magnet.cli.bench.load", lambda name: tiny_denoiser(max_agents=2))
+    assert cli.main(["bench", "--quick", "--live", "0", *words.split()]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_options_go_to_the_tasks_that_have_them(tmp_path: Path, capsys, monkeypatch) -> None:
     """Turns that overlap by half take fewer evaluations; a task without turns is measured as it is."""
     monkeypatch.setattr("magnet.cli.bench.load", lambda name: tiny_denoiser(max_agents=2))

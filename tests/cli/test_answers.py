@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -108,6 +109,16 @@ def test_shipped_answers_are_those_of_exactly_this_code_and_no_plugin(
     assert answers.recall("a") is None
     code.write_text(first)
     plugin = EntryPoint("walk", "nowhere.walks", "magnet.tasks")
+    digests = set()
+    for release in ("1.0", "1.1"):
+        dist = SimpleNamespace(name="walks", version=release)
+        found = SimpleNamespace(
+            group=plugin.group, name=plugin.name, value=plugin.value, module=plugin.module, dist=dist
+        )
+        with monkeypatch.context() as other:
+            other.setattr(answers, "entry_points", lambda group, found=found: [found])
+            digests.add(answers.code_digest())
+    assert len(digests) == 2
     for name, value in (("version", lambda name: "0"), ("entry_points", lambda group: [plugin])):
         with monkeypatch.context() as other:
             other.setattr(answers, name, value)

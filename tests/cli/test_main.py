@@ -162,6 +162,7 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
                 ["fit", "--model", "ToyModel", "--data.root.x", "1"],
                 "no option --data.root.x; --data.root takes a value",
             ),
+            (["test", "--data.test.max_scenes", "2"], "no option --data.test.max_scenes"),
             (["test", "2"], "options are written --NAME VALUE"),
             (["test", "--out", __file__], "got a file, expected a folder"),
             (["test", "--frames", "9"], "did you mean --data.window_frames?"),

@@ -122,7 +122,7 @@ def test_a_crowd_comes_from_nothing_as_far_apart_as_is_said(tmp_path, capsys) ->
             ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
             ("none.bvh --out a.npz", "none.bvh"),
             ("one.npz --task partner_inpainting --out a.npz", "`magnet predict --people 2` adds another"),
-            ("--task joint_future a.bvh", "files come first"),
+            ("--task joint_future BVH --out a.obj", "nothing writes .obj"),
         ],
         4,
     ),
@@ -146,6 +146,15 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
 
     assert not meant(["--task", "joint_future"]) and not meant([]) and not meant(["--data.path", "store.npz"])
     assert not meant(["generation"]) and not meant(["--help"]) and meant(["--help", "files"])
+
+
+def test_files_may_stand_behind_options() -> None:
+    from magnet.cli.predict_files import meant
+
+    assert meant(["--task", "joint_future", "a.bvh", "b.bvh", "--out", "c.glb"])
+    assert meant(["--seed=3", "A.NPZ"])
+    for words in (["--out", "a.npz", "b.npz"], ["--data.path", "a.npz"], ["--view", "--data.path", "a.npz"]):
+        assert not meant(words), words
 
 
 @pytest.mark.parametrize(

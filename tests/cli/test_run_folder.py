@@ -44,3 +44,34 @@ def test_what_is_left_is_reckoned_from_the_second_step_on(
         lines.tell("test: denoising step", done, 64)
     said = capsys.readouterr().out.splitlines()
     assert said == ["test: denoising step 1/64", "test: denoising step 21/64, 0:01:26 left"]
+
+
+def test_a_run_that_begins_in_the_same_second_gets_a_folder_of_its_own(tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "quick" / "2026-01-01_00-00-00"
+    with run_folder.claimed(folder) as one, run_folder.claimed(folder) as other:
+        assert (one.name, other.name) == (folder.name, f"{folder.name}-v2")
+        (one / "last.ckpt").touch()
+    assert one.is_dir() and not other.exists()
+    with run_folder.claimed(tmp_path / "never" / "quick" / "began"):
+        pass
+    assert not (tmp_path / "never").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "first"),
+    [
+        ({}, True),
+        ({"LOCAL_RANK": "1"}, False),  # started by Lightning
+        ({"RANK": "0", "LOCAL_RANK": "0"}, True),  # by torchrun
+        ({"RANK": "8", "LOCAL_RANK": "0"}, False),  # on the second machine
+        ({"SLURM_PROCID": "3"}, False),
+    ],
+)
+def test_the_first_process_is_known_whoever_started_it(
+    said: dict[str, str], first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in said.items():
+        monkeypatch.setenv(name, value)
+    assert run_folder.first_process() == first

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -255,3 +258,48 @@ def test_what_does_not_apply_to_our_checkpoints_is_not_said(caplog: pytest.LogCa
     checkpoint_connector.log.warning("something else")
     checkpoint_connector.log.removeHandler(caplog.handler)
     assert set(caplog.messages) == {"something else"}
+
+
+def test_curves_and_record_of_what_it_goes_on_with_are_kept(trained: Path, toy: Path) -> None:
+    """The toy logs a learning rate a step."""
+    before, record = (trained / "metrics.csv").read_text(), (trained / "run.json").read_text()
+    go("fit", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs", "3", "--trainer.log_every_n_steps=1")
+    with (trained / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) > len(before.splitlines()) - 1
+    assert int(rows[0]["step"]) < 4 <= int(rows[-1]["step"])
+    assert (trained / "run-1.json").read_text() == record
+    assert json.loads((trained / "run.json").read_text())["checkpoint"]
+
+
+def test_torchruns_first_process_does_not_overwrite_a_finished_run_either(
+    trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert cli.main(["fit", "--model", "ToyModel", "--out", "trained", *CPU]) == 2
+
+
+def test_a_job_that_slurm_starts_again_goes_on(trained: Path) -> None:
+    """With the checkpoint that Lightning leaves where SLURM says that time is up."""
+    shutil.copy(trained / "checkpoints/last.ckpt", trained / "hpc_ckpt_1.ckpt")
+    shutil.copy(trained / "checkpoints/last.ckpt.sha256", trained / "hpc_ckpt_1.ckpt.sha256")
+    model, _ = go(*FIT[:-3], "4", "--out", "trained")
+    assert model.trainer.global_step == 8
+
+
+def test_a_training_that_is_told_to_end_says_how_it_goes_on_and_is_no_success(
+    toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(self: ToyModel, *_: Any) -> None:
+        if self.trainer.global_step == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(ToyModel, "on_train_batch_start", told, raising=False)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert cli.main([*FIT, *CPU]) == 143
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert "goes on" in capsys.readouterr().err
+    assert (toy / "trained/checkpoints/last.ckpt").exists()

@@ -110,6 +110,12 @@ def test_few_scenes_are_split_in_time_and_no_frame_is_in_two_parts(scenes: int, 
     assert any("split in time" in line for line in reader.summary())
 
 
+def test_a_scene_that_is_called_as_a_part_of_another_is_refused(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", **{"walk": walk(40, seed=1), "walk (test)": walk(40, seed=2)})
+    with pytest.raises(DataError, match=r"'walk \(test\)' is called as a part of 'walk'; rename it"):
+        BVHReader(root).takes()
+
+
 @pytest.mark.parametrize("scenes", range(1, 8))
 def test_whole_scenes_leave_no_split_empty(scenes: int, tmp_path: Path) -> None:
     for k in range(scenes):

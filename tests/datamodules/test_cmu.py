@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -236,6 +237,37 @@ def test_an_empty_folder_no_folder_and_none_say_where_recordings_are(
 def test_a_take_in_two_splits_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"takes \[5\] are in both val and test"):
         CMUReader(tmp_path, val_takes=(3, 5))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"test_singles": ("2_1",)}, r"test_singles, val_singles: got 2_1; give one of those in .*: 02_01"),
+        ({"val_takes": (33,)}, r"test_takes, val_takes: got 33; give one of those in .*: 1, 3"),
+        ({"fps": {"7": 60.0}}, r"fps: got 7; give one of those in .*: 2, 60, 61"),
+    ],
+)
+def test_an_option_about_a_take_that_is_not_there_is_refused(made: Path, options: dict, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        CMUReader(made, **options).found()
+
+
+def test_a_subject_has_its_rate_however_its_number_is_written(made: Path) -> None:
+    for number in ("2", "02"):
+        reader = CMUReader(made, fps={number: 60.0})
+        assert [reader.rates(take) for take in reader.found()] == [[60.0], [60.0, 60.0], [60.0, 60.0]]
+    with pytest.raises(ValueError, match="got subject 'subject 2', expected a number"):
+        CMUReader(made, fps={"subject 2": 60.0})
+
+
+def test_two_files_of_one_name_are_refused_where_they_differ(made: Path, tmp_path: Path) -> None:
+    root = copied(made, tmp_path)
+    (root / "again").mkdir()
+    shutil.copy(root / "60_01.amc", root / "again")
+    assert len(CMUReader(root).found()) == 1
+    write_amc(root / "again/60_01.amc", 61, 0.5)
+    with pytest.raises(DataError, match=r"60_01\.amc and .*60_01\.amc have one name and differ"):
+        CMUReader(root).found()
 
 
 def test_speeds_that_nobody_reaches_are_refused(tmp_path: Path) -> None:

@@ -63,6 +63,14 @@ def test_scenes_are_made_once_and_again_if_their_recording_changes(
     assert len(list(data.folder.iterdir())) <= 5
 
 
+def test_a_damaged_file_of_the_cache_is_made_again(data: Reshaped) -> None:
+    first = data.clips("train")
+    file = sorted(data.folder.iterdir())[0]
+    file.write_bytes(file.read_bytes()[:100])
+    again = data.clips("train")
+    assert all(torch.equal(a.scene.body_rot, b.scene.body_rot) for a, b in zip(first, again, strict=True))
+
+
 def test_a_number_of_variants_is_expected() -> None:
     with pytest.raises(ValueError, match="variants"):
         Reshaped([Shaped()], variants=0)

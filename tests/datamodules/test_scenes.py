@@ -126,6 +126,36 @@ def test_without_a_body_file_the_open_body_dances_in_its_mean_shape_and_a_note_s
     assert not any("female" in note for note in clips.notes)
 
 
+def test_people_of_one_file_have_their_names_and_genders(tmp_path: Path) -> None:
+    held = {"anna": apart(0), "ben": plain(1), "gender": ["female", "male"]}
+    write(tmp_path / "walk.pkl", held)
+    found = read(tmp_path)
+    assert (found.persons, found.genders) == (("anna", "ben"), ("female", "male"))
+    write(tmp_path / "walk.pkl", {0: apart(0), 1: plain(1)})
+    assert read(tmp_path).persons == ("0", "1")
+    write(tmp_path / "walk.pkl", [apart(0), plain(1)])
+    assert read(tmp_path).persons == ("person1", "person2")
+
+
+def test_keys_that_other_programs_call_as_ours_mean_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "walk.npz", {**plain(0), "meta": np.array("subject 5"), "body": np.array("smplx")})
+    assert read(tmp_path).body == ""
+    assert read(tmp_path).frames == TRUE.frames
+
+
+def test_people_whose_shapes_are_of_different_families_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "walk_A.npz", scaled(0))  # SMPL's 72 numbers
+    write(tmp_path / "walk_B.npz", plain(1))  # SMPL-X's 165
+    with pytest.raises(DataError, match="shape numbers are of different bodies: smpl, smplx"):
+        read(tmp_path)
+
+
+def test_a_dict_of_people_in_a_npz_is_named_as_what_it_is(tmp_path: Path) -> None:
+    np.savez(tmp_path / "walk.npz", anna=np.array(plain(0), dtype=object), ben=np.array(plain(1), dtype=object))
+    with pytest.raises(DataError, match=r"anna, ben holds pickled objects.* as \.pkl"):
+        read(tmp_path)
+
+
 def damaged(change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
     held = plain(0)
     change(held)
@@ -145,6 +175,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         damaged(lambda h: h.update(poses=h["poses"][:, :40])),
         r"rotations: got shape \(40, 40\), expected \(frames, 66",
     ),
+    "mirrored": ({**matrices(0), "body_pose": -matrices(0)["body_pose"]}, "matrices that are no rotations"),
     "code": (Foreign(), r"a pickle can run code"),
 }
 

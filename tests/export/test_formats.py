@@ -38,10 +38,23 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
 
 
-@pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb"])
+@pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb", ".HTML", ".CSV"])
 def test_a_suffix_may_be_in_capitals(suffix, duet: Scene, body: Body, tmp_path: Path):
     (path,) = formats.write(duet.slice(0, 2), tmp_path / f"a{suffix}", body, style="skeleton")
     assert path.stat().st_size > 100
+    assert path.name == f"a{suffix}"
+
+
+def test_a_frame_without_rotations_is_not_written_as_motion(duet: Scene, body: Body, tmp_path: Path):
+    valid = torch.ones(1, duet.frames, dtype=torch.bool)
+    valid[:, 3] = False
+    T_world_root = duet.T_world_root.clone()
+    T_world_root[:, 3] = 0.0
+    broken = duet.replace(valid=valid, T_world_root=T_world_root)
+    with pytest.raises(ValueError, match=r"not valid: .* is no rotation \(scene 0, frame 3.*cut such frames out"):
+        formats.write(broken, tmp_path / "a.glb", body)
+    formats.write(broken, tmp_path / "a.npz", body)
+    formats.write(duet.replace(valid=valid), tmp_path / "a.glb", body)
 
 
 @pytest.mark.slow

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import roma
 import torch
 
 from magnet.body import Body
 from magnet.export import load_smplx, save_smplx
+from magnet.export.npz import read_smplx
+from magnet.export.rig import UP
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -78,7 +81,7 @@ def test_what_does_not_fit_is_named(trio: Scene, body: Body, tmp_path: Path) -> 
     np.savez(tmp_path / "c.npz", poses=np.zeros((4, 63)), **facts)
     with pytest.raises(ValueError, match=r"poses \(1, 4, 63\).*66 or more"):
         load_smplx(tmp_path / "c.npz", body)
-    np.savez(tmp_path / "d.npz", poses=np.zeros((4, 165)), body="other", **facts)
+    np.savez(tmp_path / "d.npz", poses=np.zeros((4, 165)), body="other", surface_model_type="smplx", **facts)
     with pytest.raises(ValueError, match="written for body 'other'"):
         load_smplx(tmp_path / "d.npz", body)
 
@@ -108,8 +111,28 @@ def test_amass_names_and_its_z_axis_are_understood(trio: Scene, body: Body, tmp_
     back = load_smplx(path, body)
     assert back.fps == 120.0
     assert (body.joints(back)[:, :, 0] - body.joints(trio.replace(body=body.id))[:, :, 0]).abs().max() < 1e-4
-    with pytest.raises(ValueError, match="up axis 'x'"):
-        load_smplx(path, body, up="x")
+    with pytest.raises(ValueError, match="up axis 'w'"):
+        load_smplx(path, body, up="w")
+
+
+@pytest.mark.parametrize("up", ["-y", "z", "-z", "x", "-x"])
+def test_a_file_of_another_program_is_turned_upright_whichever_axis_points_up(up, trio: Scene, body: Body, tmp_path):
+    turn = np.eye(4)
+    turn[:3, :3] = UP[up].T  # from our world to the file's
+    path = foreign(trio, body, tmp_path / "there.npz", ("surface_model_type",))
+    with np.load(path) as file:
+        arrays = dict(file)
+    root = roma.rotvec_to_rotmat(torch.from_numpy(arrays["poses"][:, :3])).numpy()
+    rest = body.rest_joints(torch.zeros(10))[0].double().numpy()
+    turned = roma.rotmat_to_rotvec(torch.from_numpy(turn[:3, :3] @ root)).numpy()
+    place = (arrays["transl"] + rest) @ turn[:3, :3].T - rest
+    poses = np.concatenate([turned, arrays["poses"][:, 3:]], axis=1)
+    np.savez(path, **{**arrays, "poses": poses, "transl": place, "trans": place, "body": "somebody"})
+    upright, found = read_smplx(path, body)
+    assert found == up
+    wanted = read_smplx(foreign(trio, body, tmp_path / "here.npz", ()), body)[0]
+    assert (upright.T_world_root - wanted.T_world_root).abs().max() < 1e-4
+    assert torch.equal(upright.T_world_root, load_smplx(path, body, up).T_world_root)
 
 
 def vars_of(body: Body) -> dict:

@@ -45,6 +45,14 @@ class Taken(Heads):
     columns: ClassVar = {"mpjpe": Column("mine", "m", "low", "another one")}
 
 
+class Variant(Heads):
+    columns: ClassVar = {"mpjpe_mean@0.5s": Column("mine", "m", "low", "a variant of ours")}
+
+
+class Bound(Heads):
+    columns: ClassVar = {"fs_low": Column("mine", "m", "low", "a bound of ours")}
+
+
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     points = {
@@ -52,6 +60,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "calls": "Calls",
         "nameless": "Nameless",
         "mine": "Taken",
+        "variant": "Variant",
+        "bound": "Bound",
         "gone": "Gone",
         "FS": "Heads",
     }
@@ -66,7 +76,7 @@ def test_they_are_measured_of_samples_and_of_recordings(installed: None) -> None
     generated, truth, present = draw_batch()
     with pytest.warns(UserWarning, match="metric .* is left out, it failed to load") as warned:
         made = all_metrics(confidence=0.95)
-    assert {str(each.message).split()[1] for each in warned} == {"nameless", "mine", "gone", "FS"}
+    assert {str(each.message).split()[1] for each in warned} == {"nameless", "mine", "variant", "bound", "gone", "FS"}
     recorded = ground_truth_metrics()
     for metrics in (made, recorded):
         metrics.update(generated, truth, present)

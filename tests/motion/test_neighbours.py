@@ -47,6 +47,16 @@ def test_a_bond_holds_however_far_away() -> None:
     assert 29 in table[0] and 0 in table[29]
 
 
+@pytest.mark.parametrize("place", [1e8, float("inf"), float("nan")])
+def test_wherever_somebody_absent_lies_nobody_else_has_other_partners(place: float) -> None:
+    ground, present, before, bonds = crowd(12, 3.0)
+    present[7] = False
+    bonds[0, 5] = bonds[5, 0] = True
+    table = nearest_partners(ground, present, before, bonds)
+    ground[7] = place
+    assert torch.equal(nearest_partners(ground, present, before, bonds), table)
+
+
 @pytest.mark.parametrize("people", [5, 17, 60])
 def test_everybody_is_read_from_a_view_with_the_own_partners(people: int) -> None:
     ground, present, before, bonds = crowd(people, people**0.5, seed=people)

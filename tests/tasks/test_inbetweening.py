@@ -61,6 +61,7 @@ def settled(model, scene, task, options, tokens: int, context: int = 2):
         (Inbetweening(keys=(7,), agents=(1,)), {0: set(), 1: {7}}),
         (Inbetweening(pairs=((0, 4), (1, 9))), {0: {4}, 1: {9}}),
         (Inbetweening(keys=(7,), agents=(0,), pairs=((1, 9),)), {0: {7}, 1: {9}}),
+        (Inbetweening(pairs=[[0, 4], [1, 9]]), {0: {4}, 1: {9}}),
     ],
 )
 def test_keyframes_are_where_they_were_asked_for(task, keys):

@@ -90,6 +90,8 @@ def test_targets_must_exist_and_leave_somebody():
         PartnerInpainting((0, 1, 2)).schedule(GRID)
     with pytest.raises(ValueError, match="--people 2` adds another"):
         PartnerInpainting().schedule(replace(GRID, agents=1))
+    with pytest.raises(ValueError, match="own_past: got 'false', expected True or False"):
+        PartnerInpainting(own_past="false").schedule(GRID)
     with pytest.raises(ValueError, match="offset: got 2"):
         AgenticAsync(2).schedule(GRID)
     with pytest.raises(ValueError, match="at most once"):

@@ -64,3 +64,11 @@ def test_a_denoiser_never_runs_with_another_tokenizer_than_its_own(tmp_path):
     loaded = Denoiser.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True).eval()
     assert not loaded.tokenizer.network.causal
     assert torch.equal(loaded.encode(scene), expected)
+
+
+def test_a_tokenizer_is_averaged_too(tmp_path):
+    """It makes its body when it is set up, which an average that was copied before would lack."""
+    model = tiny_tokenizer()
+    run = trainer(2, callbacks=[WeightEMA(0.5)])
+    run.fit(model, datamodule=data())
+    assert run.global_step == 2

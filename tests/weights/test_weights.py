@@ -71,6 +71,21 @@ def test_a_later_format_is_refused(checkpoint, tmp_path):
         checkpoints.read(folder)
 
 
+@pytest.mark.parametrize("change", [{"format": "one"}, {"hyper_parameters": None}, {"parts": 3}])
+def test_a_damaged_configuration_is_named(change, checkpoint, tmp_path):
+    folder = checkpoints.write(checkpoint, tmp_path)
+    config = json.loads((folder / "config.json").read_text())
+    config.pop("sha256")
+    (folder / "config.json").write_text(json.dumps(config | change))
+    with pytest.raises(ValueError, match=r"config\.json is damaged"):
+        checkpoints.read(folder)
+
+
+def test_no_name_is_no_checkpoint():
+    with pytest.raises(ValueError, match="not a file, nor a model that comes with the package"):
+        checkpoints.resolve("")
+
+
 class Evil:
     def __reduce__(self):
         return print, ("code has run",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 COUPLES: tuple[tuple[int, int], ...] = ((60, 61), (18, 19), (20, 21), (22, 23), (33, 34))
 """Subjects recorded together, in one world: salsa (leader first); then two people who shake hands, pull, talk, quarrel
 or walk side by side (18 to 23), and who throw a ball (33 and 34)."""
-RATES = {"33": 60.0, "34": 60.0, "60": 60.0, "61": 60.0, "143": 60.0}
+RATES = {33: 60.0, 34: 60.0, 60: 60.0, 61: 60.0, 143: 60.0}
 """Frames a second by subject where they are not 120. Subject 143 jumps in 143_35 and falls with 10.2 m/s2 at 60 fps; at
 120 it would be four times that."""
 USUAL_RATE = 120.0

@@ -156,6 +156,10 @@ class OwnReader(Reader, Generic[T]):
         """Scenes with their splits; or their parts, where they are split in time."""
         if not self.in_time:
             return super().takes()
+        for scene in self.scenes():
+            twice = [part_name(scene, split) for split in SPLITS if part_name(scene, split) in self.scenes()]
+            if twice:
+                raise DataError(f"{self.root}: the scene {twice[0]!r} is called as a part of {scene!r}; rename it")
         return [
             Take(part_name(take.name, split), take.files, split, "", take.also)
             for take in self.found()
@@ -211,7 +215,7 @@ class OwnReader(Reader, Generic[T]):
             notes += said
             tracks += held
             starts += [person_file.start] * len(held)
-            names += [person_file.person] if len(held) == 1 else [f"person {p + 1}" for p in range(len(held))]
+            names += [person_file.person] if len(held) == 1 else [""] * len(held)  # else as the file calls them
         if group.alone:
             notes.append("named like one of several people, but no other file goes with it")
         tracks = self._one_rate(tracks, group, notes)

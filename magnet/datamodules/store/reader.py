@@ -173,14 +173,21 @@ class StoreSplit:
 def in_roles(persons: Sequence[Sequence[str]], roles: Sequence[str], slots: int) -> Ints:
     """The order in which each clip's people fill the slots: first who has the first role, and so on. -> (C, slots)
 
-    "P1, actor" has the role "actor". People of none of the roles come last, in the order of the recording.
+    "P1, actor" has the role "actor", and so has "Actor". People of none of the roles come last, in the order of the
+    recording.
     """
+    roles = [role.casefold() for role in roles]
     order = np.tile(np.arange(slots), (len(persons), 1))
     for clip, names in enumerate(persons if roles else []):
-        words = [{name, *re.findall(r"[^\s,;:()]+", name)} for name in names]
+        words = [_words(name) for name in names]
         rank = [next((r for r, role in enumerate(roles) if role in mine), len(roles)) for mine in words]
         order[clip, : len(names)] = np.argsort(rank, kind="stable")
     return order
+
+
+def _words(name: str) -> set[str]:
+    """A person's name and the words in it, in lower case."""
+    return {name.casefold(), *re.findall(r"[^\s,;:()]+", name.casefold())}
 
 
 T = TypeVar("T")
@@ -234,6 +241,19 @@ class StoreReader:
             return inside(self.path, entry["file"])
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{self.path / MANIFEST}: damaged ({error}); prepare the store again") from error
+
+    def require_roles(self, roles: Sequence[str]) -> None:
+        """Refuse a role that nobody in the store has.
+
+        Raises:
+            ValueError: names it, and some that people have.
+        """
+        named = {name for entry in self.manifest.get("persons", []) for name in entry["persons"]}
+        had = {word for name in named for word in _words(name)}
+        for role in roles:
+            if role.casefold() not in had:
+                some = ", ".join(sorted(named)[:8]) or "without names"
+                raise ValueError(f"roles: got {role}, which nobody in {self.path} has; its people are {some}")
 
     def split(self, split: Split, roles: tuple[str, ...] = ()) -> StoreSplit:
         """The clips of a split, people in the order of `roles` as `in_roles` says; no clips where it is empty."""

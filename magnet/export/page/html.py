@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -59,9 +60,9 @@ def save_html(
             body's scene.
     """
     path = Path(path)
-    if path.suffix not in ("", ".html"):
+    if path.suffix.lower() not in ("", ".html"):
         raise ValueError(f"{path}: a page is a .html file")
-    path = path.with_suffix(".html")
+    path = path if path.suffix else path.with_suffix(".html")
     path.parent.mkdir(parents=True, exist_ok=True)
     text = page(scene, body, context=context, truth=truth, title=title, styles=styles)
     path.write_text(text, encoding="utf-8")
@@ -95,14 +96,12 @@ def page(
     data, meta["arrays"] = _packed(arrays)
     words = {
         "title": html.escape(title or (shown[0].label if len(shown) == 1 else "magnet")),
-        "meta": json.dumps(meta, separators=(",", ":")).replace("</", "<\\/"),
+        "meta": json.dumps(meta, separators=(",", ":")).replace("<", "\\u003c"),  # a name may hold <!-- or </script>
         "data": base64.b64encode(data).decode("ascii"),
         "player": "\n".join(_packaged(name) for name in SCRIPTS),
     }
-    text = _packaged("player.html")
-    for name, word in words.items():
-        text = text.replace("{{" + name + "}}", word)
-    return text
+    # In one pass, for a title may hold what looks like a place to fill.
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: words[place[1]], _packaged("player.html"))
 
 
 def _packaged(name: str) -> str:

@@ -67,6 +67,13 @@ def test_people_stand_in_the_order_of_roles(with_roles, resident):
             assert torch.equal(found.select([b]).betas, wanted.betas)
 
 
+def test_roles_are_read_in_any_case_and_one_that_nobody_has_is_refused(with_roles):
+    order = [data(with_roles, roles=roles, **PLAIN).train_scenes(8, stride=64) for roles in (("leader",), ("Leader",))]
+    assert torch.equal(order[0].T_world_root, order[1].T_world_root)
+    with pytest.raises(ValueError, match=r"roles: got leeder, which nobody in .* has; its people are P1, leader"):
+        data(with_roles, roles=("leeder",), **PLAIN).train_scenes(8, stride=64)
+
+
 def test_mixed_reads_stores_by_memory_map_and_no_clip_whole(store, with_roles, monkeypatch):
     path = data(store).body_model  # the same file as the other store's
     kinds = ({"path": store}, {"path": with_roles, "roles": ("leader",)})

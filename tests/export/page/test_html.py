@@ -84,6 +84,14 @@ def test_context_truth_and_title_are_there(duet: Scene, body: Body) -> None:
     assert "</script><b>" not in page(duet, body, title="</script><b>")
 
 
+@pytest.mark.parametrize("title", ["x <!--<script> y", "a {{data}} b", "{{title}}"])
+def test_a_title_may_hold_anything(title: str, duet: Scene, body: Body) -> None:
+    plain, strange = (page(duet, body, title=each) for each in ("x", title))
+    assert len(strange) < len(plain) + 1000
+    assert "<!--<script>" not in strange
+    assert contents(strange)[0]["takes"] == [title]
+
+
 def test_the_page_marks_what_the_scene_says_was_given(duet: Scene, body: Body) -> None:
     given = torch.zeros(1, 24, 2, dtype=torch.bool)
     given[:, :, 1] = True
