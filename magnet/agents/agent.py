@@ -11,7 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
-from magnet.agents.message import JOINTS, POSE, TOKEN, Message
+from magnet.agents.message import JOINTS, LONGEST, POSE, TOKEN, Message
 from magnet.agents.rollout import OwnRollout
 from magnet.denoiser.module import Denoiser
 from magnet.motion.frames import rigid
@@ -74,7 +74,7 @@ class Notebook:
         filled: tokens that came later than they were wanted, and were filled in.
 
     Raises:
-        ValueError: another number of names than of slots, a name twice, or no such agent.
+        ValueError: another number of names than of slots, a name twice, too long or empty, or no such agent.
     """
 
     def __init__(self, start: Scene, names: Sequence[str], me: str) -> None:
@@ -86,6 +86,8 @@ class Notebook:
                 f"names: got {', '.join(names)} for {start.agents} slots and the agent {me}; expected a name for "
                 "each slot, and the agent's among them"
             )
+        if not all(1 <= len(name) <= LONGEST for name in names):
+            raise ValueError(f"names: got {', '.join(map(repr, names))}, expected 1 to {LONGEST} letters each")
         self.names, self.me, self.next = tuple(names), tuple(names).index(me), 0
         whole = min(start.frames // TOKEN, KEPT // 2)
         self.start = start.slice(start.frames - whole * TOKEN).replace(valid=None, given=None, names=())

@@ -27,6 +27,8 @@ LARGEST = 65536
 """Bytes of a message, at most."""
 HEADER = 2048
 """Bytes of a header, at most."""
+LONGEST = 64
+"""Letters of a name, at most."""
 KEYS = {"v", "kind", "agent", "sender", "session", "frame", "count", "clock", "betas", "model", "heard"}
 
 Kind = Literal["frames", "hello"]
@@ -149,6 +151,6 @@ def _number(value: object) -> float:
 
 
 def _text(value: object) -> str:
-    if not isinstance(value, str) or len(value) > 64:
+    if not isinstance(value, str) or len(value) > LONGEST:
         raise RefusedMessage("header")
     return value

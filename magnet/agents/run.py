@@ -182,6 +182,11 @@ class Process:
     def _hello(self) -> None:
         self._send(Message("hello", self.name, self.name, 0, -1, 0.0, heard=tuple(sorted(self._heard))))
 
+    @property
+    def unheard(self) -> list[str]:
+        """Those who should take part and of whom nothing has come."""
+        return sorted(self.others - self._heard)
+
     def begin(self) -> None:
         """Meet the others, and begin with them; or join them where they are."""
         end = self.clock() + self.meet

@@ -51,6 +51,10 @@ class Link:
                         f"{address} is not an address of this machine (tcp://127.0.0.1:PORT, ipc://PATH): give keys "
                         "(--keys) to send to others"
                     )
+        else:
+            for file in (f"{name}.key_secret", *(f"{other}.key" for other in connect)):
+                if not (keys / file).is_file():
+                    raise ValueError(f"{keys / file} is missing: make one with --make_keys, or copy theirs there")
         self._zmq, self.context = zmq, zmq.Context()
         self._guard: Any = None
         try:
@@ -113,10 +117,21 @@ class Link:
 
 
 def make_keys(folder: Path, name: str) -> Path:
-    """Make a pair of CURVE keys: NAME.key, which the others need, and NAME.key_secret, which nobody else may see."""
+    """Make a pair of CURVE keys: NAME.key, which the others need, and NAME.key_secret, which nobody else may see.
+
+    Raises:
+        ValueError: a name that no file can have, or whose keys are there already.
+    """
     engine()
     import zmq.auth
 
+    if not name or Path(name).name != name:
+        raise ValueError(f"name: got {name!r}, expected one that a file can have")
+    if (folder / f"{name}.key_secret").exists():
+        raise ValueError(
+            f"{folder / name}.key_secret is there already, and the others have its {name}.key: to make another pair, "
+            "delete it first"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     _, secret = zmq.auth.create_certificates(folder, name, metadata={"magnet": str(VERSION)})
     Path(secret).chmod(0o600)

@@ -112,12 +112,19 @@ class Windows:
         return self._ordered[people, every]
 
 
+MADE_OF_IT = re.compile(r" (x[\d.]+|reshaped \d+|mirror|opposite|pass|beside|behind)$")
+"""Ends of the names of clips that data sets make of a recording."""
+
+
 def recording(label: str) -> str:
     """Name of the recording that a window was cut from, by the window's label, such as "60_05+61_05 x1.1 [120:302]".
 
-    A recording has one name at all its speeds (`CMU.speeds`).
+    A recording has one name at all its speeds (`CMU.speeds`), on all bodies (`Reshaped`) and in all its `SoloPairs`.
     """
-    return re.sub(r" x[\d.]+$", "", label.partition(" [")[0])
+    name, before = label.partition(" [")[0], ""
+    while name != before:
+        name, before = MADE_OF_IT.sub("", name), name
+    return name
 
 
 def moved_points(T_a_b: Tensor, points: Tensor) -> Tensor:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import re
 import signal
 import string
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,6 +82,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(f"--speed is {given.speed:g}, expected over 0 and at most 1, real time")
     if given.seconds is not None and not given.seconds > 0:
         raise CommandError(f"--seconds is {given.seconds:g}, expected over 0")
+    for name in ("patience", "meet"):
+        if not 0 <= getattr(given, name) < float("inf"):
+            raise CommandError(f"--{name} is {getattr(given, name):g}, expected seconds, 0 or more")
     if given.threads < 1:
         raise CommandError(f"--threads is {given.threads}, expected at least 1")
     import torch
@@ -91,8 +96,12 @@ def main(arguments: Sequence[str] = ()) -> int:
         require_place(out)
     torch.set_num_threads(given.threads)
     start = read(given.scene).plain()
-    names = tuple(given.names.split(",")) if given.names else tuple(string.ascii_uppercase[: start.agents])
-    connect = peers(given.connect, names, given.name)
+    names = (
+        tuple(name.strip() for name in given.names.split(","))
+        if given.names
+        else tuple(string.ascii_uppercase[: start.agents])
+    )
+    connect = peers(given.connect, names, given.name, given.listen)
     member = member_of(given, start, names)
     link = zeromq.Link(given.name, given.listen, connect, given.keys)
     try:
@@ -102,18 +111,25 @@ def main(arguments: Sequence[str] = ()) -> int:
     return 0
 
 
-def peers(connect: Sequence[str], names: Sequence[str], me: str) -> dict[str, str]:
+def peers(connect: Sequence[str], names: Sequence[str], me: str, listen: str = "") -> dict[str, str]:
     """Addresses by name.
 
     Raises:
-        CommandError: not of the form NAME=ADDRESS, or nobody of the scene.
+        CommandError: not of the form NAME=ADDRESS, nobody of the scene, somebody twice, one's own address, or no port.
     """
-    found = {}
+    found: dict[str, str] = {}
+    for address in (listen, *(each.partition("=")[2] for each in connect)):
+        port = re.fullmatch(r"tcp://.*:(\d+)", address)
+        if port and not 1 <= int(port[1]) <= 65535:
+            raise CommandError(f"{address}: got port {port[1]}, expected 1 to 65535")
     for each in connect:
         name, equals, address = each.partition("=")
         if not equals or name not in names or name == me:
             others = ", ".join(other for other in names if other != me)
             raise CommandError(f"--connect {each}: expected NAME=ADDRESS, with a name of {others}")
+        if name in found or address == listen:
+            whose = f"{name} is said twice" if name in found else "that is this agent's own, of --listen"
+            raise CommandError(f"--connect {each}: {whose}; expected each of the others once, where it listens")
         found[name] = address
     return found
 
@@ -165,6 +181,8 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         signal.signal(number, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))
+    if process.unheard:
+        print(f"magnet: never heard {', '.join(process.unheard)}: are addresses and keys theirs?", file=sys.stderr)
     report = process.report.told(member, gate, process.pace)
     print(json.dumps(report))
     if given.report is not None:

@@ -7,6 +7,7 @@ checkpoints is switched off: a checkpoint's options become the lowest layer, and
 from __future__ import annotations
 
 import importlib
+import inspect
 import pickle
 import sys
 import textwrap
@@ -14,6 +15,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import yaml
+from lightning.pytorch import Trainer
 
 from magnet import checkpoints
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
@@ -234,6 +238,17 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
     return layer
 
 
+def trained_with(checkpoint: Path) -> dict[str, Any]:
+    """Options of the Trainer, and a chosen optimizer, of the run that a checkpoint is of, by its config.yaml."""
+    folder = checkpoint.parent.parent
+    if not ((folder / "run.json").is_file() and (folder / "config.yaml").is_file()):
+        return {}
+    said = yaml.safe_load((folder / "config.yaml").read_text())
+    known = inspect.signature(Trainer.__init__).parameters
+    trainer = {key: value for key, value in (said.get("trainer") or {}).items() if key in known and value is not None}
+    return {"trainer": trainer} | {key: said[key] for key in ("optimizer", "lr_scheduler") if said.get(key)}
+
+
 OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
 """Options that a model does not take over from the one that it starts from."""
 
@@ -260,12 +275,13 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
         said = textwrap.shorten(str(error).partition("\n")[0], 200)
         raise CommandError(f"--model.start_from {name}: {said}") from error
     denoiser = "tokenizer_hyper_parameters" in checkpoint
-    short = (given.class_of("model") or ("Denoiser" if denoiser else "Tokenizer")).rpartition(".")[2]
-    if short not in models:  # somebody's own model knows what it starts from
+    named = given.class_of("model") or ("Denoiser" if denoiser else "Tokenizer")
+    short = _ours(named, models)
+    if short is None:  # somebody's own model knows what it starts from
         return {}
     fields = "tokenizer_hyper_parameters" if denoiser and short == "Tokenizer" else "hyper_parameters"
     stored = checkpoint.get(fields) or {}
-    path = f"{models[short]}.{short}"
+    path = f"{models[short]}.{short}" if named.rpartition(".")[2] == short else named
     known = options_of(class_named(path))
     kept = {key: value for key, value in stored.items() if key in known - OWN_WAY}
     layer = {"model": {"class_path": path, "init_args": {k: v for k, v in kept.items() if k not in LINKS.values()}}}
@@ -276,6 +292,19 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
         wanted = {key: value for key, value in linked.items() if value is not None and key in accepted}
         layer["data"] = {"class_path": data, "init_args": wanted}
     return layer
+
+
+def _ours(named: str, models: dict[str, str]) -> str | None:
+    """The short name of the model of ours that a class is, or that somebody's own class goes on from; None: of none."""
+    short = named.rpartition(".")[2]
+    if short in models:
+        return short
+    try:
+        kind = class_named(named)
+    except ImportError:
+        return None  # the parser says so
+    ours = ((name, class_named(f"{module}.{name}")) for name, module in models.items())
+    return next((name for name, our in ours if kind is not None and our is not None and issubclass(kind, our)), None)
 
 
 LINKS = {"max_agents": "max_agents", "window_frames": "window"}

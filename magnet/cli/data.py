@@ -287,7 +287,7 @@ def run_prepare(given: argparse.Namespace) -> int:
         print(f"note: {line}")
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))
-    print(f"{report.made} takes converted, {report.kept} kept from an earlier run")
+    print(f"{report.made - report.failed} takes converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     show_gaps(m["splits"])
     takes = sum(split["takes"] for split in m["splits"].values())

@@ -58,8 +58,6 @@ def parser() -> argparse.ArgumentParser:
     pictures.add_argument("--title", help="written above")
     bvh = options.add_argument_group("reading .bvh and .npz of other programs")
     scene_files.add_origin(bvh)
-    theirs = "left_hip=Thigh_L, where names say nothing"
-    bvh.add_argument("--joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
     return options
 
 
@@ -74,16 +72,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     refuse_unused(options, out.suffix.lower())
     if options.context < 0:
         raise CommandError(f"--context {options.context}: expected 0 frames or more")
-    given = dict(pair.partition("=")[::2] for pair in options.joint)
     film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
-    reading = formats.Reading(
-        fps=None if film and len(options.inputs) == 1 else options.fps,
-        trim=options.trim,
-        unit=options.in_unit,
-        up=options.up,
-        joints=given,
-        keep_floor=options.keep_floor,
-    )
+    reading = scene_files.reading(options, None if film and len(options.inputs) == 1 else options.fps)
     got = scene_files.read_inputs(options, reading)
     scene = got.scene
     if options.on_floor:

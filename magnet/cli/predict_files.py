@@ -153,12 +153,11 @@ def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
     import torch
 
     from magnet.body import load_body
-    from magnet.export import formats
     from magnet.motion.scene import FPS, empty_scene
     from magnet.motion.tokens import TOKEN_FRAMES
 
     if options.inputs:
-        reading = formats.Reading(FPS, options.trim, options.in_unit, options.up, keep_floor=options.keep_floor)
+        reading = scene_files.reading(options, FPS)
         got = scene_files.read_inputs(options, reading)
         return got.scene, got.body
     body = load_body(options.body or "open")
@@ -272,7 +271,7 @@ def lengths(
         raise CommandError(f"the files hold {scene.frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
     if context > recorded:
         raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
-    rest = options.frames or (recorded - context) or FUTURE
+    rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
     tokens, steps = -(-(context + rest) // TOKEN_FRAMES), model.sampler.steps
     if added:  # planned with a past, for tasks that need one refuse to be planned without
         planned = choice.task.schedule(Grid(tokens + 1, scene.agents, max(context // TOKEN_FRAMES, 1), steps)).known

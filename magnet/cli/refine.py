@@ -38,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("refine", __doc__, EPILOG)
     options.add_argument("out", **scene_files.OUT)
     scene_files.add_body(options)
+    scene_files.add_origin(options.add_argument_group("reading .bvh and .npz of other programs"))
     add = options.add_argument
     apart = "light lets people lean on each other, firm lets them touch (default: %(default)s)"
     add("--apart", choices=("light", "firm"), default="firm", help=apart)
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
     if options.plot:
         require_place(options.plot)
-    got = scene_files.read_inputs(options, formats.Reading(trim=options.trim))
+    got = scene_files.read_inputs(options, scene_files.reading(options))
     scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
     formats.require_finite(got.scene)
     if not got.scene.frames:

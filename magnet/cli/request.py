@@ -73,6 +73,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         stored = checkpoint_config.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
         layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
+        if command == "fit" and not given.files:
+            layer |= checkpoint_config.trained_with(checkpoint)
     elif command == "fit" and (start := given.option("model", "start_from")):
         layer = checkpoint_config.started(start, given, models, registry.default_path())
     if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():

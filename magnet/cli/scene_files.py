@@ -31,10 +31,26 @@ def add_body(options: Options) -> None:
 
 
 def add_origin(options: Options) -> None:
-    """--in_unit, --up and --keep_floor, for files of other programs."""
+    """--in_unit, --up, --keep_floor and --joint, for files of other programs."""
     options.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs)")
     options.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point)")
     options.add_argument("--keep_floor", action="store_true", help="keep people at the height they were recorded at")
+    theirs = "left_hip=Thigh_L, where names say nothing"
+    options.add_argument("--joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
+
+
+def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
+    """What `add_body` and `add_origin` were given, as readers take it."""
+    from magnet.export.formats import Reading
+
+    return Reading(
+        fps=fps,
+        trim=options.trim,
+        unit=options.in_unit,
+        up=options.up,
+        joints=dict(pair.partition("=")[::2] for pair in options.joint),
+        keep_floor=options.keep_floor,
+    )
 
 
 def add_look(options: Options) -> None:

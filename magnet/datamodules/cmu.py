@@ -31,8 +31,9 @@ FIT_VERSION = 4
 WHERE = (
     "CMU's recordings come from http://mocap.cs.cmu.edu: `magnet data download cmu FOLDER` fetches them, or put NN.asf "
     "and NN_TT.amc of couples (60 and 61 dance salsa) and of any single people into one folder yourself; say where "
-    'with --data.root or MAGNET_CMU. Published results must say: "The data used in this project was obtained from '
-    'mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217."'
+    "with --data.root (magnet score: --root) or MAGNET_CMU. Published results must say: "
+    '"The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF '
+    'EIA-0196217."'
 )
 TEST_TAKES, VAL_TAKES = (5, 10, 15), (3,)
 VAL_SINGLES = ("02_03", "05_12")

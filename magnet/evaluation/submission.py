@@ -88,7 +88,7 @@ class Submission:
                 if lacking:
                     there = ", ".join(sorted(file.files)) or "nothing"
                     raise ValueError(f"{path}: lacks {', '.join(lacking)}; it has {there}. See docs/benchmark.md")
-                read = {key: file[key] for key in KEYS}
+                read = {key: _array(path, key, file) for key in KEYS}
         except (EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path}: not a readable npz ({error}); write it with numpy.savez") from error
         names = tuple(map(str, np.atleast_1d(read["scenes"])))
@@ -99,6 +99,22 @@ class Submission:
         return Submission(str(read["benchmark"]), str(read["task"]), method, names, joints, path.name)
 
 
+def _array(path: Path, key: str, file: Any) -> Any:
+    """One of a file's arrays; what is to be one text is one."""
+    try:
+        array = file[key]
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: {key}: got Python objects, expected text or numbers: np.array(..., dtype=str)"
+        ) from error
+    if key in ("benchmark", "task", "method"):
+        if array.size != 1 or array.dtype.kind not in "US":
+            raise ValueError(f"{path}: {key}: got {array.tolist()!r}, expected one text")
+        said = array.item()
+        return said.decode("utf-8", "replace") if isinstance(said, bytes) else said
+    return np.char.decode(array, "utf-8") if array.dtype.kind == "S" else array
+
+
 def _require_facts(path: Path, read: dict[str, Any], benchmark: Benchmark) -> None:
     """Raise ValueError where a file is for something else."""
     if str(read["benchmark"]) != benchmark.label:
@@ -107,7 +123,7 @@ def _require_facts(path: Path, read: dict[str, Any], benchmark: Benchmark) -> No
         known = ", ".join(benchmark.tasks)
         raise ValueError(f"{path}: task: got {str(read['task'])!r}, expected one of {known}")
     fps = read["fps"]
-    if fps.size != 1 or fps.dtype.kind not in "iuf" or abs(float(fps.item()) - benchmark.fps) > 1e-6:
+    if fps.size != 1 or fps.dtype.kind not in "iuf" or not abs(float(fps.item()) - benchmark.fps) <= 1e-6:
         raise ValueError(f"{path}: fps: got {fps.tolist()}, expected {benchmark.fps:g}; resample the joints to it")
 
 
@@ -136,6 +152,8 @@ def _joints(path: Path, joints: Any, benchmark: Benchmark, task: str) -> Tensor:
             f"({count}, {benchmark.samples} or 1, {', '.join(map(str, rest))}): scenes, samples, frames after the "
             f"context, people, joints, xyz"
         )
+    with np.errstate(over="ignore"):
+        joints = joints.astype(np.float32)
     scored = benchmark.sight(task).generated.numpy()
     bad = ~np.isfinite(joints).all(axis=(-1, -2)) & scored
     if bad.any():
@@ -144,7 +162,7 @@ def _joints(path: Path, joints: Any, benchmark: Benchmark, task: str) -> Tensor:
             f"{path}: joints: not a number in scene {scene}, sample {sample}, frame {frame}, person {person}, who is "
             f"scored in {task}; {int(bad.sum())} such places"
         )
-    return torch.from_numpy(np.nan_to_num(joints.astype(np.float32)))
+    return torch.from_numpy(np.nan_to_num(joints))
 
 
 def answered(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from magnet.body.joints import (  # isort: skip
     ANKLES, COLLARS, ELBOWS, JOINT_NAMES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PARENTS,
     PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
 )  # fmt: skip
-from magnet.body.fit import fit_body, floor_height, swing
+from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood
@@ -55,6 +55,7 @@ class Source:
     exact: bool  # the skeleton is the body's own: nothing had to be fitted
     residual: float  # metres between limb joints and the file's, mean over joints and frames
     worst: str  # limb joint with the largest mean residual
+    jumps: tuple[int, ...] = ()  # frames to which everything jumps
 
     @property
     def poor(self) -> bool:
@@ -69,6 +70,9 @@ class Source:
                 lines.append("  that is much: its proportions are far from a person's; hands and feet may miss")
             if self.unused:
                 lines.append(f"  not mapped: {', '.join(self.unused)}")
+        if self.jumps:
+            where = ", ".join(map(str, self.jumps[:5])) + (", ..." if len(self.jumps) > 5 else "")
+            lines.append(f"  everything jumps to frame {where} (a rest pose before it, or a cut?): better leave it out")
         return "\n".join(lines)
 
 
@@ -125,6 +129,7 @@ def load_bvh(
         )
     skeletons = [understood(file, unit, up, joints) for file in files]
     read = [onto(skeleton, body) for skeleton in skeletons]
+    sources = tuple(replace(how, jumps=_jumps(each)) for (_, how), each in zip(read, skeletons, strict=True))
     labels = [str(path) for path in each]
     scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
     floor = 0.0
@@ -133,7 +138,7 @@ def load_bvh(
         T_world_root = scene.T_world_root.clone()
         T_world_root[..., 1, 3] -= floor
         scene = scene.replace(T_world_root=T_world_root)
-    return Imported(scene.replace(names=(each[0].stem,)), tuple(source for _, source in read), floor)
+    return Imported(scene.replace(names=(" + ".join(path.stem for path in each),)), sources, floor)
 
 
 def onto(
@@ -149,6 +154,16 @@ def onto(
         ValueError: no fit.
     """
     return _exact(skeleton, body) or _fitted(skeleton, body, refuse_above, most_shape)
+
+
+def _jumps(skeleton: Skeleton) -> tuple[int, ...]:
+    """Frames to which everything jumps: of two that do not go on, the second."""
+    joints = torch.from_numpy(skeleton.at)[:, None]
+    off = jumps_in(joints)[:, 0]
+    step = (joints[1:] - joints[:-1]).norm(dim=-1).mean(dim=-1)[:, 0]
+    # A step from frame t to t + 1 is a part of the second differences of both; it is the longer one of a jump's two.
+    at = {t + 1 + int(step[t + 1] > step[t]) for t in off.nonzero()[:, 0].tolist()}
+    return tuple(sorted(at))
 
 
 # -- a skeleton of the body's own --------------------------------------------------------------

@@ -219,20 +219,27 @@ class Live:
             )
         given = self._future(past, scene.frames, known, frames)
         if isinstance(task, MotionControl):
-            chunk = self._answered(task, given, version)
+            chunk = self._answered(task, given, version, scene.frames)
         else:
             chunk = self.sample(given, task, CONTEXT, frames).replace(given=given.given).slice(CONTEXT)
         return self._append(scene, chunk, version, begun)
 
-    def _answered(self, task: MotionControl, given: Scene, version: int) -> Scene:
-        """The answer to a given future, by the partner who has answered so far. given (1, `CONTEXT` + T) -> (1, T)"""
+    def _answered(self, task: MotionControl, given: Scene, version: int, begins: int) -> Scene:
+        """The answer to a given future from the frame `begins` on, by the partner who has answered so far.
+
+        Who has not answered up to there, because another task was played, remembers another past: a new one answers.
+        given (1, `CONTEXT` + T) -> (1, T)
+        """
         options = self._options()
-        key = (version, task, options)
+        key = (version, task, options, begins)
         if self._partner is None or self._partner[0] != key:
             past = given.slice(0, CONTEXT)
             partner = Partner(self.model, past, task.target, options, self.generator, task.block)
-            self._partner = (key, partner)
-        answer = self._partner[1].answer(given.slice(CONTEXT)).to("cpu")
+        else:
+            partner = self._partner[1]
+        self._partner = None
+        answer = partner.answer(given.slice(CONTEXT)).to("cpu")
+        self._partner = ((version, task, options, begins + answer.frames), partner)
         return answer.replace(names=(), given=None if given.given is None else given.given[:, CONTEXT:])
 
     def between(self) -> LiveChunk:

@@ -213,6 +213,9 @@ def test_memory_does_not_grow(denoiser, start):
 def test_what_cannot_be_is_named(denoiser, start):
     with pytest.raises(ValueError, match="a name for each slot"):
         Agent(denoiser, start, ("A", "B"), "A", AgenticSync())
+    for name in ("", 65 * "A"):
+        with pytest.raises(ValueError, match="expected 1 to 64 letters each"):
+            Agent(denoiser, start, (name, *NAMES[1:]), name, AgenticSync())
     with pytest.raises(ValueError, match="turns with offset 1"):
         Agent(denoiser, start, NAMES, "A", AgenticAsync(offset=0.5))
     with pytest.raises(ValueError, match="settle_blocks"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -18,6 +19,8 @@ import torch
 from magnet.agents.agent import poses_of
 from magnet.agents.message import unpack
 from magnet.agents.zeromq import Link, engine, make_keys
+from magnet.cli.agent import peers
+from magnet.cli.errors import CommandError
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
@@ -158,6 +161,32 @@ def test_without_keys_only_this_machine_is_spoken_to():
         Link("A", "tcp://0.0.0.0:5601", {})
     with pytest.raises(ValueError, match="not an address of this machine"):
         Link("A", "tcp://127.0.0.1:5601", {"B": "tcp://192.168.0.2:5602"})
+
+
+def test_keys_that_are_there_stay_and_those_that_are_not_are_named(tmp_path):
+    make_keys(tmp_path, "A")
+    before = (tmp_path / "A.key_secret").read_text()
+    with pytest.raises(ValueError, match=r"A\.key_secret is there already"):
+        make_keys(tmp_path, "A")
+    assert (tmp_path / "A.key_secret").read_text() == before
+    with pytest.raises(ValueError, match=r"got '\.\./evil'"):
+        make_keys(tmp_path / "keys", "../evil")
+    with pytest.raises(ValueError, match=r"B\.key is missing"):
+        Link("A", "tcp://127.0.0.1:5601", {"B": "tcp://127.0.0.1:5602"}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("connect", "said"),
+    [
+        (["B=tcp://127.0.0.1:99999"], "got port 99999, expected 1 to 65535"),
+        (["B=tcp://127.0.0.1:5601"], "that is this agent's own"),
+        (["B=tcp://127.0.0.1:5602", "B=tcp://127.0.0.1:5603"], "B is said twice"),
+        (["X=tcp://127.0.0.1:5602"], "with a name of B, C"),
+    ],
+)
+def test_addresses_that_cannot_be_are_refused(connect, said):
+    with pytest.raises(CommandError, match=re.escape(said)):
+        peers(connect, ("A", "B", "C"), "A", "tcp://127.0.0.1:5601")
 
 
 def test_with_keys_members_hear_each_other_and_strangers_hear_nothing(tmp_path):

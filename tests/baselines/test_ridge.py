@@ -8,6 +8,7 @@ from magnet.baselines import RidgeRegression, Windows
 from magnet.baselines import ridge as module
 from magnet.baselines.windows import recording
 from magnet.body import load_body
+from magnet.datamodules.solo_pairs import PAIRINGS
 from magnet.motion.frames import canonical_frame, from_planar, inverse
 from magnet.motion.scene import Scene, concatenate
 from tests.baselines.test_retrieval import CONTEXT, HORIZON, somewhere_else, wander
@@ -125,6 +126,8 @@ def test_a_label_names_its_recording() -> None:
     labels = ("60_05+61_05 [120:302]", "60_05+61_05 x0.9 [3:5]", "60_05+61_05 x1.1 [3:5]", "60_05+61_05")
     assert {recording(label) for label in labels} == {"60_05+61_05"}
     assert recording("box x [1:2]") == "box x"
+    for made in ("reshaped 0", "x1.1 reshaped 12", *PAIRINGS, *(f"x0.9 {name}" for name in PAIRINGS)):
+        assert recording(f"02_01 {made} [0:64]") == "02_01"
 
 
 def test_windows_with_a_masked_frame_are_left_out() -> None:

@@ -303,3 +303,15 @@ def test_a_training_that_is_told_to_end_says_how_it_goes_on_and_is_no_success(
         signal.signal(signal.SIGTERM, before)
     assert "goes on" in capsys.readouterr().err
     assert (toy / "trained/checkpoints/last.ckpt").exists()
+
+
+def test_a_run_goes_on_as_it_was_trained_where_only_its_checkpoint_is_named(toy: Path) -> None:
+    """Without its configuration, gradients were no longer clipped, and callbacks were gone."""
+    own = ("--trainer.callbacks", "lightning.pytorch.callbacks.ModelSummary", "--trainer.callbacks.max_depth", "2")
+    go(*FIT, "--trainer.gradient_clip_val", "0.5", "--trainer.accumulate_grad_batches", "2", *own)
+    go("fit", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs", "3")
+    config = yaml.safe_load((toy / "trained/config.yaml").read_text())["trainer"]
+    assert (config["gradient_clip_val"], config["accumulate_grad_batches"], config["max_epochs"]) == (0.5, 2, 3)
+    assert [each["init_args"]["max_depth"] for each in config["callbacks"]] == [2]
+    go("fit", "--config", "trained/config-1.yaml", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs=4")
+    assert yaml.safe_load((toy / "trained/config.yaml").read_text())["trainer"]["gradient_clip_val"] == 0.5

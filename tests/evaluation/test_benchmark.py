@@ -100,6 +100,12 @@ def test_inputs_hold_what_a_task_gives_and_nothing_else(task: str, tmp_path: Pat
 Arrays = dict[str, Any]
 BROKEN: dict[str, tuple[Callable[[Arrays], Any], str]] = {
     "another frame rate": (lambda a: a.update(fps=20.0), r"fps: got 20.0, expected 30; resample"),
+    "no frame rate": (lambda a: a.update(fps=np.nan), "fps: got nan, expected 30"),
+    "Python objects": (
+        lambda a: a.update(scenes=np.array(list(a["scenes"]), dtype=object)),
+        r"b\.npz: scenes: got Python objects, expected text or numbers",
+    ),
+    "two methods": (lambda a: a.update(method=["a", "b"]), r"method: got \['a', 'b'\], expected one text"),
     "another benchmark": (lambda a: a.update(benchmark="x-1"), "benchmark: got 'x-1', expected 'cmu-salsa-duets-1'"),
     "another task": (lambda a: a.update(task="dance"), "task: got 'dance', expected one of joint_future"),
     "a scene lost": (lambda a: a.update(scenes=a["scenes"][1:], joints=a["joints"][1:]), r"lacks test0 \[0:36\]"),
@@ -112,6 +118,10 @@ BROKEN: dict[str, tuple[Callable[[Arrays], Any], str]] = {
     "no number": (
         lambda a: a["joints"].__setitem__((4, 1, 7, 1, 0, 0), np.nan),
         "scene 4, sample 1, frame 7, person 1",
+    ),
+    "too large": (
+        lambda a: a.update(joints=np.where(a["joints"] == a["joints"].max(), 1e300, a["joints"].astype(float))),
+        "not a number in scene",
     ),
     "no joints": (lambda a: a.pop("joints"), "lacks joints; it has benchmark, fps, method, scenes, task"),
 }
@@ -127,6 +137,15 @@ def test_a_broken_submission_is_refused_with_what_to_do(name: str, tmp_path: Pat
     np.savez(tmp_path / "b.npz", **arrays)
     with pytest.raises(ValueError, match=said):
         Submission.load(tmp_path / "b.npz", benchmark)
+
+
+def test_text_may_be_written_as_bytes(tmp_path: Path) -> None:
+    benchmark, _, truth = made()
+    with np.load(submitted(truth.expand(-1, SAMPLES, -1, -1, -1, -1)).save(tmp_path / "a.npz", 30)) as file:
+        arrays = {key: value.astype("S") if value.dtype.kind == "U" else value for key, value in dict(file).items()}
+    np.savez(tmp_path / "b.npz", **arrays)
+    read = Submission.load(tmp_path / "b.npz", benchmark)
+    assert (read.method, read.scenes) == ("mine", benchmark.scenes)
 
 
 def test_a_file_that_is_no_npz_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -274,6 +275,23 @@ def test_recorded_dancers_as_bvh_fit_as_well_as_their_own_reader_does(take, cmu_
     ours, theirs = body.joints(own)[0, :, 0], body.joints(found.scene)[0, :, 0]
     assert (ours - theirs).norm(dim=-1)[:, LIMBS].mean() < 0.03
     assert (ours[..., 1] - theirs[..., 1]).mean().abs() < 0.02
+
+
+def test_a_rest_pose_in_the_first_frame_spoils_none_of_the_others(truth: Truth, body: Body, tmp_path: Path):
+    """Many programs write one, at the origin."""
+    path = stranger(truth, body, tmp_path / "plain.bvh")
+    head, motion = path.read_text().split("Frame Time:")
+    step, *rows = motion.strip().splitlines()
+    frames = int(re.search(r"Frames: (\d+)", head)[1])
+    rest = " ".join("0" for _ in rows[0].split())
+    more = head.replace(f"Frames: {frames}", f"Frames: {frames + 1}")
+    led = tmp_path / "led.bvh"
+    led.write_text(f"{more}Frame Time: {step}\n" + "\n".join([rest, *rows]) + "\n")
+    plain, found = load_bvh(path, body), load_bvh(led, body)
+    off = (body.joints(found.scene)[:, 1:] - body.joints(plain.scene)).norm(dim=-1)
+    assert off.max() < 0.03, off.amax(dim=(0, 2, 3))
+    assert "everything jumps to frame 1 (a rest pose" in str(found.sources[0])
+    assert "jumps" not in str(plain.sources[0])
 
 
 def test_a_single_frame_is_enough(truth: Truth, body: Body, tmp_path: Path):

@@ -135,6 +135,25 @@ def test_a_live_answer_is_that_of_a_partner_bit_for_bit(model) -> None:
     assert live.advance().start == 60
 
 
+def test_who_answers_after_another_task_goes_on_from_what_that_made(model, monkeypatch) -> None:
+    """A partner who had stopped answering remembers another past, and people would jump to where it left off."""
+    pasts = []
+
+    def asked(denoiser, past, *more):
+        pasts.append(past)
+        return Partner(denoiser, past, *more)
+
+    monkeypatch.setattr("magnet.generation.live.Partner", asked)
+    live = Live(model, people=2, generator=torch.Generator().manual_seed(3))
+    live.settings.steps = 2
+    for task in ("motion_control", "motion_control", "joint_future", "motion_control"):
+        before, live.settings.task = live.scene, task
+        live.advance()
+    first, second = pasts
+    assert first.frames == second.frames == 32
+    assert torch.equal(second.T_world_root, before.T_world_root[:, -32:])
+
+
 def test_a_partners_recording_is_given_as_it_is(model) -> None:
     generator = torch.Generator().manual_seed(2)
     recorded = random_scene(1, 80, 2, generator)

@@ -29,7 +29,8 @@ class PrepareReport:
     """What a run of `prepare` did."""
 
     folder: StoreReader
-    made: int  # takes converted in this run
+    made: int  # takes read in this run
+    failed: int  # of these, takes that could not be used
     kept: int  # takes that an earlier run had finished
 
 
@@ -102,7 +103,8 @@ def prepare(
         done = {keys[name]: place for name, place in packed.items()}
         write_whole(state, "state.json", as_json({"manifest": file_hash(out / MANIFEST), "takes": done}))
         clean(folder, state, set(done))
-    return PrepareReport(folder, len(todo), len(takes) - len(todo))
+    failed = sum(take.name not in packed for take in todo)
+    return PrepareReport(folder, len(todo), failed, len(takes) - len(todo))
 
 
 @dataclass(frozen=True)

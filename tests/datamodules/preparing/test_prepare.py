@@ -194,7 +194,8 @@ def test_bad_takes_are_skipped_and_listed(order, tmp_path):
     assert "no stretch of 30 frames" in skipped["take1"]
     assert folder.manifest["splits"]["train"]["takes"] == 1
     (tmp_path / "dl/take0.txt").write_text("150 2 30.0 0")
-    assert prepare(order, tmp_path / "store").made == 2  # what failed is always tried again
+    again = prepare(order, tmp_path / "store")
+    assert (again.made, again.failed) == (2, 1)  # what failed is always tried again
 
 
 def test_nothing_usable_is_an_error_that_says_why(order, tmp_path):
