@@ -96,9 +96,8 @@ def prepare(
         packed = pack(sources, old, out, facts, shard_rows)
         if packed is None:
             listed = "".join(f"\n  {s.take.name}: {s.head(None).error}" for s in sources[:20])
-            raise DataError(
-                f"{reader.title}: none of {len(takes)} takes could be used; check --root and these files:{listed}"
-            )
+            none = f"{reader.title}: none of {len(takes)} takes could be used"
+            raise DataError(f"{none}; check --root and these files:{listed}")
         folder = StoreReader(out)
         done = {keys[name]: place for name, place in packed.items()}
         write_whole(state, "state.json", as_json({"manifest": file_hash(out / MANIFEST), "takes": done}))
