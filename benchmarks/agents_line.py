@@ -170,7 +170,8 @@ def agents(
 
     where = {name: f"10.7.0.{number + 1}" for number, name in enumerate(names)}
     for name in names:
-        make_keys(folder / "keys", name)
+        if not (folder / "keys" / f"{name}.key_secret").exists():
+            make_keys(folder / "keys", name)
     made = {}
     for name in names:
         words = [sys.executable, "-m", "magnet", "agent", "--name", name, "--scene", str(scene)]

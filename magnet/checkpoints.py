@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import zipfile
 from pathlib import Path
@@ -271,11 +272,26 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     return folder
 
 
+REQUEUED = "hpc_ckpt_"
+"""How the checkpoints begin that Lightning leaves for a job that SLURM starts again; a number follows."""
+NUMBERED = re.compile(rf"{REQUEUED}(\d+)\.ckpt")
+
+
+def requeued(folder: Path) -> Path | None:
+    """The checkpoint with which a job goes on that SLURM has started again; None: it has not, or there is none."""
+    if not int(os.environ.get("SLURM_RESTART_COUNT") or 0):
+        return None
+    names = {path: NUMBERED.fullmatch(path.name) for path in folder.glob(f"{REQUEUED}*")}
+    found = {int(match[1]): path for path, match in names.items() if match}
+    return found[max(found)] if found else None
+
+
 class CheckpointIO(TorchCheckpointIO):
     """Lets Lightning load released folders like its own checkpoints, and writes a checksum beside each checkpoint."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        if storage_options is not None or "://" in str(path):  # elsewhere than on a disk
+        # Elsewhere than on a disk; or for SLURM to start again with: Lightning counts files of such names.
+        if storage_options is not None or "://" in str(path) or Path(path).name.startswith(REQUEUED):
             super().save_checkpoint(checkpoint, path, storage_options)
         else:
             save(checkpoint, Path(path))

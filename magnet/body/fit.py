@@ -25,8 +25,8 @@ from magnet.motion.scene import BODY_JOINTS, FPS, Scene
 
 CENTIMETRE = 0.01
 JUMP = 0.15
-"""Metres by which joints are, on average, off where they would be if they went on. In CMU's 72 takes at 30 frames a
-second it is 0.10 at most, in a leap of 05_17."""
+"""Metres by which joints are, on average, off where they would be if they went on, at 30 frames a second; at fewer it
+grows with the square of a frame's time. In CMU's 72 takes it is 0.10 at most, in a leap of 05_17."""
 NEARLY_RIGID = (HIPS, SHOULDERS, (L_HIP, L_SHOULDER), (R_HIP, R_SHOULDER))
 """Distances that tell the shape although they change a little with the pose: hips, shoulders, flanks."""
 TORSO = (PELVIS, *HIPS, SPINE1, SPINE2, SPINE3, NECK, *SHOULDERS)
@@ -149,7 +149,7 @@ def fit_body(
             found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
             floor, soles = float(floor_height(found, body, betas).median()), clearance(body, betas)
     smooth = settings.smooth * (fps / FPS) ** 4
-    problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor, soles, _steady(targets))
+    problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor, soles, _steady(targets, fps))
     R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(total - settings.steps + done, total))
     scene = Scene(
         body_rot=R[None, :, :, 1:],
@@ -165,18 +165,18 @@ def fit_body(
     return BodyFit(scene, residual)
 
 
-def jumps_in(targets: Tensor) -> Tensor:
+def jumps_in(targets: Tensor, fps: float = FPS) -> Tensor:
     """Beside which frames somebody jumps to another place or pose, as after a rest pose in frame 0, or at a cut.
 
     targets (T, P, M, 3) m -> (T - 2, P) bool, of the frames 1 to T - 2: the step out of such a frame does not go on as
     the step into it. A marker that is lost for a frame is no jump: the mean of all joints counts.
     """
-    return (targets[2:] - 2 * targets[1:-1] + targets[:-2]).norm(dim=-1).mean(dim=-1) > JUMP
+    return (targets[2:] - 2 * targets[1:-1] + targets[:-2]).norm(dim=-1).mean(dim=-1) > JUMP * max(FPS / fps, 1.0) ** 2
 
 
-def _steady(targets: Tensor) -> Tensor | None:
+def _steady(targets: Tensor, fps: float) -> Tensor | None:
     """Where nobody jumps, as `jumps_in`; None: nowhere does anybody."""
-    jumps = jumps_in(targets)
+    jumps = jumps_in(targets, fps)
     return ~jumps if bool(jumps.any()) else None
 
 

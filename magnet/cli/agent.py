@@ -80,8 +80,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError("--scene START and --listen ADDRESS say what to begin with and where the others hear it")
     if not 0 < given.speed <= 1:
         raise CommandError(f"--speed is {given.speed:g}, expected over 0 and at most 1, real time")
-    if given.seconds is not None and not given.seconds > 0:
-        raise CommandError(f"--seconds is {given.seconds:g}, expected over 0")
+    if given.seconds is not None and not 0 < given.seconds < float("inf"):
+        raise CommandError(f"--seconds is {given.seconds:g}, expected a number over 0")
     for name in ("patience", "meet"):
         if not 0 <= getattr(given, name) < float("inf"):
             raise CommandError(f"--{name} is {getattr(given, name):g}, expected seconds, 0 or more")

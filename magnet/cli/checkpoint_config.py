@@ -7,7 +7,6 @@ checkpoints is switched off: a checkpoint's options become the lowest layer, and
 from __future__ import annotations
 
 import importlib
-import inspect
 import pickle
 import sys
 import textwrap
@@ -15,9 +14,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import yaml
-from lightning.pytorch import Trainer
 
 from magnet import checkpoints
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
@@ -238,17 +234,6 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
     return layer
 
 
-def trained_with(checkpoint: Path) -> dict[str, Any]:
-    """Options of the Trainer, and a chosen optimizer, of the run that a checkpoint is of, by its config.yaml."""
-    folder = checkpoint.parent.parent
-    if not ((folder / "run.json").is_file() and (folder / "config.yaml").is_file()):
-        return {}
-    said = yaml.safe_load((folder / "config.yaml").read_text())
-    known = inspect.signature(Trainer.__init__).parameters
-    trainer = {key: value for key, value in (said.get("trainer") or {}).items() if key in known and value is not None}
-    return {"trainer": trainer} | {key: said[key] for key in ("optimizer", "lr_scheduler") if said.get(key)}
-
-
 OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
 """Options that a model does not take over from the one that it starts from."""
 
@@ -363,13 +348,18 @@ def trusted(spec: Spec, path: Path) -> Spec:
         CommandError: the checkpoint names a class outside magnet that is not imported yet.
     """
     for name in class_paths(spec):
-        module = name.rpartition(".")[0]
-        if not (module == "magnet" or module.startswith("magnet.") or module in sys.modules):
+        if not chosen(name):
             raise CommandError(
                 f"{path} was made with {name}, which is not part of magnet; if you trust that, name the class yourself "
                 "with --model or --data"
             )
     return spec
+
+
+def chosen(name: str) -> bool:
+    """Whether a class is ours, Lightning's or torch's, or of a module that is imported already."""
+    module = name.rpartition(".")[0]
+    return module.partition(".")[0] in ("magnet", "lightning", "torch") or module in sys.modules
 
 
 def class_paths(value: Any) -> Iterable[str]:

@@ -60,7 +60,7 @@ def _names_files(arguments: Sequence[str]) -> bool:
     flag, values = "", 0
     for word in arguments:
         if word.startswith("--"):
-            flag, values = word, int("=" in word)
+            flag, values = word, int("=" in word or word in ("--trim", "--keep_floor"))
         elif values and flag != "--out" and Path(word).suffix.lower() in READ:
             return True
         else:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magnet.cli import checkpoint_config, class_options, config_files, run_folder
+from magnet import checkpoints
+from magnet.cli import checkpoint_config, class_options, config_files, going_on, run_folder
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
@@ -73,12 +74,17 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         stored = checkpoint_config.Stored.read(checkpoint)
         keep_data = given.value("ckpt_path") is not None
         layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
-        if command == "fit" and not given.files:
-            layer |= checkpoint_config.trained_with(checkpoint)
+        if command == "fit":
+            layer |= going_on.trained_with(checkpoint, given)
     elif command == "fit" and (start := given.option("model", "start_from")):
         layer = checkpoint_config.started(start, given, models, registry.default_path())
     if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():
-        raise CommandError(f"--out {out}: is a file's name, expected that of a folder; {command} writes several files")
+        hint = (
+            "; files to go on from stand before --out: magnet predict A.bvh --out o.glb" if command == "predict" else ""
+        )
+        raise CommandError(
+            f"--out {out}: is a file's name, expected that of a folder; {command} writes several files{hint}"
+        )
     folder = run_folder.run_folder(runs / name, out)
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
@@ -109,6 +115,8 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         CommandError: it is not there.
     """
     name, out = given.value("ckpt_path"), given.value("out")
+    if name is None and command == "fit" and out and not given.only_shown:
+        return checkpoints.requeued(Path(out))
     if name is None and (command == "fit" or given.only_shown):
         return None
     if command == "fit":

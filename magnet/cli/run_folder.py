@@ -33,10 +33,15 @@ MONITOR = "val/loss"
 LATEST = "latest"
 
 
+def started_by_lightning() -> bool:
+    """Whether this is a process that Lightning has started beside the first one, and not torchrun or SLURM."""
+    return "RANK" not in os.environ and os.environ.get("LOCAL_RANK", "0") != "0"
+
+
 def first_process() -> bool:
     """Whether this is the only process, or the first of all; told by what torchrun, SLURM and Lightning say."""
-    said = (os.environ[name] for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK") if name in os.environ)
-    return next(said, "0") == "0"
+    said = ("RANK",) if "RANK" in os.environ else ("SLURM_PROCID", "LOCAL_RANK")
+    return all(os.environ.get(name, "0") == "0" for name in said)
 
 
 @contextlib.contextmanager
@@ -265,6 +270,7 @@ class Record(Callback):
         facts: what else run.json says.
         latest: keep a link `latest` beside the folder that leads to it once there is a checkpoint.
         goes_on: in the folder of the training that it goes on with, whose record is kept under another name.
+        command: of the run.
     """
 
     def __init__(
@@ -275,9 +281,10 @@ class Record(Callback):
         facts: dict[str, Any],
         latest: bool = False,
         goes_on: bool = False,
+        command: str = "fit",
     ) -> None:
         self.folder, self.config, self.options, self.facts, self.latest = folder, config, options, facts, latest
-        self.goes_on, self.begun = goes_on, False
+        self.goes_on, self.command, self.begun = goes_on, command, False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Take the first process's folder: each names one by its own clock."""
@@ -290,12 +297,14 @@ class Record(Callback):
         self.begun = True
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.goes_on:
-            before = len(list(self.folder.glob("run-*.json"))) + 1
+            before = len(list(self.folder.glob("run-[0-9]*.json"))) + 1
             for name, suffix in (("config", "yaml"), ("run", "json")):
                 if (self.folder / f"{name}.{suffix}").is_file():
                     (self.folder / f"{name}.{suffix}").replace(self.folder / f"{name}-{before}.{suffix}")
-        (self.folder / "config.yaml").write_text(self.config)
-        (self.folder / "run.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
+        # What is measured in a training's folder is recorded beside the training, which goes on as it was.
+        own = f"-{self.command}" if self.command != "fit" and (self.folder / "checkpoints").is_dir() else ""
+        (self.folder / f"config{own}.yaml").write_text(self.config)
+        (self.folder / f"run{own}.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
 
     on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
 

@@ -284,16 +284,16 @@ class MagnetCLI(LightningCLI):
         return taken
 
     def _refuse_overwriting(self) -> None:
-        if (self.folder / "checkpoints").exists() and not self._goes_on and run_folder.first_process():
+        if (self.folder / "checkpoints").exists() and not self._goes_on and not run_folder.started_by_lightning():
             raise CommandError(
                 f"{self.folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
             )
 
     @property
     def _goes_on(self) -> bool:
-        """Whether a training goes on in its own folder: with a checkpoint of its own, or as a requeued SLURM job."""
+        """Whether a training goes on in its own folder: with a checkpoint of its own."""
         own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents
-        return self.command == "fit" and (own or any(self.folder.glob("hpc_ckpt_*.ckpt")))
+        return self.command == "fit" and own
 
     def _record(self) -> run_folder.Record:
         self._dump_config()
@@ -304,7 +304,7 @@ class MagnetCLI(LightningCLI):
             "checkpoint": None if self.checkpoint is None else str(self.checkpoint),
         }
         latest = self.command == "fit" and self._option("out") is None
-        return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on)
+        return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on, self.command)
 
     def _option(self, name: str) -> Any:
         return self.config[self.command].get(name)

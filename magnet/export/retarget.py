@@ -159,7 +159,7 @@ def onto(
 def _jumps(skeleton: Skeleton) -> tuple[int, ...]:
     """Frames to which everything jumps: of two that do not go on, the second."""
     joints = torch.from_numpy(skeleton.at)[:, None]
-    off = jumps_in(joints)[:, 0]
+    off = jumps_in(joints, skeleton.file.fps)[:, 0]
     step = (joints[1:] - joints[:-1]).norm(dim=-1).mean(dim=-1)[:, 0]
     # A step from frame t to t + 1 is a part of the second differences of both; it is the longer one of a jump's two.
     at = {t + 1 + int(step[t + 1] > step[t]) for t in off.nonzero()[:, 0].tolist()}

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import JOINT_NAMES, PARENTS, Body, load_body
-from magnet.body.fit import FitSettings, clearance, fit_body, kabsch, shape_from_lengths, swing
+from magnet.body.fit import FitSettings, clearance, fit_body, jumps_in, kabsch, shape_from_lengths, swing
 from magnet.datamodules.preparing.fit_cache import LIMBS, fit_whole
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import measured
@@ -141,6 +141,15 @@ def test_a_body_that_does_not_fit_is_refused_with_the_worst_joint(body: Body, mo
     targets[:, :, 20] += 3.0
     with pytest.raises(ValueError, match=r"mean error of .* cm, expected at most 4\.0 cm; worst is left_wrist"):
         fit_body(targets, ALL, body, settings=QUICK)
+
+
+def test_what_a_leap_may_be_grows_with_the_time_between_frames() -> None:
+    """Somebody who brakes by 6 g: seen 30 times a second, and 15 times."""
+    time = torch.arange(0, 0.5, 1 / 30)
+    targets = (30.0 * time**2)[:, None, None, None].expand(-1, 1, 15, 3) / 3**0.5
+    assert not jumps_in(targets, 30.0).any()
+    assert not jumps_in(targets[::2], 15.0).any()
+    assert jumps_in(targets[::2], 30.0).any()
 
 
 def test_centimetres_are_refused(body: Body, moving: Scene) -> None:

@@ -164,6 +164,10 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
             ),
             (["test", "--data.test.max_scenes", "2"], "no option --data.test.max_scenes"),
             (["test", "2"], "options are written --NAME VALUE"),
+            (
+                ["predict", "--task", "joint_future", "--out", "o.glb", "A.bvh"],
+                "files to go on from stand before --out",
+            ),
             (["test", "--out", __file__], "got a file, expected a folder"),
             (["test", "--frames", "9"], "did you mean --data.window_frames?"),
             (["predict", "--peopel", "2"], "no option --peopel; did you mean --people?"),

@@ -152,7 +152,7 @@ def test_files_may_stand_behind_options() -> None:
     from magnet.cli.predict_files import meant
 
     assert meant(["--task", "joint_future", "a.bvh", "b.bvh", "--out", "c.glb"])
-    assert meant(["--seed=3", "A.NPZ"])
+    assert meant(["--seed=3", "A.NPZ"]) and meant(["--trim", "a.bvh", "--out", "c.glb"])
     for words in (["--out", "a.npz", "b.npz"], ["--data.path", "a.npz"], ["--view", "--data.path", "a.npz"]):
         assert not meant(words), words
 

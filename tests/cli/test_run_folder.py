@@ -65,6 +65,7 @@ def test_a_run_that_begins_in_the_same_second_gets_a_folder_of_its_own(tmp_path:
         ({"RANK": "0", "LOCAL_RANK": "0"}, True),  # by torchrun
         ({"RANK": "8", "LOCAL_RANK": "0"}, False),  # on the second machine
         ({"SLURM_PROCID": "3"}, False),
+        ({"SLURM_PROCID": "0", "LOCAL_RANK": "1"}, False),  # by Lightning, in an interactive job
     ],
 )
 def test_the_first_process_is_known_whoever_started_it(

@@ -15,7 +15,7 @@ import torch
 import yaml
 from lightning.pytorch.trainer.connectors import checkpoint_connector
 
-from magnet import cli
+from magnet import checkpoints, cli
 from magnet.cli import train
 from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel, play
 
@@ -280,12 +280,26 @@ def test_torchruns_first_process_does_not_overwrite_a_finished_run_either(
     assert cli.main(["fit", "--model", "ToyModel", "--out", "trained", *CPU]) == 2
 
 
-def test_a_job_that_slurm_starts_again_goes_on(trained: Path) -> None:
-    """With the checkpoint that Lightning leaves where SLURM says that time is up."""
-    shutil.copy(trained / "checkpoints/last.ckpt", trained / "hpc_ckpt_1.ckpt")
-    shutil.copy(trained / "checkpoints/last.ckpt.sha256", trained / "hpc_ckpt_1.ckpt.sha256")
-    model, _ = go(*FIT[:-3], "4", "--out", "trained")
-    assert model.trainer.global_step == 8
+@pytest.mark.parametrize("again", [True, False])
+def test_a_job_that_slurm_starts_again_goes_on(
+    again: bool, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the checkpoint that Lightning leaves where time is up; another job may not overwrite it."""
+    begun = []
+    kept = torch.load(trained / "checkpoints/last.ckpt", weights_only=True)
+    checkpoints.CheckpointIO().save_checkpoint(kept, trained / "hpc_ckpt_1.ckpt")
+    assert [path.name for path in trained.glob("hpc_ckpt_*")] == ["hpc_ckpt_1.ckpt"]  # Lightning counts such files
+    monkeypatch.setattr(ToyModel, "on_train_start", lambda self: begun.append(self.trainer.global_step), raising=False)
+    said = {"NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0", "JOB_ID": "7", "JOB_NAME": "big"}
+    for name, value in (said | ({"RESTART_COUNT": "1"} if again else {})).items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    words = [*FIT[:-3], "4", "--out", "trained", *CPU]
+    if again:
+        assert cli.main(words) == 0
+        assert begun == [4]
+    else:
+        assert cli.main(words) == 2
+        assert "holds a training run already" in capsys.readouterr().err
 
 
 def test_a_training_that_is_told_to_end_says_how_it_goes_on_and_is_no_success(
@@ -313,5 +327,27 @@ def test_a_run_goes_on_as_it_was_trained_where_only_its_checkpoint_is_named(toy:
     config = yaml.safe_load((toy / "trained/config.yaml").read_text())["trainer"]
     assert (config["gradient_clip_val"], config["accumulate_grad_batches"], config["max_epochs"]) == (0.5, 2, 3)
     assert [each["init_args"]["max_depth"] for each in config["callbacks"]] == [2]
-    go("fit", "--config", "trained/config-1.yaml", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs=4")
-    assert yaml.safe_load((toy / "trained/config.yaml").read_text())["trainer"]["gradient_clip_val"] == 0.5
+    go("test", "--ckpt_path", "last", "--out", "trained")
+    assert (toy / "trained/config-test.yaml").exists() and (toy / "trained/run-test.json").exists()
+    model, _ = go("fit", "--ckpt_path", "last", "--out", "trained", "--trainer.max_steps", "8")
+    config = yaml.safe_load((toy / "trained/config.yaml").read_text())["trainer"]
+    assert (config["gradient_clip_val"], config["max_epochs"], config["max_steps"]) == (0.5, None, 8)
+    assert model.trainer.global_step == 8  # the limit of before, in epochs, has no say
+
+
+def test_a_damaged_record_and_somebody_elses_classes_are_refused_in_a_line(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["fit", "--ckpt_path", "last", "--out", "trained", "--trainer.max_epochs", "3", *CPU]
+    config = trained / "config.yaml"
+    options = yaml.safe_load(config.read_text())
+    options["trainer"]["callbacks"] = [{"class_path": "a_stranger.Callback"}]
+    config.write_text(yaml.safe_dump(options))
+    assert cli.main(words) == 2
+    assert (
+        "names a_stranger.Callback, which is not part of magnet: if you trust it, say --config"
+        in capsys.readouterr().err
+    )
+    config.write_text("[")
+    assert cli.main(words) == 2
+    assert "config.yaml" in capsys.readouterr().err

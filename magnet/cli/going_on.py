@@ -1,0 +1,49 @@
+"""How a training goes on: with the options of the Trainer that its run was trained with."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+
+from magnet.cli.checkpoint_config import Arguments, chosen, class_paths
+from magnet.cli.config_files import read_layers
+from magnet.cli.errors import CommandError
+
+LIMITS = ("max_steps", "max_epochs", "max_time")
+"""Options of the Trainer of which the first that is reached ends a training."""
+
+
+def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
+    """Options of the Trainer, and a chosen optimizer, of the run that a checkpoint is of, by its config.yaml.
+
+    Whoever says how long it is to train now, or names callbacks, says all of that.
+
+    Raises:
+        CommandError: a damaged file, or a class in it that nobody here has named.
+    """
+    file = checkpoint.parent.parent / "config.yaml"
+    if not (file.is_file() and file.with_name("run.json").is_file()):
+        return {}
+    said = read_layers(str(file))[-1].options
+    known = inspect.signature(Trainer.__init__).parameters
+    trainer = {key: value for key, value in (said.get("trainer") or {}).items() if key in known and value is not None}
+    for group in (LIMITS, ("callbacks",)):
+        flags = tuple(f"--trainer.{name}" for name in group)
+        if any(flag.startswith(flags) for flag in given.flags) or _in_files(given, "trainer", group):
+            trainer = {key: value for key, value in trainer.items() if key not in group}
+    layer = {"trainer": trainer} | {key: said[key] for key in ("optimizer", "lr_scheduler") if said.get(key)}
+    for name in class_paths(layer):
+        if not chosen(name):
+            raise CommandError(
+                f"{file} names {name}, which is not part of magnet: if you trust it, say --config {file}"
+            )
+    return layer
+
+
+def _in_files(given: Arguments, key: str, names: Iterable[str]) -> bool:
+    parts = [config.get(key) or {} for config in given.configs]
+    return any(part.get(name) is not None for part in parts for name in names)
