@@ -118,12 +118,11 @@ class BadLine(threading.Thread):
                     heapq.heappush(waiting, (due, number, to, packet))
 
     def _read(self, end: int, address: str) -> list[bytes]:
+        """All packets that have come."""
         found: list[bytes] = []
         try:
-            while True:
+            while select.select([end], [], [], 0)[0]:
                 found.append(os.read(end, 65536))
-        except BlockingIOError:
-            pass  # nothing more has come
         except OSError:  # the process is gone, and its namespace with it
             if self._ends.get(address) == end:
                 del self._ends[address]

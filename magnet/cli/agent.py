@@ -96,11 +96,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         require_place(out)
     torch.set_num_threads(given.threads)
     start = read(given.scene).plain()
-    names = (
-        tuple(name.strip() for name in given.names.split(","))
-        if given.names
-        else tuple(string.ascii_uppercase[: start.agents])
-    )
+    names = tuple(map(str.strip, given.names.split(",") if given.names else string.ascii_uppercase[: start.agents]))
     connect = peers(given.connect, names, given.name, given.listen)
     member = member_of(given, start, names)
     link = zeromq.Link(given.name, given.listen, connect, given.keys)

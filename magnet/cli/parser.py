@@ -180,12 +180,8 @@ class Parser(LightningArgumentParser):
             hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
             return f"got {unknown[1]}, expected an option; {hint}"
         if unknown or refused:
-            field = refused[1] if refused else ""
-            if unknown:
-                name = unknown[1].partition("=")[0]
-                name = self._written(name.lstrip("-"), name)
-            else:
-                name = self._written(field, field)
+            said = unknown[1].partition("=")[0] if unknown else refused[1] if refused else ""
+            name = self._written(said.lstrip("-"), said)
             return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:

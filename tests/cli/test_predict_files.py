@@ -9,7 +9,7 @@ from magnet import cli
 from magnet.body import load_body
 from magnet.checkpoints import FOLDER
 from magnet.denoiser.module import Denoiser
-from magnet.export import save_bvh
+from magnet.export import formats, save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
@@ -149,8 +149,9 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
 
 
 def test_files_may_stand_behind_options() -> None:
-    from magnet.cli.predict_files import meant
+    from magnet.cli.predict_files import READ, meant
 
+    assert READ == formats.READ
     assert meant(["--task", "joint_future", "a.bvh", "b.bvh", "--out", "c.glb"])
     assert meant(["--seed=3", "A.NPZ"]) and meant(["--trim", "a.bvh", "--out", "c.glb"])
     for words in (["--out", "a.npz", "b.npz"], ["--data.path", "a.npz"], ["--view", "--data.path", "a.npz"]):

@@ -180,12 +180,17 @@ def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet
 
 
 def test_frames_that_were_answered_may_be_written_over(model, duet):
-    """A buffer that is filled again and again, as live input is."""
-    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    """A buffer that is filled again and again, as live input is: nothing is refused, and answers are the same."""
+    partner, undisturbed = (
+        Partner(model, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(1)) for _ in range(2)
+    )
     buffer = duet.T_world_root[:, 16:20].clone()
     partner.answer(duet.slice(16, 20).replace(T_world_root=buffer))
+    undisturbed.answer(duet.slice(16, 20))
     buffer[..., 0, 3] += 50.0
-    partner.answer(duet.slice(20, 24))
+    answer, wanted = (each.answer(duet.slice(20, 24)) for each in (partner, undisturbed))
+    assert torch.equal(answer.T_world_root, wanted.T_world_root)
+    assert torch.equal(answer.body_rot, wanted.body_rot)
 
 
 def test_a_body_of_another_shape_than_in_the_past_is_refused(model, duet):
