@@ -201,6 +201,7 @@ def main() -> None:
     parser.add_argument(
         "--stabilization_level", type=int, help="noise level at which made tokens are shown; default: the model's"
     )
+    parser.add_argument("--noise_scale", type=float, help="of new noise in denoising; default: the model's")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="fp32")
     given = parser.parse_args()
     body, model = load_body(), Denoiser.load(given.ckpt_path)
@@ -214,7 +215,9 @@ def main() -> None:
     guidance = Guidance(
         "history" if given.guidance else "none", given.guidance, stabilization_level=given.stabilization_level
     )
-    options = SamplerOptions(steps=given.steps, pyramid_offset=given.pyramid_offset, guidance=guidance)
+    options = SamplerOptions(
+        steps=given.steps, pyramid_offset=given.pyramid_offset, guidance=guidance, noise_scale=given.noise_scale
+    )
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):

@@ -186,6 +186,7 @@ class Sampling:
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
+        noise_scale: standard deviation of the new noise in each denoising step.
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
     """
@@ -194,6 +195,7 @@ class Sampling:
     pyramid_offset: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
+    noise_scale: float | None = None
     stabilization_level: int | None = None
     stabilization_after: int = 0
 

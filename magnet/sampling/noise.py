@@ -176,9 +176,10 @@ class NoiseStream:
         device: of the noise and of the generators.
         dtype: of the noise.
         eta: share of new noise in each denoising step, see `ddim_step`.
+        scale: standard deviation of that new noise.
 
     Raises:
-        ValueError: another number of generators than scenes, or eta outside 0 to 1.
+        ValueError: another number of generators than scenes, eta outside 0 to 1, or a scale that is not over 0.
     """
 
     shape: tuple[int, int, int]
@@ -186,11 +187,13 @@ class NoiseStream:
     device: torch.device | str = "cpu"
     dtype: torch.dtype = torch.float32
     eta: float = 0.0
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
         require_number("eta", self.eta, 0, 1)
+        require_number("scale", self.scale, over=0)
         # Drawn once, so that the noise of a step depends on its place alone, not on the order of the calls.
         each = self.generator if isinstance(self.generator, Sequence) else [self.generator]
         drawn = (torch.randint(2**62, (), generator=g, device=self.device) for g in each if self.eta)
@@ -233,4 +236,4 @@ class NoiseStream:
                 scenes = slice(number * each, (number + 1) * each)
                 new = torch.randn(each, P, D, generator=self._again, device=self.device, dtype=self.dtype)
                 noise[scenes, row] = new if where is None else torch.where(where, new, noise[scenes, row])
-        return noise
+        return noise if self.scale == 1 else noise.mul_(self.scale)

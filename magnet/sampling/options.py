@@ -70,6 +70,9 @@ class SamplerOptions:
         blend: frames over which a seam is blended, after given frames and before them; 20 were chosen on take 3.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/experiments_duet1.md).
+        noise_scale: standard deviation of that new noise. A model takes out a little more noise than there is, and
+            people calm down; a little over 1 they keep their pace (Karras et al. 2022, S_noise). None: as the model is
+            best sampled, or 1.
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
             beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
@@ -106,6 +109,7 @@ class SamplerOptions:
     keep_given: bool = True
     blend: int = 20
     eta: float = 1.0
+    noise_scale: float | None = None
     shift: float = 1.0
     crowd_enter: float = ENTER
     crowd_leave: float = LEAVE
@@ -139,13 +143,24 @@ class SamplerOptions:
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
         require_number("crowd_spacing", self.crowd_spacing, over=0)
         require_number("eta", self.eta, 0, 1)
+        if self.noise_scale is not None:
+            require_number("noise_scale", self.noise_scale, over=0, most=2)
+            if self.noise_scale != 1 and not self.eta:
+                raise ValueError(
+                    f"noise_scale: got {self.noise_scale:g}, but with eta 0 there is no new noise; leave it out"
+                )
         require_spacing(self.spacing, self.shift)
         if self.compile and self.precision == "reference":
             raise ValueError("compile: the precision reference is the network as it was trained; take float32 or int8")
 
     def filled(self, best: Any) -> SamplerOptions:
         """These options where they say something; what they leave open from another object's fields of that name."""
-        left_open = [each.name for each in fields(self) if getattr(self, each.name) is None]
+        scaled = bool(self.eta)  # without new noise there is nothing to scale
+        left_open = [
+            each.name
+            for each in fields(self)
+            if getattr(self, each.name) is None and (scaled or each.name != "noise_scale")
+        ]
         guidance = self.guidance
         if guidance.stabilization_level is None:
             names = ("stabilization_level", "stabilization_after")

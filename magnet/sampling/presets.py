@@ -24,6 +24,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "keep_given": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM
+        "noise_scale": 1.0,  # of no new noise
         "shift": 1.0,  # A.3: even steps
         "any_floor": False,  # recordings stand on the floor
         "guidance": {

@@ -157,6 +157,19 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
     assert SamplerOptions.preset("paper").filled(model).guidance.stabilization_level == 0
 
 
+def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
+    model = Sampling(noise_scale=1.1)
+    assert SamplerOptions().filled(model).noise_scale == 1.1
+    assert SamplerOptions(noise_scale=1.0).filled(model).noise_scale == 1
+    assert SamplerOptions.preset("paper").filled(model).noise_scale == 1
+    assert SamplerOptions(eta=0.0).filled(model).noise_scale is None
+    for scale in (0.0, 2.5):
+        with pytest.raises(ValueError, match="noise_scale: got .*, expected"):
+            Sampling(noise_scale=scale)
+    with pytest.raises(ValueError, match="noise_scale: got 1.1, but with eta 0 there is no new noise"):
+        SamplerOptions(eta=0.0, noise_scale=1.1)
+
+
 def test_a_forgotten_history_is_pure_noise_at_any_context_level(given):
     tokens, levels, present, mask_noise = given
     shown = []

@@ -143,6 +143,15 @@ def test_with_a_generator_each_a_steps_noise_does_not_depend_on_the_batch():
     assert torch.equal(both[1:], alone)
 
 
+def test_a_scale_is_that_of_new_noise_alone():
+    draws = [(0, 700, None), (1, 700, None)]
+    plain, scaled = (NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0, scale=scale) for scale in (1.0, 1.25))
+    assert all(torch.equal(one, other) for one, other in zip(plain.draw(4), scaled.draw(4), strict=True))
+    assert torch.equal(scaled.drawn(0, 2, draws), 1.25 * plain.drawn(0, 2, draws))
+    with pytest.raises(ValueError, match="scale: got 0, expected"):
+        NoiseStream((1, 1, 1), scale=0.0)
+
+
 def test_eta_is_a_share():
     with pytest.raises(ValueError, match="eta: got 2, expected 0"):
         NoiseStream((1, 1, 1), eta=2.0)
