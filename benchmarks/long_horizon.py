@@ -212,12 +212,10 @@ def main() -> None:
         for k in range(clip.frames // WINDOW)
     ]
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
-    guidance = Guidance(
-        "history" if given.guidance else "none", given.guidance, stabilization_level=given.stabilization_level
-    )
-    options = SamplerOptions(
-        steps=given.steps, pyramid_offset=given.pyramid_offset, guidance=guidance, noise_scale=given.noise_scale
-    )
+    kind = "history" if given.guidance else "none"
+    guidance = Guidance(kind, given.guidance, stabilization_level=given.stabilization_level)
+    said = {name: getattr(given, name) for name in ("steps", "pyramid_offset", "noise_scale")}
+    options = SamplerOptions(guidance=guidance, **said)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):

@@ -183,8 +183,7 @@ class Rollout:
             self.related[: scene.frames // TOKEN_FRAMES] = True
         check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
-        scale = 1.0 if o.noise_scale is None else o.noise_scale
-        self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta, scale=scale)
+        self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta, scale=o.noise_scale or 1.0)
         self.cond = None if cond is None else cond.to(model.device).repeat_interleave(samples, dim=0)
         if self.cond is not None and len(self.cond) != B:
             raise ValueError(

@@ -164,9 +164,9 @@ def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
     assert SamplerOptions.preset("paper").filled(model).noise_scale == 1
     assert SamplerOptions(eta=0.0).filled(model).noise_scale is None
     for scale in (0.0, 2.5):
-        with pytest.raises(ValueError, match="noise_scale: got .*, expected"):
+        with pytest.raises(ValueError, match="noise_scale: got"):
             Sampling(noise_scale=scale)
-    with pytest.raises(ValueError, match="noise_scale: got 1.1, but with eta 0 there is no new noise"):
+    with pytest.raises(ValueError, match=r"noise_scale: got 1\.1, but with eta 0 there is no new noise"):
         SamplerOptions(eta=0.0, noise_scale=1.1)
 
 
