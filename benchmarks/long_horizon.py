@@ -214,8 +214,7 @@ def main() -> None:
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
     kind = "history" if given.guidance else "none"
     guidance = Guidance(kind, given.guidance, stabilization_level=given.stabilization_level)
-    said = {name: getattr(given, name) for name in ("steps", "pyramid_offset", "noise_scale")}
-    options = SamplerOptions(guidance=guidance, **said)
+    options = SamplerOptions(given.steps, None, given.pyramid_offset, noise_scale=given.noise_scale, guidance=guidance)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):
