@@ -17,6 +17,7 @@ from torch import Tensor
 
 from magnet import checkpoints
 
+TOKENIZER = "tokenizer."
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config", "magnet_version", "global_step")
 
 
@@ -24,7 +25,7 @@ def mean_of(states: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Each tensor's mean; what is no floating point number must be the same in all.
 
     Raises:
-        ValueError: names, shapes or whole numbers differ.
+        ValueError: names, shapes or whole numbers differ, or the tokenizers do.
 
     >>> mean_of([{"w": torch.tensor([0.0, 2.0])}, {"w": torch.tensor([2.0, 2.0])}])
     {'w': tensor([1., 2.])}
@@ -36,9 +37,12 @@ def mean_of(states: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     made = {}
     for name, x in first.items():
         each = [state[name] for state in states]
-        if x.is_floating_point():
+        same = all(torch.equal(one, x) for one in each)
+        if name.startswith(TOKENIZER) and not same:
+            raise ValueError(f"the checkpoints have different tokenizers: {name} differs")
+        if x.is_floating_point() and not same:
             made[name] = torch.stack([one.double() for one in each]).mean(0).to(x.dtype)
-        elif all(torch.equal(one, x) for one in each):
+        elif same:
             made[name] = x
         else:
             raise ValueError(f"{name} differs and has no mean")
@@ -49,11 +53,20 @@ def main(arguments: list[str] | None = None) -> None:
     """Read, average, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("checkpoints", type=Path, nargs="+")
+    parser.add_argument("checkpoints", type=Path, nargs="+", help="two or more")
+    parser.add_argument("--overwrite", action="store_true", help="write OUT though it is there already")
     given = parser.parse_args(arguments)
-    read: list[dict[str, Any]] = [checkpoints.read(path) for path in given.checkpoints]
-    made = {name: read[0][name] for name in KEPT if name in read[0]}
-    checkpoints.save(made | {"state_dict": mean_of([one["state_dict"] for one in read])}, given.out)
+    if len(given.checkpoints) < 2:
+        parser.error("one checkpoint has no mean: OUT comes first, then two checkpoints or more")
+    if given.out.exists() and not given.overwrite:
+        parser.error(f"{given.out} exists already (OUT comes first); --overwrite writes over it")
+    try:
+        read: list[dict[str, Any]] = [checkpoints.read(path) for path in given.checkpoints]
+        made = {name: read[0][name] for name in KEPT if name in read[0]}
+        made["state_dict"] = mean_of([one["state_dict"] for one in read])
+    except (OSError, ValueError, KeyError) as error:
+        parser.error(str(error).splitlines()[0])
+    checkpoints.save(made, given.out)
     print(f"{given.out}: the mean of {len(read)} checkpoints")
 
 

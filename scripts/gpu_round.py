@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 from magnet import checkpoints
+from magnet.cli.child import run_to_its_end
 
 ROOT = Path(__file__).resolve().parents[1]
 SAVING = 0.5
@@ -35,7 +35,8 @@ def fit_command(given: Any, run: Path) -> list[str]:
         seconds = max(round(60 * (given.minutes - SAVING)), 10)
         command += ["--trainer.max_time", f"00:{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"]
     if given.start:
-        command += ["--model.start_from", str(given.start.resolve())]
+        start = Path(given.start)
+        command += ["--model.start_from", str(start.resolve()) if start.exists() else given.start]
     return command + given.fit
 
 
@@ -44,15 +45,21 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, help="wall-clock time of all of it")
     parser.add_argument("--steps", type=int, help="optimiser steps at most; the learning rate falls to zero with them")
-    parser.add_argument("--start", type=Path, help="weights of an earlier round, or any denoiser of these sizes")
+    parser.add_argument("--start", help="weights of an earlier round, or any denoiser of these sizes")
     parser.add_argument("--out", type=Path, required=True, help="folder for what comes back")
     parser.add_argument("--run", type=Path, help="folder of the run itself, with full checkpoints; default OUT/run")
     parser.add_argument("fit", nargs="*", help="after --: options for magnet fit, such as --data.batch_size=8")
     given = parser.parse_args(arguments)
     if not given.minutes and not given.steps:
         parser.error("how long: give --minutes or --steps")
+    if given.minutes is not None and not SAVING < given.minutes < float("inf"):
+        parser.error(f"--minutes is {given.minutes:g}, expected more than {SAVING:g}, which starting and saving take")
+    if given.steps is not None and given.steps < 1:
+        parser.error(f"--steps is {given.steps}, expected 1 or more")
     run = (given.run or given.out / "run").resolve()
-    subprocess.run(fit_command(given, run), check=True, cwd=ROOT)
+    code = run_to_its_end(fit_command(given, run), ROOT)
+    if code:
+        raise SystemExit(code)
     checkpoint = checkpoints.read(run / "checkpoints" / "last.ckpt")
     folder = checkpoints.write(checkpoint, given.out / "weights", {"steps": int(checkpoint["global_step"])})
     if (run / "metrics.csv").exists():  # few steps log nothing

@@ -76,7 +76,7 @@ def manifest() -> dict[str, str]:
 
 def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:
     """How a checkpoint came about, where its run's record still lies beside it."""
-    record = checkpoint.parents[1] / "run.json" if checkpoint else None
+    record = checkpoint.resolve().parent.parent / "run.json" if checkpoint else None
     return {key: json.loads(record.read_text())} if record and record.exists() else {}
 
 
@@ -84,8 +84,10 @@ def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[
     """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
 
     Raises:
-        ValueError: the tokenizer's codes mean something else: it has other codes, statistics or another encoder.
+        ValueError: it is no tokenizer, or its codes mean something else: it has other codes, statistics or another
+            encoder.
     """
+    require_kind(tokenizer, "tokenizer")
     state = dict(checkpoint["state_dict"])
     for name, value in tokenizer["state_dict"].items():
         own = f"tokenizer.{name}"
@@ -96,7 +98,15 @@ def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[
     return checkpoint | {"state_dict": state, "tokenizer_hyper_parameters": dict(tokenizer["hyper_parameters"])}
 
 
-def main() -> None:
+def require_kind(checkpoint: dict[str, Any], kind: str) -> None:
+    """Raises ValueError where a checkpoint is not of a `denoiser`, or not of a `tokenizer`."""
+    state = checkpoint.get("state_dict") or {}
+    found = "denoiser" if any(name.startswith("tokenizer.") for name in state) else "tokenizer"
+    if not state or found != kind:
+        raise ValueError(f"got a {found if state else 'file without weights'}, expected a {kind}'s checkpoint")
+
+
+def main(arguments: list[str] | None = None) -> None:
     """Read, write, say how large it is."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("checkpoint", type=Path)
@@ -104,8 +114,16 @@ def main() -> None:
     options.add_argument("--decoder", type=Path, help="checkpoint of a tokenizer trained on with decoder_only")
     options.add_argument("--folder", type=Path, default=checkpoints.FOLDER, help="where the model's folder is made")
     options.add_argument("--trained_on", help="what other data than those of configs/duet_*.yaml were")
-    given = options.parse_args()
-    checkpoint = checkpoints.read(given.checkpoint)
+    given = options.parse_args(arguments)
+    if Path(given.name).name != given.name or given.name in (".", ".."):
+        options.error(f"NAME is {given.name!r}, expected a plain name; --folder says where")
+    try:
+        checkpoint = checkpoints.read(given.checkpoint)
+        require_kind(checkpoint, "denoiser")
+        if given.decoder:
+            checkpoint = with_decoder(checkpoint, checkpoints.read(given.decoder))
+    except (OSError, ValueError, KeyError) as error:
+        options.error(str(error).splitlines()[0])
     known = ours((checkpoint.get("magnet_config") or {}).get("data"))
     if not known and not given.trained_on:
         options.error("these weights were trained on other data than configs/duet_*.yaml: say --trained_on 'WHAT'")
@@ -113,8 +131,6 @@ def main() -> None:
         {"trained on": given.trained_on} if given.trained_on else {"trained on": TRAINED_ON, "recordings": manifest()}
     )
     about = data | ABOUT | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
-    if given.decoder:
-        checkpoint = with_decoder(checkpoint, checkpoints.read(given.decoder))
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
     folder = checkpoints.write(checkpoint, given.folder / given.name, without_folders(about))

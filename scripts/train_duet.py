@@ -1,18 +1,17 @@
-"""A model like the shipped one, from recordings to weights in one go: tokenizer, denoiser twice, decoder, release.
+"""The shipped model, from recordings to weights in one go: tokenizer, denoiser three times, decoder, release.
 
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
-`--out`. The stage `on` goes on from the denoiser, and the mean of the weights before and after is released. Stopped at
-any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage that has its
-steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 decoder=2` rehearses it to the end.
+`--out`. The stages `on` and `again` go on from the denoiser, each by itself, and the mean of their weights is released.
+Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage
+that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 decoder=2` rehearses it to the end.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -22,9 +21,12 @@ import yaml
 
 from magnet import checkpoints
 from magnet.callbacks.narrow_codes import NAME as NARROW
+from magnet.cli.child import run_to_its_end
 
 ROOT = Path(__file__).resolve().parents[1]
-STAGES = ("tokenizer", "denoiser", "on", "decoder")
+BEFORE = {"tokenizer": "", "denoiser": "tokenizer", "on": "denoiser", "again": "denoiser", "decoder": "tokenizer"}
+"""The stages in the order they are run, each with the one whose weights it begins from."""
+STAGES = tuple(BEFORE)
 
 
 def config_of(stage: str) -> Path:
@@ -36,11 +38,50 @@ def last_checkpoint(folder: Path) -> Path:
 
 
 def steps_done(folder: Path) -> int:
-    """Optimiser steps of a stage's last checkpoint; 0: there is none."""
+    """Optimiser steps of a stage's last checkpoint; 0: there is none.
+
+    Raises:
+        SystemExit: it is damaged.
+    """
     path = last_checkpoint(folder)
     if not path.is_file():
         return 0
-    return int(checkpoints.read(path)["global_step"])
+    try:
+        return int(checkpoints.read(path)["global_step"])
+    except (ValueError, KeyError, OSError) as error:
+        raise SystemExit(f"{path} cannot be read ({str(error).splitlines()[0]}); move {folder} away to train this stage anew") from None
+
+
+def narrow_codes(out: Path) -> Path:
+    """The tokenizer's codes of few numbers, which it writes when its training is over."""
+    return last_checkpoint(out / "tokenizer").with_name(NARROW)
+
+
+def steps_left(out: Path, steps: dict[str, int]) -> dict[str, tuple[int, int]]:
+    """Of each stage that is not over: the steps it has, and those it is to have.
+
+    Raises:
+        SystemExit: a checkpoint is damaged, or a stage would go on that others have begun from already.
+    """
+    done = {stage: steps_done(out / stage) for stage in STAGES}
+    left = {stage: (done[stage], steps[stage]) for stage in STAGES if done[stage] < steps[stage]}
+    for stage, begun_from in BEFORE.items():
+        if done[stage] and begun_from in left:
+            raise SystemExit(
+                f"{out / stage} began from {begun_from} at step {done[begun_from]}, which would go on to step "
+                f"{steps[begun_from]}; move it away to train it anew, or leave --steps {begun_from}={done[begun_from]}"
+            )
+    if "tokenizer" not in left and not narrow_codes(out).is_file():  # stopped between its last step and them
+        left = {"tokenizer": (done["tokenizer"], done["tokenizer"] + 1), **left}
+    return left
+
+
+def put_aside(folder: Path) -> None:
+    """Rename a stage's folder in which nothing was saved before it was stopped: no training begins in it again."""
+    if folder.is_dir() and any(folder.iterdir()) and not last_checkpoint(folder).is_file():
+        number = next(n for n in range(1, 10_000) if not folder.with_name(f"{folder.name}-{n}").exists())
+        print(f"{folder}: stopped before it saved anything, renamed to {folder.name}-{number}")
+        folder.rename(folder.with_name(f"{folder.name}-{number}"))
 
 
 def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str]:
@@ -48,17 +89,17 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
 
     Args:
         stage: of `STAGES`.
-        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, and `on` with
-            the denoiser.
+        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, `on` and
+            `again` with the denoiser.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
     command = [sys.executable, "-m", "magnet", "fit", "--config", str(config_of(stage)), "--out", str(out / stage)]
     command += ["--trainer.max_steps", str(steps)]
-    tokenizer = str(last_checkpoint(out / "tokenizer").with_name(NARROW))
+    tokenizer = str(narrow_codes(out))
     if stage == "denoiser":
         command += ["--model.tokenizer", tokenizer]
-    if stage == "on":
+    if stage in ("on", "again"):
         command += ["--model.start_from", str(last_checkpoint(out / "denoiser"))]
     if stage == "decoder":
         command += ["--model.start_from", tokenizer]
@@ -92,7 +133,7 @@ def run(command: list[str], what: str) -> None:
     """
     print(f"{what}: {shlex.join(command[1:])}", flush=True)
     begun = time.monotonic()
-    code = subprocess.run(command, check=False, cwd=ROOT).returncode
+    code = run_to_its_end(command, ROOT)
     if code:
         raise SystemExit(f"{what} ended with {code}; run the same command again to go on from its last checkpoint")
     print(f"{what}: done in {(time.monotonic() - begun) / 60:.1f} minutes", flush=True)
@@ -112,22 +153,25 @@ def main(arguments: list[str] | None = None) -> None:
     except ValueError as error:
         parser.error(str(error))
     out = given.out.resolve()
+    folder = (given.weights or out / "weights").resolve()  # every command runs in the repository's root
+    left = steps_left(out, steps)
     for stage in STAGES:
-        done = steps_done(out / stage)
-        if done >= steps[stage]:
-            print(f"{stage}: has its {done} steps already")
+        if stage not in left:
+            print(f"{stage}: has its {steps_done(out / stage)} steps already")
             continue
-        run(fit_command(stage, out, steps[stage], given.fit), f"{stage}, step {done} to {steps[stage]}")
-        if steps_done(out / stage) < steps[stage]:  # stopped by a signal, it ends without an error
+        done, wanted = left[stage]
+        put_aside(out / stage)
+        run(fit_command(stage, out, wanted, given.fit), f"{stage}, step {done} to {wanted}")
+        if steps_done(out / stage) < wanted:  # stopped, and ended without an error
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
     mean = str(last_checkpoint(out / "on").with_name("mean.ckpt"))
-    both = [str(last_checkpoint(out / stage)) for stage in ("on", "denoiser")]
-    run([sys.executable, str(ROOT / "scripts" / "average_weights.py"), mean, *both], "mean")
+    both = [str(last_checkpoint(out / stage)) for stage in ("on", "again")]
+    run([sys.executable, str(ROOT / "scripts" / "average_weights.py"), mean, *both, "--overwrite"], "mean")
     release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), mean]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
-    release += ["--folder", str(given.weights or out / "weights")]
+    release += ["--folder", str(folder)]
     run(release, "release")
-    weights = shlex.quote(str((given.weights or out / "weights") / given.name))
+    weights = shlex.quote(str(folder / given.name))
     print(f"try it: magnet test --task joint_future --ckpt_path {weights}")
 
 

@@ -32,19 +32,33 @@ def test_minutes_leave_time_to_save_and_steps_are_handed_on(tmp_path: Path) -> N
     command = script.fit_command(given(minutes=9.0), tmp_path)
     assert after(command, "--trainer.max_time") == "00:00:08:30"
     assert after(script.fit_command(given(minutes=90.0), tmp_path), "--trainer.max_time") == "00:01:29:30"
-    command = script.fit_command(given(steps=2, start=tmp_path / "weights", fit=["--data.batch_size=4"]), tmp_path)
+    (tmp_path / "weights").mkdir()
+    command = script.fit_command(given(steps=2, start=str(tmp_path / "weights"), fit=["--data.batch_size=4"]), tmp_path)
     assert after(command, "--trainer.max_steps") == "2" and command[-1] == "--data.batch_size=4"
     assert after(command, "--model.start_from") == str(tmp_path / "weights") and "--trainer.max_time" not in command
+    command = script.fit_command(given(steps=2, start="duet"), tmp_path)  # by name, as --model.start_from takes it
+    assert after(command, "--model.start_from") == "duet"
 
 
 def test_how_long_must_be_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         script.main(["--out", str(tmp_path)])
     assert "--minutes or --steps" in capsys.readouterr().err
+    for minutes in ("-3", "0.2", "nan", "inf"):
+        with pytest.raises(SystemExit):
+            script.main(["--out", str(tmp_path), f"--minutes={minutes}"])
+        assert "expected more than 0.5" in capsys.readouterr().err
+
+
+def test_a_training_that_fails_has_said_why_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(script, "run_to_its_end", lambda command, folder: 2)
+    with pytest.raises(SystemExit) as end:
+        script.main(["--steps", "7", "--out", str(tmp_path)])
+    assert end.value.code == 2
 
 
 def test_what_comes_back_is_a_model_in_parts_and_its_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fit(command: list[str], **_: object) -> None:
+    def fit(command: list[str], folder: Path) -> int:
         run = Path(after(command, "--out"))
         (run / "checkpoints").mkdir(parents=True)
         model = tiny_denoiser()
@@ -52,8 +66,9 @@ def test_what_comes_back_is_a_model_in_parts_and_its_curve(tmp_path: Path, monke
         model.on_save_checkpoint(checkpoint)
         torch.save(checkpoint, run / "checkpoints" / "last.ckpt")
         (run / "metrics.csv").write_text("step\n7\n")
+        return 0
 
-    monkeypatch.setattr(script.subprocess, "run", fit)
+    monkeypatch.setattr(script, "run_to_its_end", fit)
     script.main(["--steps", "7", "--out", str(tmp_path)])
     assert (tmp_path / "metrics.csv").read_text() == "step\n7\n"
     assert all(part.stat().st_size <= 16_000_000 for part in (tmp_path / "weights").glob("*.safetensors"))

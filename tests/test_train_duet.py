@@ -43,8 +43,9 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
         assert command[command.index("--trainer.max_steps") + 1] == "9"
         assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
     before = str(recipe.last_checkpoint(tmp_path / "denoiser"))
-    command = recipe.fit_command("on", tmp_path, 9, [])
-    assert command[command.index("--model.start_from") + 1] == before and "--model.tokenizer" not in command
+    for stage in ("on", "again"):
+        command = recipe.fit_command(stage, tmp_path, 9, [])
+        assert command[command.index("--model.start_from") + 1] == before and "--model.tokenizer" not in command
     assert recipe.steps_done(tmp_path / "denoiser") == 0
     save(tmp_path / "denoiser", 5)
     assert recipe.steps_done(tmp_path / "denoiser") == 5
@@ -54,6 +55,7 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
 
 def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Path, monkeypatch, capsys) -> None:
     save(tmp_path / "tokenizer", 3)
+    recipe.narrow_codes(tmp_path).touch()
     ran: list[list[str]] = []
 
     def whole(command: list[str], what: str) -> None:
@@ -64,19 +66,49 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
     with monkeypatch.context() as stopped:
         stopped.setattr(recipe, "run", lambda command, what: None)
         with pytest.raises(SystemExit, match="denoiser was stopped"):
-            recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "decoder=5"])
+            recipe.main(
+                ["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "again=2", "decoder=5"]
+            )
     monkeypatch.setattr(recipe, "run", whole)
     capsys.readouterr()
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "decoder=5"])
+    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "again=2", "decoder=5"])
     configs = [command[command.index("--config") + 1] for command in ran[:-2]]
-    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_on", "duet_decoder"]
-    made, *averaged = (Path(name) for name in ran[-2][2:])
-    assert averaged == [recipe.last_checkpoint(tmp_path / stage) for stage in ("on", "denoiser")]
+    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_on", "duet_again", "duet_decoder"]
+    assert ran[-2][-1] == "--overwrite"  # the mean before, when a stage has gone on
+    made, *averaged = (Path(name) for name in ran[-2][2:-1])
+    assert averaged == [recipe.last_checkpoint(tmp_path / stage) for stage in ("on", "again")]
     assert str(made) in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="run the same command again"):
         recipe.run(["false"], "a stage")
+
+
+def test_what_a_power_cut_leaves_does_not_stop_it(tmp_path: Path, capsys) -> None:
+    steps = dict.fromkeys(recipe.STAGES, 3)
+    save(tmp_path / "tokenizer", 3)
+    assert recipe.steps_left(tmp_path, steps)["tokenizer"] == (3, 4)  # its codes of few numbers are missing
+    recipe.narrow_codes(tmp_path).touch()
+    assert set(recipe.steps_left(tmp_path, steps)) == {*recipe.STAGES} - {"tokenizer"}
+    (tmp_path / "denoiser" / "checkpoints").mkdir(parents=True)  # and nothing in it
+    for stage in ("tokenizer", "denoiser", "on"):
+        recipe.put_aside(tmp_path / stage)
+    assert (tmp_path / "tokenizer").is_dir() and not (tmp_path / "denoiser").exists()
+    assert (tmp_path / "denoiser-1").is_dir() and "renamed to denoiser-1" in capsys.readouterr().out
+    recipe.last_checkpoint(tmp_path / "tokenizer").write_text("half of it")
+    with pytest.raises(SystemExit, match=r"last\.ckpt cannot be read .*; move .* away to train this stage anew"):
+        recipe.steps_left(tmp_path, steps)
+
+
+def test_what_others_began_from_does_not_go_on(tmp_path: Path) -> None:
+    for stage in recipe.STAGES:
+        save(tmp_path / stage, 3)
+    recipe.narrow_codes(tmp_path).touch()
+    assert not recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3))
+    assert set(recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {"again": 5})) == {"again"}
+    for stage, others in (("denoiser", "on"), ("tokenizer", "denoiser")):
+        with pytest.raises(SystemExit, match=f"{others} began from {stage} at step 3, which would go on to step 5"):
+            recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {stage: 5})
 
 
 def beginnings(folder: Path, frames: int = 300) -> Path:
@@ -99,10 +131,14 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "decoder=1", *small])
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=2", "on=1", "decoder=1", *small])
+    recipe.main(
+        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "again=1", "decoder=1", *small]
+    )
+    recipe.main(
+        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=2", "again=1", "decoder=1", *small]
+    )
     said = capfd.readouterr().out
-    assert "tokenizer: has its 1 steps already" in said and "denoiser, step 1 to 2: done" in said
+    assert "tokenizer: has its 1 steps already" in said and "on, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")
     released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
     decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]

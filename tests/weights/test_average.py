@@ -48,3 +48,27 @@ def test_models_of_other_sizes_have_no_mean() -> None:
         average.mean_of([{"w": torch.zeros(2)}, {"w": torch.zeros(3)}])
     with pytest.raises(ValueError, match="count differs and has no mean"):
         average.mean_of([{"count": torch.tensor(1)}, {"count": torch.tensor(2)}])
+
+
+def test_models_with_other_tokenizers_have_no_mean() -> None:
+    states = [{"w": torch.zeros(2), "tokenizer.codes": torch.full((2,), value)} for value in (0.0, 1.0)]
+    with pytest.raises(ValueError, match=r"different tokenizers: tokenizer\.codes differs"):
+        average.mean_of(states)
+
+
+def test_nothing_is_written_over_and_mistakes_are_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = (saved(moved(tiny_denoiser(), by), tmp_path / f"{by:g}.ckpt") for by in (0.0, 1.0))
+    before = one.read_bytes()
+    (tmp_path / "junk.ckpt").write_text("nothing")
+    for words, said in (
+        ([one, other], "one checkpoint has no mean"),
+        ([one, other, other], "exists already"),
+        ([tmp_path / "mean.ckpt", one, tmp_path / "gone.ckpt"], "gone.ckpt"),
+        ([tmp_path / "mean.ckpt", one, tmp_path / "junk.ckpt"], "junk.ckpt"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            average.main([str(word) for word in words])
+        assert end.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+    assert one.read_bytes() == before and not (tmp_path / "mean.ckpt").exists()
+    average.main([str(one), str(one), str(other), "--overwrite"])
+    assert one.read_bytes() != before
