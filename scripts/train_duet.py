@@ -49,7 +49,8 @@ def steps_done(folder: Path) -> int:
     try:
         return int(checkpoints.read(path)["global_step"])
     except (ValueError, KeyError, OSError) as error:
-        raise SystemExit(f"{path} cannot be read ({str(error).splitlines()[0]}); move {folder} away to train this stage anew") from None
+        why = str(error).splitlines()[0]
+        raise SystemExit(f"{path} cannot be read ({why}); move {folder} away to train this stage anew") from None
 
 
 def narrow_codes(out: Path) -> Path:

@@ -130,9 +130,10 @@ def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
     if other.body != scene.body:
         raise CommandError(f"--shapes {named}: its shapes are of body {other.body}, not of {scene.body}")
     betas = other.betas[0, other.present[0]]
-    if len(betas) < scene.agents:
-        raise CommandError(f"--shapes {named}: holds {len(betas)} people, expected {scene.agents} or more")
-    return betas[: scene.agents].expand(scene.scenes, -1, -1)
+    people = scene.present.sum(dim=1)  # of each scene: free slots take none
+    if len(betas) < int(people.max()):
+        raise CommandError(f"--shapes {named}: holds {len(betas)} people, expected {int(people.max())} or more")
+    return betas[(scene.present.cumsum(dim=1) - 1).clamp_min(0)]
 
 
 def told(scene: Scene, body: Body) -> str:

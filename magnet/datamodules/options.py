@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from magnet.checks import require_whole
+from magnet.checks import require_number, require_whole
 from magnet.datamodules.clip import at_least
 
 
@@ -41,6 +41,9 @@ class Augmentation:
             if not 0 <= share <= 1:
                 raise ValueError(f"augment.{name}: got {share}, expected a probability from 0 to 1")
         require_whole("augment.drop_at_most", self.drop_at_most, 1)
+        require_number("augment.compose_clearance", self.compose_clearance, least=0)
+        if len(self.compose_apart) != 2 or not 0 <= self.compose_apart[0] <= self.compose_apart[1] < float("inf"):
+            raise ValueError(f"augment.compose_apart: got {self.compose_apart}, expected the shortest distance first")
 
 
 @dataclass(frozen=True)

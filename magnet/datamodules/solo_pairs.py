@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
+from magnet.checks import require_number
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.mixed import Parts
 from magnet.datamodules.registry import register_data
@@ -77,6 +78,7 @@ class SoloPairs(Parts):
             raise ValueError(f"pairings: got {unknown or names}, expected some of {', '.join(PAIRINGS)}")
         if delay < 0:
             raise ValueError(f"delay: got {delay} frames, expected 0 or more")
+        require_number("clearance", clearance, least=0)
         self.pairings = names
         self.delay = delay
         self.clearance = clearance

@@ -125,6 +125,12 @@ def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsy
     assert cli.main(["refine", str(plain), str(out), "--shapes", *characters]) == 0
     sizes, wanted = (load_body().rest_joints(each[0])[:, 15, 1] for each in (Scene.load(out).betas, betas))
     assert torch.allclose(sizes, wanted, atol=0.02), "of other skeletons"
+    second = (
+        scene.pad_agents(3).permute_agents(torch.tensor([2, 1, 0])).save(tmp_path / "second.npz")
+    )  # a free slot first
+    assert cli.main(["refine", str(second), str(out), "--shapes", str(ours)]) == 0
+    shaped = Scene.load(out)
+    assert torch.equal(shaped.betas[shaped.present], betas[0])
     capsys.readouterr()
     for words, message in (
         ([str(ours), "--shapes", str(one)], "holds 1 people, expected 2 or more"),

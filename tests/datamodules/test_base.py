@@ -289,6 +289,8 @@ def test_bad_clips_are_refused(generator: torch.Generator) -> None:
     [
         (lambda: FakeData([], batch_size=0), "batch_size"),
         (lambda: Augmentation(drop=1.5), r"augment\.drop"),
+        (lambda: Augmentation(compose_apart=(3.5, 1.6)), r"augment\.compose_apart: .* expected the shortest distance"),
+        (lambda: Augmentation(compose_clearance=-1), r"augment\.compose_clearance: got -1"),
         (lambda: HeldOutScenes(stride=0), "stride"),
     ],
 )
@@ -300,6 +302,9 @@ def test_numbers_out_of_range_are_refused(make: Callable[[], object], name: str)
 def test_a_weight_for_no_source_is_refused() -> None:
     with pytest.raises(ValueError, match=r"source \['salsa'\]; there are \['couples', 'singles'\]"):
         FakeData(couples_and_singles(), weights={"salsa": 1.0}).train_dataloader()
+    for nothing in ({}, {"couples": 0.0}):
+        with pytest.raises(ValueError, match="expected no negative number and one over 0"):
+            FakeData(couples_and_singles(), weights=nothing).train_dataloader()
 
 
 def test_an_epoch_has_as_many_windows_as_asked_for() -> None:

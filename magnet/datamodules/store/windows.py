@@ -92,8 +92,8 @@ class RandomWindows:
         unknown = sorted(set(weights) - set(source))
         if unknown:
             raise ValueError(f"weights: no training clip has the source {unknown}; there are {sorted(set(source))}")
-        if min(weights.values()) < 0:
-            raise ValueError(f"weights: got {dict(weights)}, expected no negative number")
+        if min(weights.values(), default=0) < 0 or not any(weights.values()):
+            raise ValueError(f"weights: got {dict(weights)}, expected no negative number and one over 0")
         if left := sorted(set(source) - set(weights)):
             rank_zero_warn(f"weights: nothing of {', '.join(left)} is trained on: say a weight, or 0", stacklevel=2)
         windows = {s: self.count[source == s].sum() for s in weights}
