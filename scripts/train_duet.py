@@ -3,9 +3,10 @@
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
-`--out`. The stages `on` and `again` go on from the denoiser, each by itself, and the mean of their weights is released.
-Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage
-that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 decoder=2` rehearses it to the end.
+`--out`. The stage `on` goes on from the denoiser, `again` from the mean of the weights before and after `on`, and the
+mean of the weights before and after `again` is released. Stopped at any moment, by hand or by a power cut, all goes on
+from the last checkpoint when it is run again; a stage that has its steps is not run again. `--steps tokenizer=2
+denoiser=2 on=2 again=2 decoder=2` rehearses it to the end.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from magnet.callbacks.narrow_codes import NAME as NARROW
 from magnet.cli.child import run_to_its_end
 
 ROOT = Path(__file__).resolve().parents[1]
-BEFORE = {"tokenizer": "", "denoiser": "tokenizer", "on": "denoiser", "again": "denoiser", "decoder": "tokenizer"}
+BEFORE = {"tokenizer": "", "denoiser": "tokenizer", "on": "denoiser", "again": "on", "decoder": "tokenizer"}
 """The stages in the order they are run, each with the one whose weights it begins from."""
 STAGES = tuple(BEFORE)
 
@@ -51,6 +52,17 @@ def steps_done(folder: Path) -> int:
     except (ValueError, KeyError, OSError) as error:
         why = str(error).splitlines()[0]
         raise SystemExit(f"{path} cannot be read ({why}); move {folder} away to train this stage anew") from None
+
+
+def mean_checkpoint(folder: Path) -> Path:
+    """The mean of a stage's weights and of those that it began from."""
+    return folder / "checkpoints" / "mean.ckpt"
+
+
+def average(made: Path, one: Path, other: Path) -> None:
+    """Write the mean of the weights of two checkpoints."""
+    script = str(ROOT / "scripts" / "average_weights.py")
+    run([sys.executable, script, str(made), str(one), str(other), "--overwrite"], f"mean of {one.parent.parent.name}")
 
 
 def narrow_codes(out: Path) -> Path:
@@ -90,8 +102,8 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
 
     Args:
         stage: of `STAGES`.
-        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, `on` and
-            `again` with the denoiser.
+        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, `on` with the
+            denoiser, `again` with the mean of both.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
@@ -100,8 +112,10 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
     tokenizer = str(narrow_codes(out))
     if stage == "denoiser":
         command += ["--model.tokenizer", tokenizer]
-    if stage in ("on", "again"):
+    if stage == "on":
         command += ["--model.start_from", str(last_checkpoint(out / "denoiser"))]
+    if stage == "again":
+        command += ["--model.start_from", str(mean_checkpoint(out / "on"))]
     if stage == "decoder":
         command += ["--model.start_from", tokenizer]
     if last_checkpoint(out / stage).is_file():
@@ -162,13 +176,13 @@ def main(arguments: list[str] | None = None) -> None:
             continue
         done, wanted = left[stage]
         put_aside(out / stage)
+        if stage == "again":
+            average(mean_checkpoint(out / "on"), last_checkpoint(out / "on"), last_checkpoint(out / "denoiser"))
         run(fit_command(stage, out, wanted, given.fit), f"{stage}, step {done} to {wanted}")
         if steps_done(out / stage) < wanted:  # stopped, and ended without an error
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
-    mean = str(last_checkpoint(out / "on").with_name("mean.ckpt"))
-    both = [str(last_checkpoint(out / stage)) for stage in ("on", "again")]
-    run([sys.executable, str(ROOT / "scripts" / "average_weights.py"), mean, *both, "--overwrite"], "mean")
-    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), mean]
+    average(mean_checkpoint(out / "again"), last_checkpoint(out / "again"), mean_checkpoint(out / "on"))
+    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(mean_checkpoint(out / "again"))]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(folder)]
     run(release, "release")

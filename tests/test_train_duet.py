@@ -43,9 +43,9 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
         assert command[command.index("--trainer.max_steps") + 1] == "9"
         assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
     before = str(recipe.last_checkpoint(tmp_path / "denoiser"))
-    for stage in ("on", "again"):
+    for stage, start in (("on", before), ("again", str(recipe.mean_checkpoint(tmp_path / "on")))):
         command = recipe.fit_command(stage, tmp_path, 9, [])
-        assert command[command.index("--model.start_from") + 1] == before and "--model.tokenizer" not in command
+        assert command[command.index("--model.start_from") + 1] == start and "--model.tokenizer" not in command
     assert recipe.steps_done(tmp_path / "denoiser") == 0
     save(tmp_path / "denoiser", 5)
     assert recipe.steps_done(tmp_path / "denoiser") == 5
@@ -72,12 +72,18 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
     monkeypatch.setattr(recipe, "run", whole)
     capsys.readouterr()
     recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "again=2", "decoder=5"])
-    configs = [command[command.index("--config") + 1] for command in ran[:-2]]
+    configs = [command[command.index("--config") + 1] for command in ran if "--config" in command]
     assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_on", "duet_again", "duet_decoder"]
-    assert ran[-2][-1] == "--overwrite"  # the mean before, when a stage has gone on
-    made, *averaged = (Path(name) for name in ran[-2][2:-1])
-    assert averaged == [recipe.last_checkpoint(tmp_path / stage) for stage in ("on", "again")]
-    assert str(made) in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
+    means = [command for command in ran if "average_weights.py" in command[1]]
+    assert all(command[-1] == "--overwrite" for command in means)  # a stopped stage takes it anew
+    half, whole_mean = (recipe.mean_checkpoint(tmp_path / stage) for stage in ("on", "again"))
+    denoiser, on, again = (recipe.last_checkpoint(tmp_path / stage) for stage in ("denoiser", "on", "again"))
+    assert [command[2:-1] for command in means] == [
+        [str(half), str(on), str(denoiser)],
+        [str(whole_mean), str(again), str(half)],
+    ]
+    assert ran.index(means[0]) == 2  # before what goes on from it
+    assert str(whole_mean) in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="run the same command again"):

@@ -69,7 +69,8 @@ class RollOuts(Callback):
         if frames[1] < frames[0]:
             raise ValueError(f"frames: got {frames}, expected the fewest first")
         self.share, self.every, self.scenes, self.frames, self.stretches = share, every, scenes, frames, stretches
-        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False, any_floor=True)  # what it makes
+        # What it makes, neither corrected nor livelier.
+        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False, noise_scale=1.0, any_floor=True)
         self.return_frames = return_frames
         self.task = registry.get("joint_future")()
         self.kept: list[Scene] = []
