@@ -14,7 +14,7 @@ JUMP = 0.04
 frames a second no pelvis moves so by more than 0.02 m."""
 
 AROUND = 2
-"""Steps before and after whose median is what is usual."""
+"""Steps before and after whose median is what is usual; at the ends, as many of the clip's first or last."""
 
 
 def jumps(heights: Tensor, fps: float) -> Tensor:
@@ -23,9 +23,11 @@ def jumps(heights: Tensor, fps: float) -> Tensor:
     heights (B, T, P, J) of joints
     """
     steps = heights.diff(dim=1)
-    padded = F.pad(steps.flatten(2).transpose(1, 2), (AROUND, AROUND), mode="replicate").transpose(1, 2)
-    usual = padded.unfold(1, 2 * AROUND + 1, 1).median(dim=-1).values.unflatten(2, steps.shape[2:])
-    beyond = steps - usual
+    each = steps.flatten(2)
+    usual = each.unfold(1, min(2 * AROUND + 1, each.shape[1]), 1).median(dim=-1).values
+    short = each.shape[1] - usual.shape[1]  # padding the steps themselves would make the first one usual
+    usual = F.pad(usual.transpose(1, 2), (short // 2, short - short // 2), mode="replicate").transpose(1, 2)
+    beyond = steps - usual.unflatten(2, steps.shape[2:])
     least = JUMP * max(FPS / fps, 1.0) ** 2  # what a body can do grows with the square of a frame's time
     body = beyond.median(dim=-1).values
     low, high = beyond.quantile(beyond.new_tensor([0.1, 0.9]), dim=-1)
@@ -36,8 +38,9 @@ def jumps(heights: Tensor, fps: float) -> Tensor:
 def unjumped(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
     """A scene in which nobody jumps up or down within a frame. Who does not jump stays bit-identical.
 
-    Recordings jump where markers or a camera are lost. Poses do not change, and a cut to another pose is no jump. The
-    first frame is left where it is; a scene of up to three frames is left alone.
+    Recordings jump where markers or a camera are lost. Poses do not change, and a cut to another pose is no jump. Who
+    jumps stays at the height of most of the first second, so that odd frames at the beginning come to the rest; a scene
+    of up to three frames is left alone.
 
     Args:
         scene: (B, T, P).
@@ -53,6 +56,8 @@ def unjumped(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
         whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
         jumped = torch.where(whole.to(jumped.device), 0.0, jumped)
     height = scene.T_world_root.clone()
-    height[:, 1:, :, 1, 3] -= jumped.cumsum(dim=1)
+    raised = F.pad(jumped.cumsum(dim=1), (0, 0, 1, 0))  # (B, T, P)
+    first_second = raised[:, : max(round(scene.fps), 1)]
+    height[..., 1, 3] -= raised - first_second.median(dim=1, keepdim=True).values
     moves = (jumped != 0).any(dim=1)[:, None, :, None, None]
     return scene.replace(T_world_root=torch.where(moves, height, scene.T_world_root))

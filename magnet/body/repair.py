@@ -15,7 +15,7 @@ from magnet.body.drift import moved_over_ground, undrifted
 from magnet.body.jumps import unjumped
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
-from magnet.motion.scene import FPS, Scene
+from magnet.motion.scene import FPS, Scene, cat_time, concatenate
 
 DEEP: dict[str, Apart] = {
     name: replace(each, body=each.body + 0.03, arms=each.arms + 0.04) for name, each in APART.items()
@@ -57,8 +57,9 @@ def repaired(
 ) -> Scene:
     """A repaired scene: people who are deep in each other are moved apart, then poses are corrected.
 
-    Contacts are read from the scene itself: hands within 20 cm hold each other, low toes slower than `slides` stand,
-    and who is in the air without falling floats.
+    Frames that are not valid are no motion: each stretch of valid ones is repaired by itself. Contacts are read from
+    the scene: hands within 20 cm hold each other, low toes slower than `slides` stand, and who is in the air without
+    falling floats.
 
     Args:
         scene: (B, T, P); above 45 fps corrections are computed for about 30 frames a second.
@@ -71,6 +72,8 @@ def repaired(
         slides: m/s below which a low toe is meant to stand.
         drifting: first stop people who slide over the ground as a whole (`undrifted`), or jump up or down (`unjumped`).
     """
+    if scene.valid is not None and not bool(scene.valid.all()):
+        return _by_stretches(scene, body, how, fixed, settle, begun, slides, drifting)
     every = max(round(scene.fps / FPS), 1)
     if drifting:
         scene = undrifted(unjumped(scene, body, fixed), body, fixed, slides)
@@ -83,6 +86,39 @@ def repaired(
     if fixed is not None:
         offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
     return corrected(scene, offset)
+
+
+def _by_stretches(
+    scene: Scene,
+    body: Body,
+    how: str,
+    fixed: Tensor | None,
+    settle: Settle | None,
+    begun: bool,
+    slides: float,
+    drifting: bool,
+) -> Scene:
+    """`repaired`, where some frames are not valid; these come back as they are."""
+    assert scene.valid is not None
+    made = []
+    for b, valid in enumerate(scene.valid.cpu()):
+        still = (
+            fixed
+            if fixed is None or fixed.ndim == 1
+            else fixed[b if len(fixed) > 1 else 0]
+            if fixed.ndim == 3
+            else fixed
+        )
+        pieces, begin = [], 0
+        for run, count in zip(*(each.tolist() for each in valid.unique_consecutive(return_counts=True)), strict=True):
+            piece = scene.select([b]).slice(begin, begin + count).replace(valid=None)
+            if run:
+                kept = still if still is None or still.ndim == 1 else still[begin : begin + count]
+                piece = repaired(piece, body, how, kept, settle, begun and not begin, slides, drifting)
+            pieces.append(piece)
+            begin += count
+        made.append(cat_time(pieces))
+    return concatenate(made).replace(valid=scene.valid, given=scene.given, names=scene.names)
 
 
 def settling(

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,10 +104,21 @@ def read(path: Path) -> dict[str, Any]:
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        found["cases"].items()
+        for case in found["cases"].values():
+            _positive(case[name] for name in COLUMNS if case.get(name))
+        if found.get("live"):
+            _positive([found["live"]["median_ms"]])
+        (found.get("git") or {}).get("commit")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CommandError(f"--compare {path}: not a file that `magnet bench --out` has written") from error
     return dict(found)
+
+
+def _positive(numbers: Iterable[Any]) -> None:
+    """Raises ValueError or TypeError where something is no number over 0."""
+    for number in numbers:
+        if isinstance(number, str) or not 0 < number < float("inf"):
+            raise ValueError(f"got {number!r}")
 
 
 def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -142,6 +153,7 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     from magnet.bench.speed import cases, live_latency, measure
     from magnet.cli.run_folder import provenance
     from magnet.evaluation.results import machine
+    from magnet.precision import device_of
     from magnet.sampling.options import SamplerOptions
     from magnet.tasks import registry
 
@@ -149,7 +161,7 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     usual = QUICK if given.quick else WHOLE
     tasks = given.task or registry.names()
     options_of = task_options(of_tasks, tasks)
-    model = load(given.model).to(given.device)
+    model = load(given.model).to(device_of(given.device))
     asked = {"steps": given.steps, "precision": given.precision, "compile": given.compile or None}
     options = SamplerOptions.preset(given.sampler, **{name: v for name, v in asked.items() if v is not None})
     most = model.layout.agents
@@ -190,6 +202,8 @@ def load(name: str | None) -> Denoiser:
 def compared(then: dict[str, Any], now: dict[str, Any]) -> str:
     """How two runs differ: now over then, of each case that both have."""
     both = [name for name in now["cases"] if name in then["cases"]]
+    if not both:
+        return f"nothing to compare: the other run measured {', '.join(then['cases']) or 'nothing'}"
     lines = [f"now over then ({(then.get('git') or {}).get('commit', 'no commit')})", row("", list(COLUMNS.values()))]
     for name in both:
         old, new = then["cases"][name], now["cases"][name]

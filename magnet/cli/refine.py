@@ -79,8 +79,11 @@ def main(arguments: Sequence[str] = ()) -> int:
     got = scene_files.read_inputs(options, scene_files.reading(options))
     scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
     formats.require_finite(got.scene)
-    if not got.scene.frames:
-        raise CommandError(f"{options.inputs[0]}: holds no frames, so there is nothing to refine")
+    if not got.scene.frames or not bool(got.scene.present.any()):
+        what = "people" if got.scene.frames else "frames"
+        raise CommandError(f"{options.inputs[0]}: holds no {what}, so there is nothing to refine")
+    if got.scene.valid is not None and not bool(got.scene.valid.any()):
+        raise CommandError(f"{options.inputs[0]}: holds no frame that is valid, so there is nothing to refine")
     if got.scene.agents < 2 and options.poses == "keep":
         raise CommandError(
             f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people, or let "
@@ -151,11 +154,12 @@ def told(scene: Scene, body: Body) -> str:
         worst = torch.maximum(worst, depth.view(scene.scenes, scene.frames) * both)
     toes = joints[..., TOES, :]
     slide = scene.fps * toes[..., [0, 2]].diff(dim=1).norm(dim=-1)
-    low = (toes[:, 1:, ..., 1] < 0.05) & scene.present[:, None, :, None]
+    counts = joints.new_ones(joints.shape[:2], dtype=torch.bool) if scene.valid is None else scene.valid
+    low = (toes[:, 1:, ..., 1] < 0.05) & scene.present[:, None, :, None] & counts[:, 1:, None, None]
     speed = float(slide[low].mean()) if bool(low.any()) else 0.0
-    there = scene.present[:, None].expand(joints.shape[:3])
+    there = scene.present[:, None] & counts[..., None]
     foot = joints[..., FEET, 1].amin(dim=-1)[there]
-    over = [(limit, 100 * float((worst > limit / 100).float().mean())) for limit in (5, 10)]
+    over = [(limit, 100 * float((worst[counts] > limit / 100).float().mean())) for limit in (5, 10)]
     shares = ", ".join(f"{share:.1f} % over {limit} cm" for limit, share in over)
     air, under = (100 * float(share.float().mean()) for share in (foot > 0.06, foot < -0.02))
     return (

@@ -70,6 +70,7 @@ class Partner:
         self._places = places(past)[:, -1]  # in the last frame that was taken
         whole = past.slice(past.frames % TOKEN_FRAMES).replace(valid=None, given=None)
         self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
+        self._answering = False  # True afterwards: an answer was interrupted half-way
 
     @property
     def past(self) -> Scene:
@@ -88,7 +89,10 @@ class Partner:
         Raises:
             ValueError: not a whole number of blocks, motion that is not finite or jumps by over `FASTEST`, or other
                 scenes, people, shapes or frame rate. Nothing has been taken then: the same frames may be given again.
+            RuntimeError: an answer before was interrupted by an error, and this partner cannot go on.
         """
+        if self._answering:
+            raise RuntimeError("an answer was interrupted half-way; begin a new Partner, from this one's `past`")
         require_rate(frames, "frames")
         block = self.task.block * TOKEN_FRAMES
         if not frames.frames or frames.frames % block:
@@ -103,7 +107,9 @@ class Partner:
         now = places(frames)
         self._require_steps(now)
         # Block by block: what has been fed beyond a block is not to be read in it.
+        self._answering = True
         answers = [self.stream.feed(frames.slice(first, first + block)) for first in range(0, frames.frames, block)]
+        self._answering = False
         self._places = now[:, -1]
         answer = cat_time(answers).replace(names=frames.names)
         return answer.permute_agents(torch.arange(frames.agents)).to(str(frames.device))

@@ -38,6 +38,15 @@ def test_jumps_are_taken_out_where_they_are_and_nowhere_else(walk: Scene, metres
     assert torch.equal(made.T_world_root[..., [0, 2], 3], scene.T_world_root[..., [0, 2], 3])
 
 
+@pytest.mark.parametrize("fps", [30.0, 120.0])
+@pytest.mark.parametrize("metres", [0.2, -0.2])
+@pytest.mark.parametrize("odd", [(0, 1), (0, 2), (1, 2), (1, 3), (-1, None), (-2, -1), (-3, -1)])
+def test_odd_frames_at_an_end_come_to_the_rest(walk: Scene, odd: tuple[int, int], metres: float, fps: float) -> None:
+    scene = resampled(walk, fps)
+    made = unjumped(raised(scene, 0, slice(*odd), metres), BODY)
+    assert (made.T_world_root - scene.T_world_root).abs().max() < 0.015
+
+
 def test_a_jump_over_two_frames_and_one_that_stays_are_taken_out(walk: Scene) -> None:
     half = raised(raised(walk, 1, slice(40, None), 0.06), 1, slice(41, None), 0.06)
     assert (unjumped(half, BODY).T_world_root - walk.T_world_root).abs().max() < 0.015

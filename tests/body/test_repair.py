@@ -21,7 +21,7 @@ from magnet.body.settle_wishes import Wishes
 from magnet.metrics import hand_distance
 from magnet.metrics.body_depth import deepest
 from magnet.motion.frames import rigid
-from magnet.motion.scene import Scene, cat_time
+from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.synthesis import synthesize
 from tests.cases import some_slow
 
@@ -161,6 +161,20 @@ def test_hands_that_hold_hold_on_while_bodies_leave_each_other(handshake: Scene)
     made = BODY.joints(repaired(moved(handshake, 0, up), BODY))
     hands = [hand_points(made[0, :, agent]) for agent in range(2)]
     assert float((hands[0][:, :, None] - hands[1][:, None]).norm(dim=-1).amin(dim=(1, 2))[holds].max()) < 0.2
+
+
+def test_frames_that_are_not_valid_spoil_no_others(handshake: Scene) -> None:
+    scene = concatenate([handshake.slice(0, 60), handshake.slice(20, 80)]).replace(names=("a", "b"))
+    valid = torch.ones(2, 60, dtype=torch.bool)
+    valid[0, :20] = valid[0, 40] = valid[1, 50:] = False
+    away = scene.T_world_root.clone()
+    away[~valid] = float("nan")
+    made = repaired(scene.replace(T_world_root=away, valid=valid), BODY)
+    assert torch.equal(made.T_world_root[~valid].isnan(), away[~valid].isnan())
+    for b, stretch in ((0, slice(20, 40)), (0, slice(41, 60)), (1, slice(0, 50))):
+        alone = repaired(scene.select([b]).slice(stretch.start, stretch.stop), BODY)
+        torch.testing.assert_close(made.T_world_root[b, stretch], alone.T_world_root[0])
+    assert made.names == scene.names and torch.equal(made.valid, valid)
 
 
 def test_whoever_is_costly_to_lift_reaches_for_hands_and_stays_on_the_floor(handshake: Scene) -> None:

@@ -165,6 +165,18 @@ def test_frames_that_are_refused_may_be_given_again(model, duet):
     assert torch.equal(again.T_world_root, once.T_world_root)
 
 
+def test_a_partner_who_was_interrupted_half_way_says_so(model, duet, monkeypatch):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    with monkeypatch.context() as broken:
+        broken.setattr(type(model), "denoise", lambda *words, **named: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            partner.answer(duet.slice(16, 20))
+    with pytest.raises(RuntimeError, match="interrupted half-way; begin a new Partner"):
+        partner.answer(duet.slice(16, 20))
+    again = Partner(model, partner.past, (0,), FAST)
+    assert again.answer(duet.slice(16, 20)).frames == 4
+
+
 def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet):
     """From the frame before as within the frames; of those who answer nothing is read."""
     partner = Partner(model, duet.slice(0, 16), (0,), FAST)

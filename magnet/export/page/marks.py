@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from magnet.body.base import Body
 from magnet.body.capsules import capsule_segments, nearest_points
-from magnet.body.joints import TOES, WRISTS
+from magnet.body.energy import hand_points
+from magnet.body.joints import TOES
 from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.export.page.rig import CROWD, Array, Index
 from magnet.metrics.body_depth import DEEP
+from magnet.metrics.hand_contact import WITHIN
 from magnet.metrics.penetration import TOUCH, penetration_depth
 from magnet.metrics.skating import PRESETS, toe_steps
 from magnet.motion.scene import Scene
 
 Mask = NDArray[np.bool_]
 
-HANDS_TOUCH = 0.2
-"""Metres between two people's wrists under which their hands count as touching."""
 HAND, DISC = 0.085, 0.11
 """Metres of radius of the ball between touching hands, and of the disc under a foot."""
 BALL = 0.03
@@ -46,12 +46,15 @@ def standing(joints: Array, fps: float) -> tuple[Mask, Mask]:
 
 
 def touching(joints: Array) -> tuple[Index, Array]:
-    """Places between hands of different people that touch. (T, P, 22, 3) -> frames (M,), (M, 3)"""
-    wrists = joints[:, :, WRISTS]  # (T, P, 2, 3)
-    apart = np.linalg.norm(wrists[:, :, :, None, None] - wrists[:, None, None], axis=-1)  # (T, P, 2, P, 2)
-    t, p, hand, q, other = np.nonzero(apart < HANDS_TOUCH)
+    """Places between hands of different people in contact, as the metric `hand_contact` counts it.
+
+    (T, P, 22, 3) -> frames (M,), (M, 3)
+    """
+    hands = hand_points(torch.from_numpy(joints)).numpy()  # (T, P, 2, 3)
+    apart = np.linalg.norm(hands[:, :, :, None, None] - hands[:, None, None], axis=-1)  # (T, P, 2, P, 2)
+    t, p, hand, q, other = np.nonzero(apart < WITHIN)
     once = p < q
-    return t[once], ((wrists[t, p, hand] + wrists[t, q, other]) / 2)[once]
+    return t[once], ((hands[t, p, hand] + hands[t, q, other]) / 2)[once]
 
 
 def penetrations(joints: Array) -> tuple[Index, Array, Array, Array]:

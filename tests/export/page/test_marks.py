@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from magnet.body import Body
+from magnet.body.energy import hand_points
 from magnet.export.page.marks import (
     AT_ONCE,
     DEPTH,
-    HANDS_TOUCH,
     MOST,
     SLIDING,
     TOUCHING,
@@ -22,6 +22,7 @@ from magnet.export.page.marks import (
 )
 from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.metrics.body_depth import deepest
+from magnet.metrics.hand_contact import WITHIN, hand_distance
 from magnet.metrics.penetration import penetration_depth
 from magnet.metrics.skating import toe_steps
 from magnet.motion.scene import Scene
@@ -48,8 +49,8 @@ def test_standing_and_sliding_are_those_of_the_metric(duet: Scene, body: Body) -
 def test_hands_touch_only_between_people_and_each_pair_counts_once() -> None:
     joints = np.zeros((2, 3, 22, 3))
     joints[..., 0] = np.arange(3)[:, None] * 5.0
-    joints[1, 0, 20] = joints[1, 0, 21] = [1.0, 1.0, 0.0]  # own hands do not count
-    joints[1, 1, 20] = [1.1, 1.0, 0.0]
+    joints[1, 0, 18:22] = [1.0, 1.0, 0.0]  # elbows in the wrists, so that hands are there too; own ones do not count
+    joints[1, 1, [18, 20]] = [1.1, 1.0, 0.0]
     frames, places = touching(joints)
     np.testing.assert_allclose(places, [[1.05, 1.0, 0.0]] * 2)
     assert frames.tolist() == [1, 1]
@@ -107,8 +108,10 @@ def test_a_page_marks_each_frame_as_deep_as_the_metric_says_in_the_take_that_it_
         assert 0 < here.sum() <= MOST
         assert depth[here].max() == pytest.approx(1000 * truth[t], abs=0.51)
     for t, place in zip(frames[kind == TOUCHING], places[kind == TOUCHING], strict=True):
-        wrists = joints[t, :, [20, 21]].reshape(-1, 3).numpy() + shift
-        assert np.sort(np.linalg.norm(wrists - place, axis=1))[1] < HANDS_TOUCH / 2 + 1e-5
+        hands = hand_points(joints[t]).reshape(-1, 3).numpy() + shift
+        assert np.sort(np.linalg.norm(hands - place, axis=1))[1] < WITHIN / 2 + 1e-5
+    contact = hand_distance(joints[:, 0], joints[:, 1]) < WITHIN
+    assert set(frames[kind == TOUCHING]) == set(contact.nonzero()[:, 0].tolist())
 
 
 def test_a_page_marks_feet_where_they_slide_and_stand_nowhere_else(duet: Scene, body: Body) -> None:
