@@ -60,8 +60,25 @@ def test_the_command_writes_what_it_measured_and_compares_it(tmp_path: Path, cap
     last = capsys.readouterr().out.splitlines()[-1].split()
     assert last[:5] == ["joint_future,", "2", "people,", "batch", "1"]
     assert float(last[5 + 3]) == 1.0, "evaluations a frame are the same"
-    out.write_text("[]")
-    assert cli.main([*words, "--compare", str(out)]) == 2
+    other = {"cases": {"generation, 2 people, batch 1": {}}, "live": None}
+    out.write_text(json.dumps(other))
+    assert cli.main([*words, "--live", "0", "--compare", str(out)]) == 0
+    assert "nothing to compare: the other run measured generation, 2 people" in capsys.readouterr().out
+    case = "joint_future, 2 people, batch 1"
+    for damaged in (
+        [],
+        {"cases": {case: {"evaluation_ms": "12"}}},
+        {"cases": {case: None}},
+        {"cases": {case: {"evaluation_ms": -1}}},
+        {"cases": {}, "live": [1]},
+        {"cases": {}, "live": {"median_ms": 0}},
+        {"cases": {}, "live": {"answers": 3}},
+        {"cases": {}, "git": "abc"},
+    ):
+        out.write_text(json.dumps(damaged))
+        assert cli.main([*words, "--compare", str(out)]) == 2
+        said = capsys.readouterr()
+        assert "not a file that" in said.err and "evals" not in said.out, "before anything is measured"
     assert cli.main([*words[:-1], "0"]) == 2
 
 
@@ -71,6 +88,7 @@ def test_the_command_writes_what_it_measured_and_compares_it(tmp_path: Path, cap
         ("--people 0", "--people is 0, expected at least 1"),
         ("--batch 0", "--batch is 0, expected at least 1"),
         ("--live -1", "--live is -1, expected seconds"),
+        ("--device nonsense", "device: got 'nonsense'"),
         ("--people 5", "--people is 5, expected at most the model's 2"),
         ("--people 1 --task motion_control", "none of motion_control is for 1 people"),
     ],

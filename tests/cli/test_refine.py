@@ -99,6 +99,15 @@ def test_one_person_and_unknown_formats_are_refused(crowded: Scene, tmp_path: Pa
     assert "nothing writes .xyz" in capsys.readouterr().err
 
 
+def test_where_nothing_is_to_be_refined_it_says_so(crowded: Scene, tmp_path: Path, capsys) -> None:
+    few = crowded.slice(0, 8)
+    nobody = few.replace(present=torch.zeros_like(few.present)).save(tmp_path / "nobody.npz")
+    nothing = few.replace(valid=torch.zeros(1, 8, dtype=torch.bool)).save(tmp_path / "nothing.npz")
+    for path, said in ((nobody, "holds no people"), (nothing, "holds no frame that is valid")):
+        assert cli.main(["refine", str(path), str(tmp_path / "out.npz")]) == 2
+        assert said in capsys.readouterr().err and not (tmp_path / "out.npz").exists()
+
+
 def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene, tmp_path: Path) -> None:
     scene, plot = crowded.slice(0, 40).save(tmp_path / "crowded.npz"), tmp_path / "over_time.svg"
     assert cli.main(["refine", str(scene), str(tmp_path / "out.npz"), "--poses", "keep", "--plot", str(plot)]) == 0
