@@ -141,10 +141,10 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
         ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "again=1", "decoder=1", *small]
     )
     recipe.main(
-        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=2", "again=1", "decoder=1", *small]
+        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "again=2", "decoder=1", *small]
     )
     said = capfd.readouterr().out
-    assert "tokenizer: has its 1 steps already" in said and "on, step 1 to 2: done" in said
+    assert "tokenizer: has its 1 steps already" in said and "again, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")
     released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
     decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
