@@ -12,6 +12,7 @@ denoiser=2 on=2 again=2 decoder=2` rehearses it to the end.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import shlex
 import sys
 import time
@@ -84,8 +85,13 @@ def steps_left(out: Path, steps: dict[str, int]) -> dict[str, tuple[int, int]]:
                 f"{out / stage} began from {begun_from} at step {done[begun_from]}, which would go on to step "
                 f"{steps[begun_from]}; move it away to train it anew, or leave --steps {begun_from}={done[begun_from]}"
             )
-    if "tokenizer" not in left and not narrow_codes(out).is_file():  # stopped between its last step and them
-        left = {"tokenizer": (done["tokenizer"], done["tokenizer"] + 1), **left}
+    if "tokenizer" in left or narrow_codes(out).is_file():
+        return left
+    readers = [stage for stage, begun_from in BEFORE.items() if begun_from == "tokenizer"]
+    if not any(done[stage] for stage in readers):  # stopped between its last step and them
+        return {"tokenizer": (done["tokenizer"], done["tokenizer"] + 1), **left}
+    if any(stage in left and not done[stage] for stage in readers):
+        raise SystemExit(f"{narrow_codes(out)} is missing, and other stages began from it; put it back")
     return left
 
 
@@ -168,6 +174,17 @@ def main(arguments: list[str] | None = None) -> None:
     except ValueError as error:
         parser.error(str(error))
     out = given.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SystemExit(f"{out}: another train_duet.py is at work in it") from None
+        train(given, out, steps)
+
+
+def train(given: Any, out: Path, steps: dict[str, int]) -> None:
+    """Run the stages that are not over, and release the weights."""
     folder = (given.weights or out / "weights").resolve()  # every command runs in the repository's root
     left = steps_left(out, steps)
     for stage in STAGES:

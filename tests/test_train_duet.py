@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from pathlib import Path
 
@@ -104,6 +105,23 @@ def test_what_a_power_cut_leaves_does_not_stop_it(tmp_path: Path, capsys) -> Non
     recipe.last_checkpoint(tmp_path / "tokenizer").write_text("half of it")
     with pytest.raises(SystemExit, match=r"last\.ckpt cannot be read .*; move .* away to train this stage anew"):
         recipe.steps_left(tmp_path, steps)
+
+
+def test_codes_that_are_gone_are_not_made_anew_under_stages_that_read_them(tmp_path: Path) -> None:
+    steps = dict.fromkeys(recipe.STAGES, 3)
+    for stage in recipe.STAGES[:-1]:
+        save(tmp_path / stage, 3)
+    with pytest.raises(SystemExit, match=r"narrow\.ckpt is missing, and other stages began from it"):
+        recipe.steps_left(tmp_path, steps)
+    save(tmp_path / "decoder", 3)
+    assert not recipe.steps_left(tmp_path, steps)
+
+
+def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    with (tmp_path / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(SystemExit, match="another train_duet"):
+            recipe.main(["--out", str(tmp_path)])
 
 
 def test_what_others_began_from_does_not_go_on(tmp_path: Path) -> None:

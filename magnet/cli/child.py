@@ -7,14 +7,20 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-PASSED_ON = (signal.SIGINT, signal.SIGTERM)
+PASSED_ON: dict[int, int] = {
+    signal.SIGINT: signal.SIGINT,
+    signal.SIGTERM: signal.SIGTERM,
+    signal.SIGHUP: signal.SIGTERM,
+}
+"""What who waits gets, and what it sends on: where a terminal is closed, a command is to save before it ends."""
 
 
 def run_to_its_end(command: Sequence[str], folder: Path) -> int:
     """Run a command and wait for it, whatever happens meanwhile.
 
-    SIGINT (Ctrl+C) and SIGTERM go to it, once each time, and not to who waits: so a training saves its checkpoint
-    before it ends, and none is left behind that nobody knows of.
+    SIGINT (Ctrl+C) and SIGTERM go to it, once each time, and not to who waits, and where the terminal is closed it gets
+    SIGTERM: so a training saves its checkpoint before it ends, and none is left behind that nobody knows of. What was
+    ignored before (SIGHUP by nohup) stays so.
 
     Args:
         command: program and arguments.
@@ -23,10 +29,22 @@ def run_to_its_end(command: Sequence[str], folder: Path) -> int:
     Returns:
         Its exit code; 128 and the signal's number where a signal ended it, as a shell says it.
     """
-    child = subprocess.Popen(command, cwd=folder, process_group=0)  # so that Ctrl+C comes to it once, from here
-    before = {number: signal.signal(number, lambda which, frame: child.send_signal(which)) for number in PASSED_ON}
+    begun: list[subprocess.Popen[bytes]] = []
+    early: list[int] = []  # what came before the command was there to get it
+
+    def send(which: int, frame: object) -> None:
+        if begun:
+            begun[0].send_signal(PASSED_ON[which])
+        else:
+            early.append(which)
+
+    heeded = [number for number in PASSED_ON if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, send) for number in heeded}
     try:
-        code = child.wait()
+        begun.append(subprocess.Popen(command, cwd=folder, process_group=0))  # Ctrl+C comes to it once, from here
+        for which in early:
+            send(which, None)
+        code = begun[0].wait()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

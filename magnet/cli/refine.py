@@ -155,7 +155,11 @@ def told(scene: Scene, body: Body) -> str:
     toes = joints[..., TOES, :]
     slide = scene.fps * toes[..., [0, 2]].diff(dim=1).norm(dim=-1)
     counts = joints.new_ones(joints.shape[:2], dtype=torch.bool) if scene.valid is None else scene.valid
-    low = (toes[:, 1:, ..., 1] < 0.05) & scene.present[:, None, :, None] & counts[:, 1:, None, None]
+    low = (
+        (toes[:, 1:, ..., 1] < 0.05)
+        & scene.present[:, None, :, None]
+        & (counts[:, 1:] & counts[:, :-1])[..., None, None]
+    )
     speed = float(slide[low].mean()) if bool(low.any()) else 0.0
     there = scene.present[:, None] & counts[..., None]
     foot = joints[..., FEET, 1].amin(dim=-1)[there]

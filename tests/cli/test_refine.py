@@ -10,6 +10,7 @@ import torch
 
 from magnet import cli
 from magnet.body import load_body
+from magnet.cli.refine import told
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 
@@ -106,6 +107,16 @@ def test_where_nothing_is_to_be_refined_it_says_so(crowded: Scene, tmp_path: Pat
     for path, said in ((nobody, "holds no people"), (nothing, "holds no frame that is valid")):
         assert cli.main(["refine", str(path), str(tmp_path / "out.npz")]) == 2
         assert said in capsys.readouterr().err and not (tmp_path / "out.npz").exists()
+
+
+def test_a_step_out_of_frames_that_are_not_valid_is_none(crowded: Scene) -> None:
+    scene = crowded.slice(0, 20)
+    away = scene.T_world_root.clone()
+    away[:, :5, :, 0, 3] += 50.0
+    valid = torch.ones(1, 20, dtype=torch.bool)
+    valid[:, :5] = False
+    body = load_body()
+    assert told(scene.replace(T_world_root=away, valid=valid), body) == told(scene.slice(5), body)
 
 
 def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene, tmp_path: Path) -> None:
