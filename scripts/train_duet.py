@@ -189,7 +189,7 @@ def train(given: Any, out: Path, steps: dict[str, int]) -> None:
     left = steps_left(out, steps)
     for stage in STAGES:
         if stage not in left:
-            print(f"{stage}: has its {steps_done(out / stage)} steps already")
+            print(f"{stage}: has its {steps[stage]} steps already")
             continue
         done, wanted = left[stage]
         put_aside(out / stage)

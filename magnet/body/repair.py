@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -73,7 +74,8 @@ def repaired(
         drifting: first stop people who slide over the ground as a whole (`undrifted`), or jump up or down (`unjumped`).
     """
     if scene.valid is not None and not bool(scene.valid.all()):
-        return _by_stretches(scene, body, how, fixed, settle, begun, slides, drifting)
+        each = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
+        return _by_stretches(scene, fixed, begun, each)
     every = max(round(scene.fps / FPS), 1)
     if drifting:
         scene = undrifted(unjumped(scene, body, fixed), body, fixed, slides)
@@ -88,17 +90,8 @@ def repaired(
     return corrected(scene, offset)
 
 
-def _by_stretches(
-    scene: Scene,
-    body: Body,
-    how: str,
-    fixed: Tensor | None,
-    settle: Settle | None,
-    begun: bool,
-    slides: float,
-    drifting: bool,
-) -> Scene:
-    """`repaired`, where some frames are not valid; these come back as they are."""
+def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, each: Callable[..., Scene]) -> Scene:
+    """`each` of every stretch of valid frames; those that are not valid come back as they are."""
     assert scene.valid is not None
     made = []
     for b, valid in enumerate(scene.valid.cpu()):
@@ -114,7 +107,7 @@ def _by_stretches(
             piece = scene.select([b]).slice(begin, begin + count).replace(valid=None)
             if run:
                 kept = still if still is None or still.ndim == 1 else still[begin : begin + count]
-                piece = repaired(piece, body, how, kept, settle, begun and not begin, slides, drifting)
+                piece = each(piece, fixed=kept, begun=begun and not begin)
             pieces.append(piece)
             begin += count
         made.append(cat_time(pieces))
