@@ -48,6 +48,7 @@ class RollOuts(Callback):
         steps: denoising steps of the sampler.
         return_frames: frames over which people return to their recorded places.
         stretches: training clips that are kept to choose from.
+        tasks: the tasks of which each roll-out draws one; tasks that go on from a past alone.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class RollOuts(Callback):
         return_frames: int = 32,
         stretches: int = 2000,
         start: int = 0,
+        tasks: tuple[str, ...] = ("joint_future",),
     ) -> None:
         require_number("share", share, 0, 1)
         require_whole("start", start, 0)
@@ -72,7 +74,9 @@ class RollOuts(Callback):
         # What it makes, neither corrected nor livelier.
         self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False, noise_scale=1.0, any_floor=True)
         self.return_frames = return_frames
-        self.task = registry.get("joint_future")()
+        if not tasks:
+            raise ValueError("tasks: got none, expected at least one")
+        self.tasks = [registry.get(task)() for task in tasks]
         self.kept: list[Scene] = []
         self.filled, self.start = -1, start
 
@@ -132,11 +136,13 @@ class RollOuts(Callback):
         low, high = (-(-count // TOKEN_FRAMES) * TOKEN_FRAMES for count in self.frames)
         draw = torch.rand((), generator=generator, device=generator.device)
         more = low + int(draw * ((high - low) // TOKEN_FRAMES + 1)) * TOKEN_FRAMES
+        count = len(self.tasks)
+        which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
         start = batch.select(chosen).slice(0, past)
         training = model.training
         model.eval()
         with precision or nullcontext():
-            made = generate(model, start, self.task, past, more, 1, self.sampler, generator)
+            made = generate(model, start, self.tasks[which], past, more, 1, self.sampler, generator)
         model.train(training)
         made = made.slice(made.frames - past)
         behind = near(made.slice(past - COMPARED).to("cpu"), frames - past).to(made.device)

@@ -29,13 +29,25 @@ those with mixed roles: with a past, where a partner is need not be told from th
 ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
 
+LIVE_ROLES = (0.45, 0.33, 0.22)
+"""Shares, in live scenes, of agents who are generated, given as far as the block reaches, and hidden from it on."""
+
+UNKNOWN_AFTER = 3
+"""Token steps of unknown future that live tasks show after a block (`magnet.sampling.schedule.AHEAD`)."""
 
 FAINT = 300
 """Highest level at which a past is shown faintly."""
 
 
 def draw_levels(
-    kind: Distribution, B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0
+    kind: Distribution,
+    B: int,
+    N: int,
+    P: int,
+    generator: torch.Generator,
+    shift: float = 1.0,
+    faint: float = 0.0,
+    live: float = 0.0,
 ) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
@@ -50,6 +62,7 @@ def draw_levels(
         generator: source of all randomness.
         shift: over 1 draws high levels more often, see `shifted`.
         faint: share of the roll-outs whose past is shown a little noisy.
+        live: share of the roll-outs that are `live_levels`.
     """
     device = generator.device
 
@@ -69,7 +82,11 @@ def draw_levels(
     which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    return torch.where(which == ROLLOUT, rollout_levels(B, N, P, generator, shift, faint), levels)
+    rolled = rollout_levels(B, N, P, generator, shift, faint)
+    if live:
+        chosen = torch.rand(B, 1, 1, generator=generator, device=device) < live
+        rolled = torch.where(chosen, live_levels(B, N, P, generator, shift, faint), rolled)
+    return torch.where(which == ROLLOUT, rolled, levels)
 
 
 def rollout_levels(
@@ -119,3 +136,28 @@ def rollout_levels(
     levels = torch.where(role == 1, given, generated)
     levels = torch.where(role == 2, torch.zeros_like(levels), levels)
     return torch.where(role == 3, hidden, levels)
+
+
+def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0) -> Tensor:
+    """A past, one or two token steps at one level, and an unknown future: what live tasks ask. -> (B, N, P) int
+
+    Each agent is generated, given as far as the block reaches (motion control, and whoever had the turn before), or
+    hidden from the block on (in step, and whoever has the turn after); at least one is generated. The block is most
+    often where a window that moves along has it. The past of those who are not given is faint as in `rollout_levels`.
+    """
+    device = generator.device
+    draw = torch.rand(6, B, 1, 1, generator=generator, device=device)
+    time = torch.arange(N, device=device)[None, :, None]
+    latest = max(N - 1 - UNKNOWN_AFTER, 1)
+    past = (1 + draw[0] * 2 * latest).long().clamp_max(latest)
+    stop = past + 1 + (draw[1] < 0.2)
+    level = shifted(1 + (draw[2] * LEVELS).long().clamp_max(LEVELS - 1), shift)
+    since = torch.where(draw[3] < 0.5, 0, draw[3] * past)
+    behind = torch.where((draw[4] < faint) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0)
+    shares = torch.tensor(LIVE_ROLES, device=device)
+    role = torch.multinomial(shares, B * P, replacement=True, generator=generator).view(B, 1, P)
+    somebody = torch.randint(P, (B, 1, 1), generator=generator, device=device)
+    role = torch.where(torch.arange(P, device=device) == somebody, 0, role)
+    shown = torch.where(role == 1, 0, behind)
+    block = torch.where(role == 0, level, torch.where(role == 1, 0, LEVELS))
+    return torch.where(time < past, shown, torch.where(time < stop, block, LEVELS))

@@ -83,6 +83,8 @@ class NoiseOptions:
             smaller, the less noise hides where a partner is. 0: their standard deviation, as in the paper.
         faint_past: share of the roll-outs in `mixture` whose past is shown a little noisy, as samplers show what was
             made some seconds ago (ours); see `magnet.denoiser.levels.rollout_levels`.
+        live: share of the roll-outs in `mixture` as tasks that go on live ask about: some agents' next tokens, the
+            others' given so far or hidden (ours); see `magnet.denoiser.levels.live_levels`.
     """
 
     distribution: Distribution = "per_token"
@@ -90,13 +92,15 @@ class NoiseOptions:
     pairwise: PairwiseNoise = "noisier_end"
     pairwise_metres: float = 0.0
     faint_past: float = 0.0
+    live: float = 0.0
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
-        require_number("faint_past", self.faint_past, 0, 1)
+        for name in ("faint_past", "live"):
+            require_number(name, getattr(self, name), 0, 1)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,17 @@
 import pytest
 import torch
 
-from magnet.denoiser.levels import FAINT, FROM_NOTHING, FROM_NOTHING_MIXED, MIXED, ROLES, draw_levels, rollout_levels
+from magnet.denoiser.levels import (
+    FAINT,
+    FROM_NOTHING,
+    FROM_NOTHING_MIXED,
+    MIXED,
+    ROLES,
+    UNKNOWN_AFTER,
+    draw_levels,
+    live_levels,
+    rollout_levels,
+)
 from magnet.sampling.noise import LEVELS
 
 KINDS = ["per_token", "per_timestep", "per_sequence", "mixture"]
@@ -74,6 +84,44 @@ def test_without_a_faint_past_levels_are_as_they_were(generator):
     half = rollout_levels(4000, 16, 1, generator, faint=0.5)[:, :, 0]
     shown = (half > 0) & (half <= FAINT)
     assert 0.2 < float(shown.any(dim=1).double().mean()) < 0.6
+
+
+def test_live_levels_are_a_past_one_or_two_tokens_and_an_unknown_future(generator):
+    levels = live_levels(4000, 16, 2, generator, 3.0)
+    generated = (levels > 0) & (levels < LEVELS)
+    assert set(generated.sum(dim=1).unique().tolist()) <= {0, 1, 2}
+    assert (levels.diff(dim=1) >= 0).all()
+    assert (levels[:, 0] == 0).all() and (levels[:, -UNKNOWN_AFTER + 1 :] == LEVELS).all()
+    assert generated.any(dim=2).any(dim=1).double().mean() > 0.99  # level K is drawn once in a while
+    where = generated.any(dim=2).double().argmax(dim=1)
+    assert 0.4 < float((where == 16 - 1 - UNKNOWN_AFTER).double().mean()) < 0.65  # where a window that moves has it
+
+
+def test_live_levels_ask_what_each_live_task_asks(generator):
+    levels = live_levels(4000, 16, 2, generator)
+    begins = (levels > 0).any(dim=2).double().argmax(dim=1)
+    first, second = levels[torch.arange(4000), begins].unbind(dim=1)
+    busy = (first > 0) & (first < LEVELS)
+    together, after, hidden = (
+        float((busy & also).double().mean()) for also in (second == first, second == 0, second == LEVELS)
+    )
+    assert min(together, after, hidden) > 0.1
+
+
+def test_a_live_past_is_faint_for_those_who_are_not_given(generator):
+    levels = live_levels(4000, 16, 2, generator, faint=1.0)
+    assert ((levels[:, 0] > 0) & (levels[:, 0] <= FAINT)).any()
+    given = (levels == 0).sum(dim=1) > (levels > 0).any(dim=2).double().argmax(dim=1)[:, None]  # also in the block
+    assert given.any()
+
+
+def test_a_share_of_the_roll_outs_is_live(generator):
+    def narrow(levels):
+        busy = ((levels > 0) & (levels < LEVELS)).any(dim=2).sum(dim=1)
+        return float((busy <= 2).double().mean())
+
+    few, many = (narrow(draw_levels("mixture", 4000, 16, 2, generator, live=live)) for live in (0.0, 0.5))
+    assert many > few + 0.2
 
 
 def test_an_unknown_kind_is_named(generator):
