@@ -81,6 +81,7 @@ class OwnRollout(Rollout):
         if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
             options = dataclasses.replace(options, placement="integrate")
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
+        self.world.in_step = isinstance(task, AgenticSync)
         self.agent, self.names = agent, past.agents
         self.row = past.frames // TOKEN_FRAMES  # the next that is generated
         with torch.no_grad():

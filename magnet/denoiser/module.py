@@ -229,8 +229,8 @@ class Denoiser(TokenModel):
             scene = scene.pad_agents(layout.agents)
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
-            noise = self.noise
-            levels = draw_levels(noise.distribution, B, N, P, generator, noise.shift, noise.faint_past, noise.live)
+            drawn = self.noise
+            levels = draw_levels(drawn.distribution, B, N, P, generator, drawn.shift, drawn.faint_past, drawn.live)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)

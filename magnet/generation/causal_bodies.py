@@ -38,6 +38,8 @@ class World(Protocol):
     given: Scene
     known: Tensor
     placed: Tensor
+    turn: Tensor
+    in_step: bool
     T_world_can: Tensor
     finalized: int
     correction: Corrected | None
@@ -128,7 +130,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
 
 
 def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None) -> Scene:
-    """Bodies of the token steps up to `stop` corrected, each person's by what was final of all others before.
+    """Bodies of the token steps up to `stop` corrected, each person's by what was final of others before, or `seen_by`.
 
     Frames of `made` after them are what the corrections will have to go on to; they are not returned. told (P,) bool,
     whose they are; None: everybody's.
@@ -141,10 +143,20 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     seen = 1 + PACE if world.correction is not None else RECALLED
     before = world.given.slice(max(first - seen, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
-    unseen = (world.known[rows] | ~world.placed[rows]).any(dim=0).to(new.device)
-    made, correction = settled_on(made, before, new, unseen, how, world.correction, uncorrected)
+    sees = seen_by(world, rows).to(new.device)
+    made, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected)
     world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
     return made.slice(0, own)
+
+
+def seen_by(world: World, rows: slice) -> Tensor:
+    """Whose part of a block each agent may look at: who is given it, or had the turn before. -> (P, P) bool
+
+    [p, q]: p may look at q's. In step nobody looks at anybody's.
+    """
+    turn = world.turn[rows]
+    there = (world.known[rows] | (turn > 0)) & world.placed[rows]
+    return ((turn[:, None] < turn[:, :, None]) & there[:, None]).all(dim=0) & (not world.in_step)
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:

@@ -201,7 +201,8 @@ def settled_on(
     scene: Scene,
     before: Scene | None,
     new: Tensor,
-    unseen: Tensor,
+    block: int,
+    sees: Tensor,
     how: str,
     past: Corrected | None,
     uncorrected: Scene | None = None,
@@ -212,7 +213,9 @@ def settled_on(
         scene: (B, T, P) bodies, uncorrected.
         before: the last frames before, as shown; None: there are none, and nobody else is there yet.
         new: (T, P) bool, who may be moved.
-        unseen: (P,) bool, of whom nobody knows more than `before`.
+        block: frames that are shown; those after them are expected, and nobody knows them of anybody else.
+        sees: (P, P) bool; [p, q]: p knows q's block, and as it is corrected if it is new. Else p knows no more of q
+            than `before`.
         how: `light`, `firm` or `hold`.
         past: what the last call returned, its corrections those of the two frames before; None: nothing.
         uncorrected: the same two frames without them; None: as shown.
@@ -224,25 +227,40 @@ def settled_on(
     body, agents = open_body_on(scene.device), torch.arange(len(there), device=scene.device)
     shaped = scene.replace(body=body.id, valid=None, given=None).permute_agents(there)
     known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
-    new, unseen, who = new[:, there], unseen[there], tuple(there.tolist())
+    new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
     holding = None if known is None or how != "hold" else held_on(known, body, past, who)
     plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
     last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
-    for one in [agents == agent for agent in agents[moving]]:
-        hidden = unseen | (moving & ~one)
-        if known is None:
-            seen = shaped.replace(present=shaped.present & ~hidden)
-        else:
-            seen = carried_on(cat_time([known, shaped]), hidden, known.frames - 1).slice(known.frames)
+    turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
+    for number in turns[moving[turns]]:
+        one = agents == number
+        seen = as_known(shaped, known, one, sees[number], block)
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
         offset[:, :, one] = changes[:, :, one]
+        if bool(sees[:, number].any()):
+            done = corrected(shaped, changes * one[:, None])
+            shaped = shaped.replace(body_rot=done.body_rot, T_world_root=done.T_world_root)
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset
     made = corrected(scene, whole)
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, holding, who)
+
+
+def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int) -> Scene:
+    """A block and the frames after it as one person knows them: the others go on from where they were last seen.
+
+    Arguments as for `settled_on`; one, sees (P,) bool, who it is and whom it sees.
+    """
+    hidden = ~sees & ~one
+    if before is None:
+        scene = scene.replace(present=scene.present & ~hidden)
+    else:
+        scene = carried_on(cat_time([before, scene]), hidden, before.frames - 1)
+    lead = 0 if before is None else before.frames
+    return carried_on(scene, sees & ~one, lead + block - 1).slice(lead)
 
 
 def held_on(known: Scene, body: Body, past: Corrected | None, who: tuple[int, ...]) -> Tensor:

@@ -174,11 +174,11 @@ def test_feet_shown_standing_stay_there_block_after_block() -> None:
     root = still.T_world_root.clone()
     root[0, :, 0, 0, 3] += 0.15 * (torch.arange(frames) - block).clamp(min=0) / 30.0
     sliding, body = still.replace(T_world_root=root), load_body()
-    new, unseen = torch.ones(2 * block, 1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
+    new, sees = torch.ones(2 * block, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
     shown, past, plain = [sliding.slice(0, block)], None, None
     for start in range(block, frames - block, block):
         ahead = sliding.slice(start, start + 2 * block)
-        made, now = settled_on(ahead, shown[-1], new, unseen, "firm", past, plain)
+        made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
         shown.append(made.slice(0, block))
         past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
     toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (cat_time(shown), sliding))
@@ -199,7 +199,7 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
     shown, past, plain = [walking.slice(0, block)], None, None
     for start in range(block, frames - block, block):
         ahead = walking.slice(start, start + 2 * block)
-        made, now = settled_on(ahead, shown[-1], new, ~new[0], "firm", past, plain)
+        made, now = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past, plain)
         shown.append(made.slice(0, block))
         past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
     return cat_time(shown).replace(body=body.id)
@@ -209,6 +209,29 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
 def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
     joints = load_body().joints(walked_on(1, speed))[0]
     assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_whoever_is_given_the_block_is_made_way_for_in_it(known) -> None:
+    """B comes at A at 2.5 m/s from half a metre, and stands until the block begins: who sees the block steps aside."""
+    frames, block, body = 12, 4, load_body()
+    still = standing(1, frames, 2, torch.device("cpu"))
+    root = still.T_world_root.clone()
+    root[0, :, 1, 2, 3] = root[0, :, 0, 2, 3]
+    root[0, :, 1, 0, 3] = root[0, :, 0, 0, 3] + 0.5 - 2.5 / 30 * (torch.arange(frames) - block + 1).clamp(0, block)
+    scene = still.replace(T_world_root=root)
+    new, sees = torch.tensor([True, False]).expand(2 * block, -1), torch.tensor([[False, known], [False, False]])
+    before, plain = scene.slice(0, block), scene.slice(block, frames)
+    made, _ = settled_on(plain, before, new, block, sees, "firm", None)
+    assert torch.equal(made.T_world_root[:, :, 1], plain.T_world_root[:, :, 1])
+    was, now = (
+        deepest(*body.joints(each.replace(body=body.id))[0, :block].unbind(dim=1))[-1, 1] for each in (plain, made)
+    )
+    assert (float(now) < float(was) - 0.02) == known
+    later = plain.T_world_root.clone()
+    later[:, block:, 1, 0, 3] += 1.0
+    again, _ = settled_on(plain.replace(T_world_root=later), before, new, block, sees, "firm", None)
+    assert torch.equal(again.T_world_root[:, :, 0], made.T_world_root[:, :, 0])  # nobody knows what comes after
 
 
 def test_corrections_made_anew_in_one_scene_change_no_other() -> None:

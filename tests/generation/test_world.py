@@ -4,12 +4,13 @@ import pytest
 import torch
 
 from magnet.generation.blending import freeze_after
+from magnet.generation.causal_bodies import seen_by
 from magnet.generation.conditioning import known_tokens, mask_unknown
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
-from magnet.sampling.options import SamplerOptions
+from magnet.sampling.options import SamplerOptions, Settling
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -88,10 +89,17 @@ TOKENS = 12
 
 
 def told(
-    model, scene: Scene, task: Task, placement: str, context: int, wrong: torch.Tensor | None = None, **about
+    model,
+    scene: Scene,
+    task: Task,
+    placement: str,
+    context: int,
+    wrong: torch.Tensor | None = None,
+    settle: Settling = "off",
+    **about,
 ) -> tuple[WorldState, torch.Tensor]:
     """The finished world and tokens where a model says the truth, and `wrong` (B, N, P, D) on top."""
-    options = SamplerOptions(steps=4, stride=2, placement=placement, pairwise_weight=0.1)
+    options = SamplerOptions(steps=4, stride=2, placement=placement, pairwise_weight=0.1, settle=settle)
     schedule = task.schedule(Grid(TOKENS, 3, context, 4, 8, 2))
     given = mask_unknown(scene, schedule.known)
     world = WorldState(model, given, schedule, options, 1, **about)
@@ -195,3 +203,20 @@ def test_relations_between_agents_who_saw_nothing_of_each_other_do_not_count_as_
         world = WorldState(model, mask_unknown(scene, schedule.known), schedule, OPTIONS, 1, stats)
         world.make_consistent(torch.zeros(2, TOKENS, 3, model.layout.width), finished, decentralized)
         assert stats.pairwise_drifts == 2 * 2 * pairs
+
+
+@pytest.mark.parametrize(
+    "task, expected",
+    [
+        (MotionControl((0,)), [(0, 1), (0, 2)]),
+        (AgenticSync(), []),
+        (AgenticAsync(), [(1, 0), (2, 0), (2, 1)]),
+        (AgenticAsync(order=(2,)), [(0, 2), (1, 0), (1, 2)]),
+        (AgenticAsync(offset=0.0), []),  # all at once: nobody is finished before another
+    ],
+    ids=str,
+)
+def test_a_block_is_corrected_by_what_was_given_or_finished_before_it(model, scene, task, expected):
+    world, _ = told(model, scene, task, "fuse", 3, settle="firm")
+    for row in range(3, TOKENS):
+        assert seen_by(world, slice(row, row + 1)).nonzero().tolist() == [list(pair) for pair in expected]
