@@ -69,6 +69,8 @@ class OwnRollout(Rollout):
         generator: torch.Generator | None = None,
         missing: Tensor | None = None,
     ) -> None:
+        if task.block is None:
+            task = dataclasses.replace(task, block=1)
         if task.block != 1 or (isinstance(task, AgenticAsync) and task.offset != 1):
             raise ValueError(f"task: got {task}, expected blocks of one token, and turns with offset 1")
         if past.scenes != 1 or not 0 <= agent < past.agents or not bool(past.present[0, agent]):

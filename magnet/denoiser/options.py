@@ -188,6 +188,7 @@ class Sampling:
     Args:
         stride: token steps finished before the window moves on.
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
+        turn: token steps of a turn, where agents take turns.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
         noise_scale: standard deviation of the new noise in each denoising step.
@@ -197,6 +198,7 @@ class Sampling:
 
     stride: int | None = None
     pyramid_offset: int | None = None
+    turn: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
     noise_scale: float | None = None

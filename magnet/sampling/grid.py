@@ -28,9 +28,18 @@ class Grid:
     shift: float = SamplerOptions.shift  # see `magnet.sampling.noise.shifted`
     noise_sampling: NoiseSampling = SamplerOptions.noise_sampling  # see `magnet.sampling.plans.token_levels`
     spacing: Spacing = SamplerOptions.spacing  # of the levels that a token passes
+    turn: int = 1  # token steps of a turn, where the task leaves it open
 
     def __post_init__(self) -> None:
-        for name, least in (("tokens", 1), ("agents", 1), ("context", 0), ("steps", 1), ("window", 1), ("stride", 1)):
+        for name, least in (
+            ("tokens", 1),
+            ("agents", 1),
+            ("context", 0),
+            ("steps", 1),
+            ("window", 1),
+            ("stride", 1),
+            ("turn", 1),
+        ):
             require_whole(name, getattr(self, name), least)
         if self.context > self.tokens:
             raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
@@ -84,4 +93,5 @@ class Grid:
 def planning_grid(tokens: int, agents: int, past: int, window: int, options: SamplerOptions) -> Grid:
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o, stride = options, options.stride or min(STRIDE, window)
-    return Grid(tokens, agents, past, o.steps, window, stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing)
+    levels = o.steps, window, stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing
+    return Grid(tokens, agents, past, *levels, min(o.turn or 1, window))

@@ -47,6 +47,8 @@ class SamplerOptions:
             keep 8 tokens in flight. 0: the tokens of a stride are denoised together, as in the paper. None: as the
             model is best sampled, or half of the window is in flight; tasks whose agents take turns or that look ahead
             to keyframes go in strides.
+        turn: token steps of a turn, where agents take turns and their task leaves it open (`AgenticAsync.block`). None:
+            as the model is best sampled, or 1.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
@@ -98,6 +100,7 @@ class SamplerOptions:
     steps: int = 16
     stride: int | None = None
     pyramid_offset: int | None = None
+    turn: int | None = None
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
     apart: Separation = "off"
@@ -133,8 +136,9 @@ class SamplerOptions:
         for name in ("settle_blocks", "keep_given", "any_floor", "compile", "smooth_path", "requantize"):
             require_flag(name, getattr(self, name), unsaid=name in ("smooth_path", "requantize"))
         require_whole("steps", self.steps, 1, LEVELS)
-        if self.stride is not None:
-            require_whole("stride", self.stride, 1)
+        for name in ("stride", "turn"):
+            if getattr(self, name) is not None:
+                require_whole(name, getattr(self, name), 1)
         if self.pyramid_offset is not None:
             require_whole("pyramid_offset", self.pyramid_offset, 0)
         require_number("pairwise_weight", self.pairwise_weight, least=0)

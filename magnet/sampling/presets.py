@@ -18,6 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "steps": 30,  # A.3
         "stride": 4,  # 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
         "pyramid_offset": 0,  # 3.3: segment by segment
+        "turn": 1,  # 3.3: P(A_t | ...), then P(B_t | A_t, ...)
         "placement": "integrate",  # the paper predicts steps and integrates them
         "pairwise_weight": 0.02,  # not read by `integrate`
         "requantize": True,  # 3.1: what is decoded are codes

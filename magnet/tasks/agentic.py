@@ -43,13 +43,13 @@ class AgenticAsync:
         offset: share of the denoising steps between two agents' starts; 1 waits until the one before is done,
             0 starts all together (paper Table 3: 0, 0.5 and 1).
         order: slots in the order of their turns; slots left out follow in their own order.
-        block: token steps of a turn.
+        block: token steps of a turn. None: as the model is best sampled (`Sampling.turn`), or 1.
     """
 
     formula: ClassVar[str] = "P(A_t | A_0:t-1, B_0:t-1) P(B_t | A_0:t, B_0:t-1) ..."
     offset: float = 1.0
     order: tuple[int, ...] = ()
-    block: int = 1
+    block: int | None = None
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
@@ -61,4 +61,5 @@ class AgenticAsync:
         turns = [*self.order, *(p for p in range(grid.agents) if p not in self.order)]
         turn = torch.tensor([turns.index(p) for p in range(grid.agents)])
         delay = turn * round(self.offset * grid.steps)
-        return MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid, self.block, delay=delay)
+        block = grid.turn if self.block is None else self.block
+        return MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid, block, delay=delay)

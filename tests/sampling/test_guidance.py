@@ -4,6 +4,7 @@ from torch import Tensor
 
 from magnet.denoiser.options import Sampling
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.grid import planning_grid
 from magnet.sampling.guidance import Guidance, roughness
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.sampling.options import SamplerOptions
@@ -158,6 +159,10 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
 
 
 def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
+    assert SamplerOptions().filled(Sampling(turn=2)).turn == 2
+    assert SamplerOptions(turn=1).filled(Sampling(turn=2)).turn == 1
+    assert planning_grid(12, 2, 4, 16, SamplerOptions(turn=2)).turn == 2
+    assert planning_grid(12, 2, 4, 16, SamplerOptions()).turn == 1
     model = Sampling(noise_scale=1.1)
     assert SamplerOptions().filled(model).noise_scale == 1.1
     assert SamplerOptions(noise_scale=1.0).filled(model).noise_scale == 1

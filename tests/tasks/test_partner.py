@@ -81,6 +81,16 @@ def test_at_the_full_offset_turns_are_stages():
     assert who == 4 * [[2], [0], [1]]
 
 
+def test_a_turn_is_as_long_as_the_model_is_best_sampled_where_the_task_does_not_say():
+    grid = Grid(tokens=12, agents=2, context=8, steps=4)
+    assert len(AgenticAsync().schedule(grid).stages) == 2 * 4
+    assert len(AgenticAsync().schedule(replace(grid, turn=2)).stages) == 2 * 2
+    assert len(AgenticAsync(block=4).schedule(replace(grid, turn=2)).stages) == 2
+    assert len(AgenticSync().schedule(replace(grid, turn=2)).stages) == 4  # takes no turns
+    with pytest.raises(ValueError, match="turn"):
+        replace(grid, turn=0)
+
+
 def test_targets_must_exist_and_leave_somebody():
     with pytest.raises(ValueError, match=r"target \(1, 1\): name each agent once"):
         PartnerInpainting(target=(1, 1)).schedule(Grid(4, 3, 0))
