@@ -27,14 +27,17 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/experiments_corrections.md)."""
 
+LOOSELY = Settle(iterations=12, inner=40, bend=30.0, root=5.0, hold=2.0, hard=10.0)
+"""How it is corrected where that leaves somebody over `TOO_DEEP` in another."""
+
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
 PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, lift=10.0, stand=16.0, hold=2.0, hard=20.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
 
-LEFT = Apart(body=0.07, arms=0.07)
-"""Metres of depth that `SHOWN` may leave."""
+LEFT, TOO_DEEP = Apart(body=0.07, arms=0.07), Apart(body=0.08, arms=0.08)
+"""Metres of depth that `SHOWN` may leave, and `FINISHED`."""
 
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
@@ -152,8 +155,16 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
     offset, holding = (None, None) if past is None else past[:2]
     still = fixed[..., there.to(fixed.device)]
-    offset = settling(shaped, body, how, still, FINISHED, begun, offset, holding=holding)
+    before = offset
+    offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
+    deep = left_deep(made, body, TOO_DEEP)
+    if bool(deep.any()):
+        few = shaped.select(deep.nonzero()[:, 0])
+        stay = still[deep] if still.ndim == 3 and len(still) == len(deep) else still
+        past_few, held_few = (None if each is None else each[deep] for each in (before, holding))
+        offset[deep] = settling(few, body, how, stay, LOOSELY, begun, past_few, holding=held_few)
+        made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
     body_rot[:, :, there], root[:, :, there] = made.body_rot, made.T_world_root
@@ -180,7 +191,7 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
-    deep = left_deep(corrected(seen, offset), body)
+    deep = left_deep(corrected(seen, offset), body, LEFT)
     if bool(deep.any()):
         before, hold = (None if each is None else each[deep] for each in (past, holding))
         ends = None if last is None else (last[0][deep], last[1][deep])
@@ -189,12 +200,12 @@ def own_correction(
     return offset
 
 
-def left_deep(scene: Scene, body: Body) -> Tensor:
-    """In which scenes two people are deeper in each other than `LEFT` in some frame. -> (B,) bool"""
+def left_deep(scene: Scene, body: Body, allowed: Apart) -> Tensor:
+    """In which scenes two people are deeper in each other than allowed in some frame. -> (B,) bool"""
     joints = body.joints(scene)
     first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
     both = (scene.present[:, first] & scene.present[:, second])[:, None]
-    return ((excess_depth(joints[:, :, first], joints[:, :, second], LEFT) > 0) & both).flatten(1).any(dim=1)
+    return ((excess_depth(joints[:, :, first], joints[:, :, second], allowed) > 0) & both).flatten(1).any(dim=1)
 
 
 def settled_on(

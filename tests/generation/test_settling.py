@@ -11,10 +11,12 @@ import torch
 import magnet
 from magnet.bench.speed import standing
 from magnet.body import load_body
+from magnet.body.apart import Apart
 from magnet.body.energy import CONTACT
 from magnet.body.joints import TOES
 from magnet.body.settle import DOFS
 from magnet.body.settle_wishes import FIRM
+from magnet.generation import settling
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
 from magnet.generation.settling import (
@@ -209,6 +211,26 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
 def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
     joints = load_body().joints(walked_on(1, speed))[0]
     assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08
+
+
+def test_what_is_left_deep_in_a_finished_chunk_is_corrected_more_loosely(monkeypatch) -> None:
+    """A runs through B, who is given, at 6 m/s, beside a scene in which nobody moves."""
+    still, body = standing(2, 40, 2, torch.device("cpu")), load_body()
+    root = still.T_world_root.clone()
+    root[0, :, 0, 0, 3] = root[0, :, 1, 0, 3] + (torch.arange(40) - 20) / 30 * 6.0
+    root[0, :, 0, 2, 3] = root[0, :, 1, 2, 3]
+    running, fixed = still.replace(T_world_root=root), torch.tensor([False, True]).expand(40, -1)
+
+    def depth(made: Scene) -> float:
+        joints = body.joints(made.replace(body=body.id))[0]
+        return float(deepest(joints[:, 0], joints[:, 1])[:, 1].max())
+
+    made, _ = settled_chunk(running, fixed, "firm", None)
+    monkeypatch.setattr(settling, "TOO_DEEP", Apart(body=9.0, arms=9.0))
+    once, _ = settled_chunk(running, fixed, "firm", None)
+    assert depth(once) > 0.10 > 0.08 > depth(made)
+    assert torch.equal(made.T_world_root[1], once.T_world_root[1])  # other scenes stay as they were
+    assert torch.equal(made.T_world_root[:, :, 1], running.T_world_root[:, :, 1])
 
 
 @pytest.mark.parametrize("known", [True, False])
