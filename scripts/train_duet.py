@@ -1,12 +1,13 @@
-"""The shipped model, from recordings to weights in one go: tokenizer, denoiser three times, decoder, release.
+"""The shipped model, from recordings to weights in one go: tokenizer, denoiser, decoder, release.
 
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
-`--out`. The stage `on` goes on from the denoiser, `again` from the mean of the weights before and after `on`, and the
-mean of the weights before and after `again` is released. Stopped at any moment, by hand or by a power cut, all goes on
-from the last checkpoint when it is run again; a stage that has its steps is not run again. `--steps tokenizer=2
-denoiser=2 on=2 again=2 decoder=2` rehearses it to the end.
+`--out`. The stage `on` goes on from the denoiser, `again` from the mean of the weights before and after `on`. From the
+mean of the weights before and after `again` the sisters (`SISTERS`) go on, each for itself, and the mean of it, twice,
+and them is released. Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a
+stage that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2 first=2
+decoder=2` rehearses it to the end.
 """
 
 from __future__ import annotations
@@ -26,7 +27,17 @@ from magnet.callbacks.narrow_codes import NAME as NARROW
 from magnet.cli.child import run_to_its_end
 
 ROOT = Path(__file__).resolve().parents[1]
-BEFORE = {"tokenizer": "", "denoiser": "tokenizer", "on": "denoiser", "again": "on", "decoder": "tokenizer"}
+SISTERS = ("live", "clean", "first")
+"""Stages that go on from the same weights; the mean of theirs and of those, which count twice, is what ships."""
+
+BEFORE = {
+    "tokenizer": "",
+    "denoiser": "tokenizer",
+    "on": "denoiser",
+    "again": "on",
+    **dict.fromkeys(SISTERS, "again"),
+    "decoder": "tokenizer",
+}
 """The stages in the order they are run, each with the one whose weights it begins from."""
 STAGES = tuple(BEFORE)
 
@@ -60,10 +71,10 @@ def mean_checkpoint(folder: Path) -> Path:
     return folder / "checkpoints" / "mean.ckpt"
 
 
-def average(made: Path, one: Path, other: Path) -> None:
-    """Write the mean of the weights of two checkpoints."""
-    script = str(ROOT / "scripts" / "average_weights.py")
-    run([sys.executable, script, str(made), str(one), str(other), "--overwrite"], f"mean of {one.parent.parent.name}")
+def average(made: Path, *checkpoints: Path) -> None:
+    """Write the mean of the weights of some checkpoints."""
+    script, each = str(ROOT / "scripts" / "average_weights.py"), [str(path) for path in checkpoints]
+    run([sys.executable, script, str(made), *each, "--overwrite"], f"mean of {made.parent.parent.name}")
 
 
 def narrow_codes(out: Path) -> Path:
@@ -109,7 +120,7 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
     Args:
         stage: of `STAGES`.
         out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, `on` with the
-            denoiser, `again` with the mean of both.
+            denoiser, `again` with the mean of both, the sisters with the mean before and after that.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
@@ -120,8 +131,8 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
         command += ["--model.tokenizer", tokenizer]
     if stage == "on":
         command += ["--model.start_from", str(last_checkpoint(out / "denoiser"))]
-    if stage == "again":
-        command += ["--model.start_from", str(mean_checkpoint(out / "on"))]
+    if stage in ("again", *SISTERS):
+        command += ["--model.start_from", str(mean_checkpoint(out / BEFORE[stage]))]
     if stage == "decoder":
         command += ["--model.start_from", tokenizer]
     if last_checkpoint(out / stage).is_file():
@@ -195,11 +206,15 @@ def train(given: Any, out: Path, steps: dict[str, int]) -> None:
         put_aside(out / stage)
         if stage == "again":
             average(mean_checkpoint(out / "on"), last_checkpoint(out / "on"), last_checkpoint(out / "denoiser"))
+        if stage in SISTERS:
+            average(mean_checkpoint(out / "again"), last_checkpoint(out / "again"), mean_checkpoint(out / "on"))
         run(fit_command(stage, out, wanted, given.fit), f"{stage}, step {done} to {wanted}")
         if steps_done(out / stage) < wanted:  # stopped, and ended without an error
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
-    average(mean_checkpoint(out / "again"), last_checkpoint(out / "again"), mean_checkpoint(out / "on"))
-    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(mean_checkpoint(out / "again"))]
+    released, sisters = mean_checkpoint(out / SISTERS[-1]), [last_checkpoint(out / stage) for stage in SISTERS]
+    start = mean_checkpoint(out / "again")
+    average(released, start, start, *sisters)  # where they began counts twice
+    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(released)]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(folder)]
     run(release, "release")

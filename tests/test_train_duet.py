@@ -44,7 +44,8 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
         assert command[command.index("--trainer.max_steps") + 1] == "9"
         assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
     before = str(recipe.last_checkpoint(tmp_path / "denoiser"))
-    for stage, start in (("on", before), ("again", str(recipe.mean_checkpoint(tmp_path / "on")))):
+    half, whole = (str(recipe.mean_checkpoint(tmp_path / stage)) for stage in ("on", "again"))
+    for stage, start in (("on", before), ("again", half), *((sister, whole) for sister in recipe.SISTERS)):
         command = recipe.fit_command(stage, tmp_path, 9, [])
         assert command[command.index("--model.start_from") + 1] == start and "--model.tokenizer" not in command
     assert recipe.steps_done(tmp_path / "denoiser") == 0
@@ -57,6 +58,7 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
 def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Path, monkeypatch, capsys) -> None:
     save(tmp_path / "tokenizer", 3)
     recipe.narrow_codes(tmp_path).touch()
+    steps = ["--steps", "tokenizer=3", *(f"{stage}={number}" for number, stage in enumerate(recipe.STAGES[1:], 2))]
     ran: list[list[str]] = []
 
     def whole(command: list[str], what: str) -> None:
@@ -67,24 +69,27 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
     with monkeypatch.context() as stopped:
         stopped.setattr(recipe, "run", lambda command, what: None)
         with pytest.raises(SystemExit, match="denoiser was stopped"):
-            recipe.main(
-                ["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "again=2", "decoder=5"]
-            )
+            recipe.main(["--out", str(tmp_path), *steps])
     monkeypatch.setattr(recipe, "run", whole)
     capsys.readouterr()
-    recipe.main(["--out", str(tmp_path), "--steps", "tokenizer=3", "denoiser=4", "on=2", "again=2", "decoder=5"])
+    recipe.main(["--out", str(tmp_path), *steps])
     configs = [command[command.index("--config") + 1] for command in ran if "--config" in command]
-    assert [Path(config).stem for config in configs] == ["duet_denoiser", "duet_on", "duet_again", "duet_decoder"]
+    assert [Path(config).stem for config in configs] == [f"duet_{stage}" for stage in recipe.STAGES[1:]]
     means = [command for command in ran if "average_weights.py" in command[1]]
     assert all(command[-1] == "--overwrite" for command in means)  # a stopped stage takes it anew
-    half, whole_mean = (recipe.mean_checkpoint(tmp_path / stage) for stage in ("on", "again"))
-    denoiser, on, again = (recipe.last_checkpoint(tmp_path / stage) for stage in ("denoiser", "on", "again"))
+    half, whole_mean, released = (
+        str(recipe.mean_checkpoint(tmp_path / stage)) for stage in ("on", "again", recipe.SISTERS[-1])
+    )
+    denoiser, on, again, *sisters = (
+        str(recipe.last_checkpoint(tmp_path / stage)) for stage in ("denoiser", "on", "again", *recipe.SISTERS)
+    )
     assert [command[2:-1] for command in means] == [
-        [str(half), str(on), str(denoiser)],
-        [str(whole_mean), str(again), str(half)],
+        [half, on, denoiser],
+        *[[whole_mean, again, half]] * len(sisters),  # before each of those that go on from it
+        [released, whole_mean, whole_mean, *sisters],
     ]
-    assert ran.index(means[0]) == 2  # before what goes on from it
-    assert str(whole_mean) in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
+    assert ran.index(means[0]) == 2 and ran.index(means[1]) == 4
+    assert released in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="run the same command again"):
@@ -129,8 +134,9 @@ def test_what_others_began_from_does_not_go_on(tmp_path: Path) -> None:
         save(tmp_path / stage, 3)
     recipe.narrow_codes(tmp_path).touch()
     assert not recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3))
-    assert set(recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {"again": 5})) == {"again"}
-    for stage, others in (("denoiser", "on"), ("tokenizer", "denoiser")):
+    last = recipe.SISTERS[-1]  # nothing begins from it
+    assert set(recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {last: 5})) == {last}
+    for stage, others in (("denoiser", "on"), ("tokenizer", "denoiser"), ("again", recipe.SISTERS[0])):
         with pytest.raises(SystemExit, match=f"{others} began from {stage} at step 3, which would go on to step 5"):
             recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {stage: 5})
 
@@ -155,14 +161,11 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
-    recipe.main(
-        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "again=1", "decoder=1", *small]
-    )
-    recipe.main(
-        ["--out", str(tmp_path), "--steps", "tokenizer=1", "denoiser=1", "on=1", "again=2", "decoder=1", *small]
-    )
+    each = {stage: 1 for stage in recipe.STAGES}
+    for steps in (each, each | {"clean": 2}):
+        recipe.main(["--out", str(tmp_path), "--steps", *(f"{name}={count}" for name, count in steps.items()), *small])
     said = capfd.readouterr().out
-    assert "tokenizer: has its 1 steps already" in said and "again, step 1 to 2: done" in said
+    assert "tokenizer: has its 1 steps already" in said and "clean, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")
     released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
     decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
