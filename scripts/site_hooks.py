@@ -27,7 +27,6 @@ ELSEWHERE = {
     "CONTRIBUTING.md": "contributing.md",
     "magnet/weights/duet/README.md": "card.md",
     "magnet/weights/duet1/README.md": "card1.md",
-    "magnet/weights/duet_long/README.md": "card_long.md",
     "magnet/body/OPEN_BODY.md": "open_body.md",
     "examples/magnet-duel/README.md": "plugin.md",
     "examples/tour.ipynb": "tour.md",

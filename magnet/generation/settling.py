@@ -27,8 +27,11 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/experiments_corrections.md)."""
 
-LOOSELY = Settle(iterations=12, inner=40, bend=30.0, root=5.0, hold=2.0, hard=10.0)
-"""How it is corrected where that leaves somebody over `TOO_DEEP` in another."""
+LOOSELY = (
+    Settle(iterations=12, inner=40, bend=30.0, root=5.0, hold=2.0, hard=10.0),
+    Settle(iterations=16, inner=60, bend=5.0, root=3.0, hold=1.0, hard=40.0),
+)
+"""How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another."""
 
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
@@ -158,12 +161,14 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     before = offset
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
-    deep = left_deep(made, body, TOO_DEEP)
-    if bool(deep.any()):
+    for looser in LOOSELY:
+        deep = left_deep(made, body, TOO_DEEP)
+        if not bool(deep.any()):
+            break
         few = shaped.select(deep.nonzero()[:, 0])
         stay = still[deep] if still.ndim == 3 and len(still) == len(deep) else still
         past_few, held_few = (None if each is None else each[deep] for each in (before, holding))
-        offset[deep] = settling(few, body, how, stay, LOOSELY, begun, past_few, holding=held_few)
+        offset[deep] = settling(few, body, how, stay, looser, begun, past_few, holding=held_few)
         made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
