@@ -83,7 +83,7 @@ class OwnRollout(Rollout):
         if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
             options = dataclasses.replace(options, placement="integrate")
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
-        self.world.in_step = isinstance(task, AgenticSync)
+        self.in_step = isinstance(task, AgenticSync)
         self.agent, self.names = agent, past.agents
         self.row = past.frames // TOKEN_FRAMES  # the next that is generated
         with torch.no_grad():
@@ -122,6 +122,8 @@ class OwnRollout(Rollout):
         with torch.autocast(self._autocast[0], enabled=False):
             self._bring_in(row + 1)
         self._run(self._in_own_view(stage))
+        if self.in_step:  # whatever has come of the others is of before
+            self.world.saw.fill_(False)
         self._expect_others(row)
         self._finalize(row + 1, row + 1)
         local = row - self.first

@@ -18,12 +18,16 @@ from magnet.motion.frames import canonical_frame, from_planar, inverse, to_plana
 from magnet.motion.resample import slerp, smoothstep
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.grid import Grid
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive
 from magnet.tasks import registry
 
 COMPARED = 16
 """Frames at the end of a generated past by which the recorded continuation is chosen."""
+
+GOING_ON = Grid(tokens=8, agents=2, context=4)
+"""On which it is found out whether a task goes on from a past alone."""
 
 BLEND = 8
 """Frames over which poses change from the generated past to the recorded continuation."""
@@ -71,12 +75,17 @@ class RollOuts(Callback):
         if frames[1] < frames[0]:
             raise ValueError(f"frames: got {frames}, expected the fewest first")
         self.share, self.every, self.scenes, self.frames, self.stretches = share, every, scenes, frames, stretches
-        # What it makes, neither corrected nor livelier.
-        self.sampler = SamplerOptions(steps=steps, settle="off", smooth_path=False, noise_scale=1.0, any_floor=True)
+        # What it makes, neither corrected nor livelier, in turns of one token.
+        plain = {"settle": "off", "smooth_path": False, "noise_scale": 1.0, "turn": 1, "any_floor": True}
+        self.sampler = SamplerOptions(steps=steps, **plain)  # type: ignore[arg-type]
         self.return_frames = return_frames
         if not tasks:
             raise ValueError("tasks: got none, expected at least one")
         self.tasks = [registry.get(task)() for task in tasks]
+        for name, task in zip(tasks, self.tasks, strict=True):
+            plan, grid = task.schedule(GOING_ON), GOING_ON
+            if not torch.equal(plan.known, grid.past()) or not bool(plan.finished.all()):
+                raise ValueError(f"tasks: got {name}, expected tasks that make everybody's future from a past alone")
         self.kept: list[Scene] = []
         self.filled, self.start = -1, start
 

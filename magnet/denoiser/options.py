@@ -188,7 +188,7 @@ class Sampling:
     Args:
         stride: token steps finished before the window moves on.
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
-        turn: token steps of a turn, where agents take turns.
+        turn: token steps of a turn, where agents take turns and their task leaves it open.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
         noise_scale: standard deviation of the new noise in each denoising step.

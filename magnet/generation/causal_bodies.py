@@ -39,7 +39,7 @@ class World(Protocol):
     known: Tensor
     placed: Tensor
     turn: Tensor
-    in_step: bool
+    saw: Tensor
     T_world_can: Tensor
     finalized: int
     correction: Corrected | None
@@ -149,14 +149,27 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     return made.slice(0, own)
 
 
-def seen_by(world: World, rows: slice) -> Tensor:
-    """Whose part of a block each agent may look at: who is given it, or had the turn before. -> (P, P) bool
+def shown_to(stage: Stage, before: Tensor) -> Tensor:
+    """Whose part of the block each agent that a stage generates is shown; of others what was before. (P, P) bool
 
-    [p, q]: p may look at q's. In step nobody looks at anybody's.
+    [p, q]: p is shown q's.
+    """
+    if stage.visibility is None and bool(before.all()):
+        return before
+    active = stage.levels[0] != stage.levels[-1]  # (W, P)
+    rows, moves = active.any(dim=1), active.any(dim=0)
+    seen = torch.ones_like(before) if stage.visibility is None else stage.visibility[:, rows].all(dim=1)
+    return torch.where(moves[:, None], seen, before)
+
+
+def seen_by(world: World, rows: slice) -> Tensor:
+    """Whose part of a block each agent may look at: given or finished in an earlier stage, and shown. -> (P, P) bool
+
+    [p, q]: p may look at q's.
     """
     turn = world.turn[rows]
     there = (world.known[rows] | (turn > 0)) & world.placed[rows]
-    return ((turn[:, None] < turn[:, :, None]) & there[:, None]).all(dim=0) & (not world.in_step)
+    return ((turn[:, None] < turn[:, :, None]) & there[:, None]).all(dim=0) & world.saw
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:

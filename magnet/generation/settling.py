@@ -162,7 +162,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
     for looser in LOOSELY:
-        deep = left_deep(made, body, TOO_DEEP)
+        deep = left_deep(made, body, TOO_DEEP, still)
         if not bool(deep.any()):
             break
         few = shaped.select(deep.nonzero()[:, 0])
@@ -196,7 +196,7 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
-    deep = left_deep(corrected(seen, offset), body, LEFT)
+    deep = left_deep(corrected(seen, offset), body, LEFT, fixed)
     if bool(deep.any()):
         before, hold = (None if each is None else each[deep] for each in (past, holding))
         ends = None if last is None else (last[0][deep], last[1][deep])
@@ -205,11 +205,15 @@ def own_correction(
     return offset
 
 
-def left_deep(scene: Scene, body: Body, allowed: Apart) -> Tensor:
-    """In which scenes two people are deeper in each other than allowed in some frame. -> (B,) bool"""
+def left_deep(scene: Scene, body: Body, allowed: Apart, fixed: Tensor) -> Tensor:
+    """In which scenes two people, not both of them fixed, are deeper in each other than allowed. -> (B,) bool
+
+    fixed (T, P) or (B, T, P) bool
+    """
     joints = body.joints(scene)
     first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
-    both = (scene.present[:, first] & scene.present[:, second])[:, None]
+    free = ~(fixed[..., first] & fixed[..., second]).to(scene.device)
+    both = (scene.present[:, first] & scene.present[:, second])[:, None] & free
     return ((excess_depth(joints[:, :, first], joints[:, :, second], allowed) > 0) & both).flatten(1).any(dim=1)
 
 

@@ -45,6 +45,8 @@ class Grid:
             raise ValueError(f"context: got {self.context} token steps, expected at most the {self.tokens} there are")
         if self.stride > self.window:
             raise ValueError(f"stride must lie between 1 and the window of {self.window}: got {self.stride}")
+        if self.turn > self.window:
+            raise ValueError(f"turn must lie between 1 and the window of {self.window}: got {self.turn}")
         if self.pyramid_offset is not None:
             require_whole("pyramid_offset", self.pyramid_offset, 0)
         require_choice("noise_sampling", self.noise_sampling, NoiseSampling)
@@ -94,4 +96,4 @@ def planning_grid(tokens: int, agents: int, past: int, window: int, options: Sam
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o, stride = options, options.stride or min(STRIDE, window)
     levels = o.steps, window, stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing
-    return Grid(tokens, agents, past, *levels, min(o.turn or 1, window))
+    return Grid(tokens, agents, past, *levels, o.turn or 1)

@@ -62,9 +62,12 @@ class Stage:
 
     @property
     def decentralized(self) -> bool:
-        """Whether some agent does not see what this stage generates of another."""
+        """Whether some agent does not see what this stage generates of another, or what is given of them there."""
+        if self.visibility is None:
+            return False
         generated = (self.levels[0] > 0) & (self.levels[0] != self.levels[-1])
-        return self.visibility is not None and bool((~self.visibility & generated).any())
+        given = (self.levels[0] == 0) & generated.any(dim=1, keepdim=True)
+        return bool((~self.visibility & (generated | given)).any())
 
     def padded(self, agents: int) -> Stage:
         """The same with free slots added, of which nothing is known and nothing is generated."""

@@ -121,3 +121,23 @@ def test_training_with_it_rolls_out_as_often_as_asked(tmp_path, precision, start
 def test_wrong_options_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         RollOuts(**wrong)
+
+
+OTHERS = ("partner_prediction", "motion_control", "partner_inpainting", "generation", "inbetweening")
+
+
+@pytest.mark.parametrize("task", OTHERS)
+def test_only_tasks_that_go_on_from_a_past_are_rolled_out(task):
+    with pytest.raises(ValueError, match=f"tasks: got {task}, expected tasks that make everybody's future"):
+        RollOuts(tasks=(task,))
+    with pytest.raises(ValueError, match="tasks: got none"):
+        RollOuts(tasks=())
+
+
+def test_people_who_take_turns_are_rolled_out(made):
+    batch, _, model = made
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2, tasks=("agentic_async",))
+    rolling.keep(batch)
+    pasts = rolling.rolled_out(model, batch, torch.Generator().manual_seed(1))
+    assert pasts.scenes.frames == FRAMES and pasts.scenes.T_world_root.isfinite().all()
+    assert not torch.equal(pasts.scenes.T_world_root, made[1].scenes.T_world_root)

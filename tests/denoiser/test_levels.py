@@ -110,9 +110,14 @@ def test_live_levels_ask_what_each_live_task_asks(generator):
 
 def test_a_live_past_is_faint_for_those_who_are_not_given(generator):
     levels = live_levels(4000, 16, 2, generator, faint=1.0)
-    assert ((levels[:, 0] > 0) & (levels[:, 0] <= FAINT)).any()
-    given = (levels == 0).sum(dim=1) > (levels > 0).any(dim=2).double().argmax(dim=1)[:, None]  # also in the block
-    assert given.any()
+    dark = (levels == LEVELS).all(dim=2)
+    begins = torch.where(dark.any(dim=1), dark.double().argmax(dim=1), 16) - 1  # the block's last
+    last = levels[torch.arange(4000), begins]
+    given = (last == 0) & ~(last == 0).all(dim=1, keepdim=True)
+    past = torch.arange(16)[:, None] < begins[:, None, None]
+    faint = ((levels > 0) & (levels <= FAINT) & past).any(dim=1)
+    assert given.any() and not faint[given].any()
+    assert float(faint[last == LEVELS].double().mean()) > 0.75
 
 
 def test_a_share_of_the_roll_outs_is_live(generator):

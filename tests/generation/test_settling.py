@@ -21,6 +21,7 @@ from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
 from magnet.generation.settling import (
     GLIDE,
+    LOOSELY,
     PACE,
     Corrected,
     carried_on,
@@ -94,15 +95,18 @@ def test_what_is_not_given_is_not_read(model, name) -> None:
     assert torch.equal(plain.T_world_root, made.T_world_root) and torch.equal(plain.body_rot, made.body_rot)
 
 
-def test_scenes_do_not_depend_on_those_beside_them(model) -> None:
+@pytest.mark.parametrize("metres, off", [(0.0, 0.03), (1.5, 2e-3)])
+def test_scenes_do_not_depend_on_those_beside_them(model, metres, off) -> None:
+    """But for rounding, which grows where people who stay in each other are corrected anew."""
     scenes = random_scene(2, 40, 2, torch.Generator().manual_seed(5))
+    scenes.T_world_root[:, :, 1, 0, 3] += metres
 
     def sampled(rows: list[int]) -> Scene:
         generators = [torch.Generator().manual_seed(row) for row in rows]
         return generate(model, scenes.select(rows), registry.get("joint_future")(), 16, 24, 1, BOTH, generators)
 
     together, alone = sampled([0, 1]), sampled([1])
-    assert torch.allclose(together.T_world_root[1], alone.T_world_root[0], atol=2e-3)
+    assert torch.allclose(together.T_world_root[1], alone.T_world_root[0], atol=off)
 
 
 def test_it_goes_together_with_history_guidance_and_rolling(model) -> None:
@@ -231,6 +235,26 @@ def test_what_is_left_deep_in_a_finished_chunk_is_corrected_more_loosely(monkeyp
     assert depth(once) > 0.10 > 0.08 > depth(made)
     assert torch.equal(made.T_world_root[1], once.T_world_root[1])  # other scenes stay as they were
     assert torch.equal(made.T_world_root[:, :, 1], running.T_world_root[:, :, 1])
+    monkeypatch.setattr(settling, "TOO_DEEP", Apart(body=0.08, arms=0.08))
+    root[0, :, 0, 0, 3] = root[0, :, 1, 0, 3] + (torch.arange(40) - 20) / 30 * 2.0  # slower, for longer
+    walking = still.replace(T_world_root=root)
+    monkeypatch.setattr(settling, "LOOSELY", LOOSELY[:1])
+    less, _ = settled_chunk(walking, fixed, "firm", None)
+    monkeypatch.setattr(settling, "LOOSELY", LOOSELY)
+    assert depth(less) > 0.08 > depth(settled_chunk(walking, fixed, "firm", None)[0])
+
+
+def test_people_who_may_not_be_moved_are_not_corrected_anew(monkeypatch) -> None:
+    """Two who are given stand in each other, then a metre apart, where they may be moved."""
+    scene = standing(1, 40, 2, torch.device("cpu"))
+    root = scene.T_world_root.clone()
+    root[0, :20, 0, :3, 3] = root[0, :20, 1, :3, 3] + torch.tensor([0.1, 0.0, 0.0])
+    scene, fixed = scene.replace(T_world_root=root), (torch.arange(40) < 20)[:, None].expand(-1, 2)
+    calls: list[int] = []
+    plain = settling.settling
+    monkeypatch.setattr(settling, "settling", lambda *words, **more: calls.append(1) or plain(*words, **more))
+    settled_chunk(scene, fixed, "firm", None)
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize("known", [True, False])

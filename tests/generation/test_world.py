@@ -1,25 +1,28 @@
 """The world of a scene whose rows come and go."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 
 from magnet.generation.blending import freeze_after
-from magnet.generation.causal_bodies import seen_by
+from magnet.generation.causal_bodies import seen_by, shown_to
 from magnet.generation.conditioning import known_tokens, mask_unknown
+from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions, Settling
 from magnet.sampling.sampler import sample
-from magnet.sampling.schedule import Grid
+from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.base import Task
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation
 from magnet.tasks.partner import MotionControl, PartnerInpainting, PartnerPrediction
-from magnet.testing import without_absent
+from magnet.testing import random_scene, without_absent
 from tests.cases import few, some_slow
 
 OPTIONS = SamplerOptions(steps=2, stride=2)
@@ -205,10 +208,43 @@ def test_relations_between_agents_who_saw_nothing_of_each_other_do_not_count_as_
         assert stats.pairwise_drifts == 2 * 2 * pairs
 
 
+@dataclass(frozen=True)
+class Blind:
+    """Agent 0 is generated and shown nothing of agent 1's block, though that is given."""
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        unknown = (torch.arange(grid.agents) == 0) & ~grid.past()
+        unseen = torch.zeros(grid.agents, grid.agents, dtype=torch.bool)
+        unseen[0, 1] = True
+        return MaskSchedule.autoregressive(~unknown, unknown, grid, unseen=unseen, lookahead=False)
+
+
+@pytest.mark.parametrize("settle", ["off", "firm"])
+def test_what_is_given_and_hidden_moves_nobody(model, settle):
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(4))
+    other = scene.T_world_root.clone()
+    other[:, 12:, 1, :3, 3] = scene.T_world_root[:, 12:, 0, :3, 3]  # in the middle of where agent 0 is
+    options = SamplerOptions(steps=2, settle=settle, any_floor=True)
+    once, again = (
+        generate(model, each, Blind(), 12, 4, 1, options, torch.Generator().manual_seed(0))
+        for each in (scene, scene.replace(T_world_root=other))
+    )
+    assert torch.equal(once.T_world_root[:, :, 0], again.T_world_root[:, :, 0])
+
+
+def shown_by(task: Task) -> torch.Tensor:
+    """Whose part of a block each agent is shown by the plan's last stages."""
+    saw = torch.ones(3, 3, dtype=torch.bool)
+    for stage in task.schedule(Grid(TOKENS, 3, 3, 4, 8, 2)).stages:
+        saw = shown_to(stage, saw)
+    return saw
+
+
 @pytest.mark.parametrize(
     "task, expected",
     [
         (MotionControl((0,)), [(0, 1), (0, 2)]),
+        (Blind(), [(0, 2)]),
         (AgenticSync(), []),
         (AgenticAsync(), [(1, 0), (2, 0), (2, 1)]),
         (AgenticAsync(order=(2,)), [(0, 2), (1, 0), (1, 2)]),
@@ -218,5 +254,6 @@ def test_relations_between_agents_who_saw_nothing_of_each_other_do_not_count_as_
 )
 def test_a_block_is_corrected_by_what_was_given_or_finished_before_it(model, scene, task, expected):
     world, _ = told(model, scene, task, "fuse", 3, settle="firm")
+    world.saw = shown_by(task)
     for row in range(3, TOKENS):
         assert seen_by(world, slice(row, row + 1)).nonzero().tolist() == [list(pair) for pair in expected]
