@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool1d, max_pool1d
 
 from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
@@ -38,6 +39,9 @@ SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10
 
 PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, lift=10.0, stand=16.0, hold=2.0, hard=20.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
+
+REACH = 6
+"""Frames before and after a moment that is corrected more loosely."""
 
 LEFT, TOO_DEEP = Apart(body=0.07, arms=0.07), Apart(body=0.08, arms=0.08)
 """Metres of depth that `SHOWN` may leave, and `FINISHED`."""
@@ -162,13 +166,15 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
     for looser in LOOSELY:
-        deep = left_deep(made, body, TOO_DEEP, still)
+        frames = left_deep(made, body, TOO_DEEP, still)
+        deep = frames.any(dim=1)
         if not bool(deep.any()):
             break
         few = shaped.select(deep.nonzero()[:, 0])
         stay = still[deep] if still.ndim == 3 and len(still) == len(deep) else still
         past_few, held_few = (None if each is None else each[deep] for each in (before, holding))
-        offset[deep] = settling(few, body, how, stay, looser, begun, past_few, holding=held_few)
+        loose = settling(few, body, how, stay, looser, begun, past_few, holding=held_few)
+        offset[deep] = torch.lerp(offset[deep], loose, around(frames[deep])[..., None, None].to(loose))
         made = corrected(shaped, offset)
     held = hands_held(made, body) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
@@ -196,7 +202,7 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
-    deep = left_deep(corrected(seen, offset), body, LEFT, fixed)
+    deep = left_deep(corrected(seen, offset), body, LEFT, fixed).any(dim=1)
     if bool(deep.any()):
         before, hold = (None if each is None else each[deep] for each in (past, holding))
         ends = None if last is None else (last[0][deep], last[1][deep])
@@ -206,7 +212,7 @@ def own_correction(
 
 
 def left_deep(scene: Scene, body: Body, allowed: Apart, fixed: Tensor) -> Tensor:
-    """In which scenes two people, not both of them fixed, are deeper in each other than allowed. -> (B,) bool
+    """In which frames two people, not both of them fixed, are deeper in each other than allowed. -> (B, T) bool
 
     fixed (T, P) or (B, T, P) bool
     """
@@ -214,7 +220,13 @@ def left_deep(scene: Scene, body: Body, allowed: Apart, fixed: Tensor) -> Tensor
     first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
     free = ~(fixed[..., first] & fixed[..., second]).to(scene.device)
     both = (scene.present[:, first] & scene.present[:, second])[:, None] & free
-    return ((excess_depth(joints[:, :, first], joints[:, :, second], allowed) > 0) & both).flatten(1).any(dim=1)
+    return ((excess_depth(joints[:, :, first], joints[:, :, second], allowed) > 0) & both).any(dim=2)
+
+
+def around(frames: Tensor) -> Tensor:
+    """1 up to `REACH` frames from those that are marked, falling to 0 over twice as many more. (B, T) bool -> (B, T)"""
+    near = max_pool1d(frames.double(), 4 * REACH + 1, 1, 2 * REACH)
+    return avg_pool1d(near, 2 * REACH + 1, 1, REACH, count_include_pad=False)
 
 
 def settled_on(

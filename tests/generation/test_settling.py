@@ -23,7 +23,9 @@ from magnet.generation.settling import (
     GLIDE,
     LOOSELY,
     PACE,
+    REACH,
     Corrected,
+    around,
     carried_on,
     hands_held,
     held_on,
@@ -335,3 +337,13 @@ def test_nobody_makes_way_for_whom_nothing_is_known_of(model) -> None:
     assert not torch.equal(expected.T_world_root[:, :, 0], both.T_world_root[:, :, 0])
     assert torch.equal(made.T_world_root[:, :, 0], expected.T_world_root[:, :, 0])
     assert torch.equal(made.T_world_root[:, :, 1], plain.T_world_root[:, :, 1])
+
+
+def test_only_frames_around_a_moment_are_corrected_more_loosely() -> None:
+    frames = torch.zeros(2, 60, dtype=torch.bool)
+    frames[0, 30] = True
+    share = around(frames)
+    assert share.shape == (2, 60) and not share[1].any()
+    assert (share[0, 30 - REACH : 31 + REACH] == 1).all()
+    assert (share[0, : 30 - 3 * REACH] == 0).all() and (share[0, 31 + 3 * REACH :] == 0).all()
+    assert (share[0, 30:].diff() <= 0).all() and (share[0, :31].diff() >= 0).all()
