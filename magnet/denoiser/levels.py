@@ -33,7 +33,8 @@ LIVE_ROLES = (0.45, 0.33, 0.22)
 """Shares, in live scenes, of agents who are generated, given as far as the block reaches, and hidden from it on."""
 
 UNKNOWN_AFTER = 3
-"""Token steps of unknown future that live tasks show after a block (`magnet.sampling.schedule.AHEAD`)."""
+"""Token steps of unknown future that live tasks show after a block at least (`magnet.sampling.schedule.AHEAD`); in
+strides of twelve, as `duet` goes, they show seven."""
 
 FAINT = 300
 """Highest level at which a past is shown faintly."""
@@ -143,7 +144,7 @@ def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float
 
     Each agent is generated, given as far as the block reaches (motion control, and whoever had the turn before), or
     hidden from the block on (in step, and whoever has the turn after); at least one is generated. The block is most
-    often where a window that moves along has it. The past of those who are not given is faint as in `rollout_levels`.
+    often where a window that moves along has it in short strides. The past of those who are not given is faint as in `rollout_levels`.
     """
     device = generator.device
     draw = torch.rand(6, B, 1, 1, generator=generator, device=device)
