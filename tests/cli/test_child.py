@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,8 @@ def test_who_is_interrupted_saves_before_it_ends(number: int, tmp_path: Path) ->
     (tmp_path / "child.py").write_text(SAVES_SLOWLY)
     (tmp_path / "waits.py").write_text(WAITS)
     root = {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    waits = subprocess.Popen([sys.executable, "waits.py"], cwd=tmp_path, env=os.environ | root)
+    heeded = partial(signal.signal, number, signal.SIG_DFL)  # a shell's background job ignores SIGINT
+    waits = subprocess.Popen([sys.executable, "waits.py"], cwd=tmp_path, env=os.environ | root, preexec_fn=heeded)
     while not (tmp_path / "ready").exists():
         assert waits.poll() is None
         time.sleep(0.02)
