@@ -144,7 +144,8 @@ def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float
 
     Each agent is generated, given as far as the block reaches (motion control, and whoever had the turn before), or
     hidden from the block on (in step, and whoever has the turn after); at least one is generated. The block is most
-    often where a window that moves along has it in short strides. The past of those who are not given is faint as in `rollout_levels`.
+    often where a window that moves along has it in short strides. The past of those who are not given is faint as in
+    `rollout_levels`.
     """
     device = generator.device
     draw = torch.rand(6, B, 1, 1, generator=generator, device=device)
