@@ -6,8 +6,8 @@ Nobody need watch it. Each stage is `magnet fit` with its configuration in confi
 `--out`. The stage `on` goes on from the denoiser, `again` from the mean of the weights before and after `on`. From the
 mean of the weights before and after `again` the sisters (`SISTERS`) go on, each for itself, and the mean of it, twice,
 and them is released. Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is
-run again; a stage that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2 first=2
-decoder=2` rehearses it to the end.
+run again; a stage that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2
+first=2 decoder=2` rehearses it to the end.
 """
 
 from __future__ import annotations
