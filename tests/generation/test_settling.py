@@ -97,18 +97,15 @@ def test_what_is_not_given_is_not_read(model, name) -> None:
     assert torch.equal(plain.T_world_root, made.T_world_root) and torch.equal(plain.body_rot, made.body_rot)
 
 
-@pytest.mark.parametrize("metres, off", [(0.0, 0.03), (1.5, 2e-3)])
-def test_scenes_do_not_depend_on_those_beside_them(model, metres, off) -> None:
-    """But for rounding, which grows where people who stay in each other are corrected anew."""
+def test_scenes_do_not_depend_on_those_beside_them(model) -> None:
     scenes = random_scene(2, 40, 2, torch.Generator().manual_seed(5))
-    scenes.T_world_root[:, :, 1, 0, 3] += metres
 
     def sampled(rows: list[int]) -> Scene:
         generators = [torch.Generator().manual_seed(row) for row in rows]
         return generate(model, scenes.select(rows), registry.get("joint_future")(), 16, 24, 1, BOTH, generators)
 
     together, alone = sampled([0, 1]), sampled([1])
-    assert torch.allclose(together.T_world_root[1], alone.T_world_root[0], atol=off)
+    assert torch.allclose(together.T_world_root[1], alone.T_world_root[0], atol=2e-3)
 
 
 def test_it_goes_together_with_history_guidance_and_rolling(model) -> None:
