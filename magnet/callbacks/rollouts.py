@@ -83,8 +83,8 @@ class RollOuts(Callback):
             raise ValueError("tasks: got none, expected at least one")
         self.tasks = [registry.get(task)() for task in tasks]
         for name, task in zip(tasks, self.tasks, strict=True):
-            plan, grid = task.schedule(GOING_ON), GOING_ON
-            if not torch.equal(plan.known, grid.past()) or not bool(plan.finished.all()):
+            plan = task.schedule(GOING_ON)
+            if not torch.equal(plan.known, GOING_ON.past()) or not bool(plan.finished.all()):
                 raise ValueError(f"tasks: got {name}, expected tasks that make everybody's future from a past alone")
         self.kept: list[Scene] = []
         self.filled, self.start = -1, start

@@ -38,7 +38,6 @@ class World(Protocol):
     given: Scene
     known: Tensor
     placed: Tensor
-    turn: Tensor
     saw: Tensor
     T_world_can: Tensor
     finalized: int
@@ -130,7 +129,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
 
 
 def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None) -> Scene:
-    """Bodies of the token steps up to `stop` corrected, each person's by what was final of others before, or `seen_by`.
+    """Bodies of the token steps up to `stop` corrected, each person's by what was final of others before, or shown.
 
     Frames of `made` after them are what the corrections will have to go on to; they are not returned. told (P,) bool,
     whose they are; None: everybody's.
@@ -143,33 +142,23 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     seen = 1 + PACE if world.correction is not None else RECALLED
     before = world.given.slice(max(first - seen, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
-    sees = seen_by(world, rows).to(new.device)
+    sees = (world.saw & world.placed[rows].all(dim=0)).to(new.device)
     made, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected)
     world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
     return made.slice(0, own)
 
 
 def shown_to(stage: Stage, before: Tensor) -> Tensor:
-    """Whose part of the block each agent that a stage generates is shown; of others what was before. (P, P) bool
+    """Whose part of the block each agent that a stage generates is shown clean; of others what was before. (P, P) bool
 
-    [p, q]: p is shown q's.
+    [p, q]: p is shown q's, which was given or finished in an earlier stage.
     """
-    if stage.visibility is None and bool(before.all()):
-        return before
     active = stage.levels[0] != stage.levels[-1]  # (W, P)
     rows, moves = active.any(dim=1), active.any(dim=0)
-    seen = torch.ones_like(before) if stage.visibility is None else stage.visibility[:, rows].all(dim=1)
+    seen = (stage.levels[0, rows] == 0).all(dim=0).expand_as(before)
+    if stage.visibility is not None:
+        seen = seen & stage.visibility[:, rows].all(dim=1)
     return torch.where(moves[:, None], seen, before)
-
-
-def seen_by(world: World, rows: slice) -> Tensor:
-    """Whose part of a block each agent may look at: given or finished in an earlier stage, and shown. -> (P, P) bool
-
-    [p, q]: p may look at q's.
-    """
-    turn = world.turn[rows]
-    there = (world.known[rows] | (turn > 0)) & world.placed[rows]
-    return ((turn[:, None] < turn[:, :, None]) & there[:, None]).all(dim=0) & world.saw
 
 
 def finalized_bodies(world: World, tokens: Tensor, first: int, stop: int) -> Scene:

@@ -71,14 +71,12 @@ class WorldState:
         self.given = given.repeat(samples)
         self.there = self.given.present.any(dim=0).nonzero()[:, 0]  # slots that somebody is in
         self.placed = self.known.clone()
-        self.turn = torch.zeros_like(self.known, dtype=torch.long)  # the stage that finished a token; 0: given or told
         self.saw = torch.ones(self.known.shape[1], self.known.shape[1], dtype=torch.bool)  # see `shown_to`
         # Recorded across the border of two known tokens; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.since: Tensor | None = None  # token steps to the first row from each one's last given one before it
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
-        self.settles = self.causal and self.settle is not None  # block by block
         self.correction: Corrected | None = None  # of the last two frames shown, in causal plans; in others:
         self.chunk: Corrected | None = None
         self.uncorrected: Scene | None = None  # those frames of a causal plan without it
@@ -91,7 +89,6 @@ class WorldState:
         """Add rows at the end. given (B, 4 n), known (n, P)"""
         self.given = cat_time([self.given, given := given.repeat(self.samples)])
         self.known, self.placed = torch.cat([self.known, known]), torch.cat([self.placed, known])
-        self.turn = torch.cat([self.turn, torch.zeros_like(known, dtype=torch.long)]) if self.settles else self.turn
         self.T_world_can = torch.cat([self.T_world_can, canonical_frame(given.T_world_root)], dim=1)
 
     def release(self, rows: int) -> None:
@@ -105,7 +102,6 @@ class WorldState:
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows
         self.known, self.placed = self.known[rows:], self.placed[rows:]
-        self.turn = self.turn[rows:] if self.settles else self.turn
         self.T_world_can, self.given = self.T_world_can[:, frames:], self.given.slice(frames)
 
     @torch.inference_mode()
@@ -128,8 +124,6 @@ class WorldState:
             if self.stats is not None:
                 self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
             latent = torch.where(new[..., None], code, latent)
-        if self.settles:
-            self.turn = torch.where(finished.cpu(), int(self.turn.max()) + 1, self.turn)
         placement = "integrate" if decentralized else self.options.placement
         moved = self._place_all(deltas, pairs if layout.slots else None, finished, first, stop, placement)
         if self.steer is not None:
@@ -157,6 +151,10 @@ class WorldState:
         tokens[:, begin:stop] = torch.where(changed, normalizer.normalize(settled), tokens[:, begin:stop])
         return self._enter(tokens, begin, stop)
 
+    def _unseen(self, row: int) -> Tensor:
+        """Who is given at a token step and not shown to everybody whose block it is. -> (P,) bool"""
+        return self.known[row] & ~self.saw.all(dim=0) if self.causal else torch.zeros_like(self.known[row])
+
     def _separate(
         self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
     ) -> None:
@@ -177,7 +175,7 @@ class WorldState:
             self.options.apart,
             bool(lead),
             self.known[low:stop].to(latent.device),
-            (self.known[first] & ~self.saw.all(dim=0)).to(latent.device),
+            self._unseen(first).to(latent.device),
             decentralized,
         )
 
@@ -193,7 +191,7 @@ class WorldState:
         low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
         new, known = new.to(latent.device), self.known[low:stop].to(latent.device)
-        T_world_can, unseen = self.T_world_can[:, frames], (self.known[first] & ~self.saw.all(dim=0)).to(latent.device)
+        T_world_can, unseen = self.T_world_can[:, frames], self._unseen(first).to(latent.device)
         rest = self.given.slice(frames.start, frames.stop), new, known, unseen, self.settle, lead, decentralized
         deltas = self.placed_deltas(low, stop)
         plain, made = settled_block(self.model.tokenizer.decode, latent, deltas, T_world_can, *rest)
