@@ -32,8 +32,8 @@ LOOSELY = (
     Settle(iterations=12, inner=120, bend=30.0, root=5.0, hold=2.0, hard=10.0),
     Settle(iterations=16, inner=120, bend=5.0, root=3.0, hold=1.0, hard=40.0),
 )
-"""How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another. With fewer inner steps what
-is rounded otherwise in another batch moves people by a centimetre."""
+"""How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another. With fewer inner steps
+what is rounded otherwise in another batch moves people by a centimetre."""
 
 SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
