@@ -148,6 +148,12 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     return made.slice(0, own)
 
 
+def shown(world: World, stage: Stage) -> Tensor:
+    """`shown_to` in a world that corrects poses or places; in others nobody asks, and a live answer has no time."""
+    corrects = world.settle is not None or world.options.apart != "off"
+    return shown_to(stage, world.saw) if corrects else world.saw
+
+
 def shown_to(stage: Stage, before: Tensor) -> Tensor:
     """Whose part of the block each agent that a stage generates is shown clean; of others what was before. (P, P) bool
 

@@ -15,7 +15,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
-from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view, shown_to
+from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view, shown
 from magnet.generation.conditioning import (
     Encoders,
     known_tokens,
@@ -256,7 +256,7 @@ class Rollout:
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
-        self._ahead, self.begins, self.world.saw = stage.ahead, stage.start, shown_to(stage, self.world.saw)
+        self._ahead, self.begins, self.world.saw = stage.ahead, stage.start, shown(self.world, stage)
         self._ask_for(stage)
         guidance = self.options.guidance
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
