@@ -194,6 +194,7 @@ class Sampling:
         noise_scale: standard deviation of the new noise in each denoising step.
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
+        stabilization_beside: a higher such level for people beside somebody whose motion is given.
     """
 
     stride: int | None = None
@@ -204,6 +205,7 @@ class Sampling:
     noise_scale: float | None = None
     stabilization_level: int | None = None
     stabilization_after: int = 0
+    stabilization_beside: int | None = None
 
     def __post_init__(self) -> None:
         SamplerOptions().filled(self)  # which refuses what no sampler takes

@@ -33,7 +33,7 @@ from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import dtype_of
 from magnet.sampling.grid import planning_grid
-from magnet.sampling.guidance import shown_clean
+from magnet.sampling.guidance import faint_levels
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
@@ -256,9 +256,9 @@ class Rollout:
 
     @torch.no_grad()
     def _run(self, stage: Stage) -> None:
-        self._ahead, self.begins, self.world.saw = stage.ahead, stage.start, shown(self.world, stage)
+        world, self._ahead, self.begins = self.world, stage.ahead, stage.start
+        world.saw = shown(world, stage)
         self._ask_for(stage)
-        guidance = self.options.guidance
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             self.tokens = run_stages(
@@ -266,21 +266,21 @@ class Rollout:
                 [dataclasses.replace(stage, start=stage.start - self.first)],
                 self.tokens,
                 self.mask_noise,
-                self.world.given.present,
+                world.given.present,
                 self.model.layout,
-                self.world.make_consistent,
+                world.make_consistent,
                 self.progress,
-                guidance,
+                self.options.guidance,
                 self.noise,
                 self.first,
                 self.history,
                 self.body_guidance,
-                shown_clean(self.world.known, guidance.stabilization_after, self.world.since)
-                if guidance.stabilization_level
-                else None,
+                functools.partial(
+                    faint_levels, self.options.guidance, world.known, since=world.since, live=world.causal
+                ),
             )
         self.reached = max(self.reached, stage.active[1])
-        if self.world.causal and self.expected.most:
+        if world.causal and self.expected.most:
             self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
 
     def _ask_for(self, stage: Stage) -> None:

@@ -39,6 +39,9 @@ class Guidance:
             clean. None: as the model is best sampled, or 0.
         stabilization_after: token steps after the last given one of the same person, or the beginning, that are shown
             clean too. Read where `stabilization_level` is said.
+        stabilization_beside: a higher such level for people beside somebody whose motion is given, in tasks that are
+            not live (partner inpainting): the given one tells more of where they are than a past that is a little
+            wrong, and which keeps them wrong. None: as the model is best sampled, or 0.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """
@@ -49,6 +52,7 @@ class Guidance:
     smooth: float = 0.0
     stabilization_level: int | None = None
     stabilization_after: int = 0
+    stabilization_beside: int | None = None
     cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -56,8 +60,9 @@ class Guidance:
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
         require_number("cond_weight", self.cond_weight, least=0)
-        if self.stabilization_level is not None:
-            require_whole("stabilization_level", self.stabilization_level, 0, LEVELS - 1)
+        for name in ("stabilization_level", "stabilization_beside"):
+            if getattr(self, name) is not None:
+                require_whole(name, getattr(self, name), 0, LEVELS - 1)
         require_whole("stabilization_after", self.stabilization_after, 0)
 
     def branches(self, there: Tensor) -> Tensor:
@@ -88,19 +93,19 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
-        sure: Tensor | None = None,
+        faint: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The noisy tokens that the next step starts from where it denoises, and the guided prediction.
 
         Smoothing changes the former. Arguments as for `predict` -> (B, W, P, D) twice
         """
         if not self.smooth:
-            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout, sure)
+            return tokens, self.predict(denoise, tokens, levels, present, mask_noise, layout, faint)
         # Lightning tests in inference mode, whose tensors no gradient may pass.
         with torch.inference_mode(False), torch.enable_grad():
             noisy = tokens.clone().requires_grad_()
             still = levels.clone(), present.clone(), mask_noise.clone()
-            clean = self.predict(denoise, noisy, *still, layout, sure)
+            clean = self.predict(denoise, noisy, *still, layout, faint)
             (slope,) = torch.autograd.grad(roughness(clean, still[1]), noisy)
         return tokens - self.smooth * slope, clean.detach()
 
@@ -112,7 +117,7 @@ class Guidance:
         present: Tensor,
         mask_noise: Tensor,
         layout: TokenLayout,
-        sure: Tensor | None = None,
+        faint: Tensor | None = None,
     ) -> Tensor:
         """Guided prediction; all branches run as one batch.
 
@@ -125,20 +130,19 @@ class Guidance:
             present: (B, P) bool.
             mask_noise: (B, W, P, D).
             layout: which numbers of a token share a level.
-            sure: (W, P) bool, tokens that `stabilization_level` leaves clean (`shown_clean`); None: none.
+            faint: (W, P) int, levels at which clean tokens are shown (`faint_levels`); None: 0, all are shown clean.
 
         Returns:
             (B, W, P, D).
         """
-        if self.kind == "none" and not self.stabilization_level:
+        if self.kind == "none" and faint is None:
             return denoise(tokens, levels, present)
         B, _, P, _ = tokens.shape
         there = present.any(dim=0)
         sees = self.branches(there)  # (K, P)
         clean = levels == 0
-        if self.stabilization_level:
-            unsure = clean if sure is None else clean & ~sure
-            told = torch.where(unsure, self.stabilization_level, levels)
+        if faint is not None:
+            told = torch.where(clean, faint, levels)
             tokens = noisier(tokens, mask_noise, *(layout.spread(layout.group_levels(x)) for x in (levels, told)))
             levels = told
         if len(sees) == 1:
@@ -169,6 +173,28 @@ class Guidance:
                 agent = torch.arange(P, device=tokens.device)
                 special = each[agent, :, :, agent].permute(1, 2, 0, 3)
         return cond + self.weight * (special - uncond)
+
+
+def faint_levels(
+    guidance: Guidance, known: Tensor, active: tuple[int, int], since: Tensor | None = None, live: bool = False
+) -> Tensor | None:
+    """Levels at which a stage that changes the rows `active` shows what is finished. (N, P) int, None: all clean
+
+    Args:
+        guidance: says how noisy.
+        known: (N, P) bool, tokens that were given; they are shown clean.
+        active: the first row and one past the last.
+        since: (P,) int, as for `shown_clean`.
+        live: whether poses are final as soon as their tokens are; then nobody's are fainter `beside` others.
+    """
+    levels = torch.zeros(known.shape, dtype=torch.long)
+    if guidance.stabilization_level:
+        levels[~shown_clean(known, guidance.stabilization_after, since)] = guidance.stabilization_level
+    if guidance.stabilization_beside and not live:
+        given = known[slice(*active)].all(dim=0)
+        beside = given.sum() > given.long()
+        levels[beside & ~known] = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
+    return levels if bool(levels.any()) else None
 
 
 def shown_clean(known: Tensor, after: int, since: Tensor | None = None) -> Tensor:

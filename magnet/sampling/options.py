@@ -165,10 +165,11 @@ class SamplerOptions:
             for each in fields(self)
             if getattr(self, each.name) is None and (scaled or each.name != "noise_scale")
         ]
-        guidance = self.guidance
+        guidance, open_levels = self.guidance, []
         if guidance.stabilization_level is None:
-            names = ("stabilization_level", "stabilization_after")
-            guidance = replace(guidance, **{name: getattr(best, name) for name in names if hasattr(best, name)})
+            open_levels += ["stabilization_level", "stabilization_after"]
+            open_levels += ["stabilization_beside"] * (guidance.stabilization_beside is None)
+        guidance = replace(guidance, **{name: getattr(best, name) for name in open_levels if hasattr(best, name)})
         named = {name: getattr(best, name) for name in left_open if hasattr(best, name)}
         return replace(self, guidance=guidance, **named)
 

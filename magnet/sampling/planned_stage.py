@@ -84,12 +84,12 @@ def run_planned_stage(
     first: int = 0,
     history: History | None = None,
     correct: Correct | None = None,
-    sure: Tensor | None = None,
+    faint: Tensor | None = None,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
 
-    `first` is the row of `noise` that the window begins with; `history` is that of the window; `sure` (W, P) bool are
-    tokens that are shown clean whatever the guidance. Agents that see the same share a view, and all views run as one
+    `first` is the row of `noise` that the window begins with; `history` is that of the window; `faint` (W, P) int
+    are the levels at which finished tokens are shown. Agents that see the same share a view, and all views run as one
     batch.
     """
     B, W, P, _ = tokens.shape
@@ -114,7 +114,7 @@ def run_planned_stage(
         if views is not None:
             shown = torch.where(unknown, mask_noise[:, None], tokens[:, None]).flatten(0, 1)
         each = levels.expand(B, V, W, P).flatten(0, 1)
-        pushed, clean = guidance.apply(denoise, shown, each, present, shown_noise, layout, sure)
+        pushed, clean = guidance.apply(denoise, shown, each, present, shown_noise, layout, faint)
         if guidance.smooth:
             part = torch.where(stays, part, read(pushed))
         clean = read(clean if correct is None else correct(clean, levels, hidden, first))

@@ -35,6 +35,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "smooth": 0.0,
             "stabilization_level": 0,
             "stabilization_after": 0,
+            "stabilization_beside": 0,
             "cond_weight": 0.0,  # the paper has no conditions
         },  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2

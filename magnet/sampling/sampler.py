@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import DenoiseFn, Guidance, shown_clean
+from magnet.sampling.guidance import DenoiseFn, Guidance, faint_levels
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.planned_stage import Correct, run_planned_stage
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver
+
+Faint = Callable[[tuple[int, int]], Tensor | None]
+"""From the rows that a stage changes, the levels at which finished tokens are shown, as `faint_levels` has them."""
 
 StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was
@@ -73,7 +76,7 @@ def sample(
         guidance,
         noise,
         history=history,
-        sure=shown_clean(schedule.known, guidance.stabilization_after) if guidance else None,
+        faint=functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal) if guidance else None,
     )
 
 
@@ -98,19 +101,19 @@ def run_stages(
     offset: int = 0,
     history: History | None = None,
     correct: Correct | None = None,
-    sure: Tensor | None = None,
+    faint: Faint | None = None,
 ) -> Tensor:
     """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
     Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
     `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
-    `correct` changes what each step predicts; `sure` (N, P) bool are tokens that are shown clean whatever the guidance.
+    `correct` changes what each step predicts; `faint` says how noisy finished tokens are shown, `None`: clean.
     """
     tokens, guidance = tokens.clone(), guidance or Guidance()
-    plain = replace(guidance, stabilization_level=0)
     for stage in stages:
         window = slice(stage.start, stage.stop)
-        kept = None if sure is None or not guidance.stabilization_level else sure[window]
+        levels = None if faint is None else faint(stage.active)
+        levels = None if levels is None or not levels[window].any() else levels[window].to(tokens.device)
         tokens[:, window] = run_planned_stage(
             denoise,
             stage,
@@ -119,12 +122,12 @@ def run_stages(
             present,
             layout,
             progress,
-            plain if kept is not None and bool(kept.all()) else guidance,
+            guidance,
             noise,
             offset + stage.start,
             None if history is None else history.window(window),
             correct,
-            None if kept is None else kept.to(tokens.device),
+            levels,
         )
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)

@@ -43,6 +43,24 @@ def test_for_a_while_after_what_was_given_all_is_shown_clean(model) -> None:
     assert torch.equal(clean.T_world_root, never.T_world_root)
 
 
+@pytest.mark.parametrize("name", registry.names())
+def test_beside_somebody_given_what_was_made_is_shown_faintly_but_not_live(model, name) -> None:
+    """Of all tasks partner inpainting alone changes, and nothing before its second block does."""
+    start, task = random_scene(1, 64, 2, torch.Generator().manual_seed(4)), registry.get(name)()
+
+    def made(level: int | None) -> Scene:
+        options = SamplerOptions(3, 4, pyramid_offset=0, guidance=Guidance(stabilization_beside=level))
+        return generate(model, start, task, 8, 48, 1, options, torch.Generator().manual_seed(0))
+
+    clean, shaken = made(None), made(700)
+    if name != "partner_inpainting":
+        assert torch.equal(clean.T_world_root, shaken.T_world_root)
+        return
+    same = (clean.T_world_root == shaken.T_world_root).flatten(3).all(dim=-1)[0]
+    assert bool(same[:, 1].all()), "who is given stays"
+    assert bool(same[:12, 0].all()) and not bool(same[28:, 0].any())
+
+
 @pytest.mark.parametrize("name", ["joint_future", "motion_control"])
 def test_a_stream_knows_how_long_ago_somebody_was_given(model, name) -> None:
     """Rows that are let go hold what was given last; frames come as from one call."""

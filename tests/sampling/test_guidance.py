@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -5,7 +7,7 @@ from torch import Tensor
 from magnet.denoiser.options import Sampling
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.grid import planning_grid
-from magnet.sampling.guidance import Guidance, roughness
+from magnet.sampling.guidance import Guidance, faint_levels, roughness
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.planned_stage import run_planned_stage
@@ -115,7 +117,8 @@ def shown_at_level_40(tokens: Tensor, levels: Tensor, present: Tensor, mask_nois
         seen.append((noisy, shown))
         return model(noisy, shown, present)
 
-    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
+    faint = torch.full(levels.shape[1:], 40)
+    Guidance().predict(spy, tokens, levels, present, mask_noise, LAYOUT, faint)
     return seen[0]
 
 
@@ -135,18 +138,40 @@ def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(g
 def test_given_tokens_are_shown_clean_beside_finished_ones_that_are_not(given):
     """Agent 0's first two tokens were given; a model that is told less of what is sure would go on from it worse."""
     tokens, levels, present, mask_noise = given
-    sure = torch.zeros(levels.shape[1:], dtype=torch.bool)
-    sure[:2, 0] = True
+    known = torch.zeros(levels.shape[1:], dtype=torch.bool)
+    known[:2, 0] = True
+    guidance = Guidance(stabilization_level=40)
     seen = []
 
     def spy(noisy: Tensor, shown: Tensor, present: Tensor) -> Tensor:
         seen.append((noisy, shown))
         return model(noisy, shown, present)
 
-    Guidance(stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT, sure)
+    guidance.predict(spy, tokens, levels, present, mask_noise, LAYOUT, faint_levels(guidance, known, (4, 5)))
     (noisy, shown), own = seen[0], LAYOUT.groups() == 0
     assert (shown[:, :2, 0] == 0).all() and torch.equal(noisy[:, :2, 0, own], tokens[:, :2, 0, own])
     assert (shown[:, 2:4, 0] == 40).all() and (shown[:, :4, 1] == 40).all()
+
+
+def test_people_beside_somebody_given_are_shown_faintly_and_nobody_else():
+    """Agent 1 is given throughout, agents 0 and 2 from the fourth row on are made; agent 3 is nobody."""
+    known = torch.zeros(8, 4, dtype=torch.bool)
+    known[:, 1] = known[:3, 0] = known[:3, 2] = True
+    beside = Guidance(stabilization_level=40, stabilization_after=2, stabilization_beside=700)
+    levels = faint_levels(beside, known, (5, 8))
+    assert levels is not None
+    assert (levels[known] == 0).all() and (levels[3:, [0, 2, 3]] == 700).all()
+    known[6, 1] = False  # not given for all of the block that is made
+    assert faint_levels(beside, known, (5, 8)).tolist() == faint_levels(beside, known, (5, 8), live=True).tolist()
+    assert faint_levels(beside, known, (5, 8))[:, 0].tolist() == [0] * 5 + [40] * 3
+    assert (faint_levels(beside, known, (7, 8))[3:, 0] == 700).all()
+    assert faint_levels(beside, known, (7, 8), live=True).max() == 40  # for them continuity matters more
+    assert faint_levels(Guidance(), known, (5, 8)) is None
+    alone = torch.zeros(8, 2, dtype=torch.bool)
+    alone[:, 0] = True
+    assert (faint_levels(Guidance(stabilization_beside=9), alone, (0, 8))[:, 0] == 0).all()  # nobody beside oneself
+    with pytest.raises(ValueError, match="stabilization_beside: got 1000"):
+        Guidance(stabilization_beside=1000)
 
 
 def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
@@ -156,6 +181,13 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
     assert SamplerOptions(guidance=Guidance(stabilization_level=0)).filled(model).guidance.stabilization_level == 0
     assert SamplerOptions().filled(plain).guidance.stabilization_level is None
     assert SamplerOptions.preset("paper").filled(model).guidance.stabilization_level == 0
+    both = Sampling(stabilization_level=60, stabilization_beside=700)
+    assert SamplerOptions().filled(both).guidance == Guidance(stabilization_level=60, stabilization_beside=700)
+    less = Guidance(stabilization_beside=0)
+    assert SamplerOptions(guidance=less).filled(both).guidance == replace(less, stabilization_level=60)
+    clean = Guidance(stabilization_level=0)
+    assert SamplerOptions(guidance=clean).filled(both).guidance == clean
+    assert not SamplerOptions.preset("paper").filled(both).guidance.stabilization_beside
 
 
 def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
@@ -183,7 +215,8 @@ def test_a_forgotten_history_is_pure_noise_at_any_context_level(given):
         shown.append(seen)
         return model(noisy, seen, present)
 
-    Guidance("history", stabilization_level=40).predict(spy, tokens, levels, present, mask_noise, LAYOUT)
+    faint = torch.full(levels.shape[1:], 40)
+    Guidance("history").predict(spy, tokens, levels, present, mask_noise, LAYOUT, faint)
     assert set(shown[0][:, :4].unique().tolist()) == {40, LEVELS}
 
 
