@@ -51,8 +51,8 @@ class SamplerOptions:
             as the model is best sampled, or 1.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on validation scenes
-            (docs/experiments_duet1.md): deltas are far more certain than pairwise transforms, so a little is enough.
+        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on take 3: deltas are far more
+            certain than pairwise transforms, so a little is enough (docs/experiments_sampling.md).
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
@@ -102,7 +102,7 @@ class SamplerOptions:
     pyramid_offset: int | None = None
     turn: int | None = None
     placement: Placement = "fuse"
-    pairwise_weight: float = 0.02
+    pairwise_weight: float = 0.05
     apart: Separation = "off"
     body_guidance: Separation = "off"
     settle: Settling | None = None

@@ -241,6 +241,10 @@ class LiveApp(ViewerBase):
             self._update_play()
             apply()
 
+        def chosen(_: Any) -> None:
+            block.value = 1 if task.value == "agentic_sync" else 2  # who does not see two tokens of others meets them
+
+        task.on_update(chosen)
         for control in (task, steps, kind, weight, smooth, offset, block, running):
             control.on_update(apply)
 
