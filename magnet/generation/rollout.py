@@ -32,8 +32,8 @@ from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import dtype_of
+from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
-from magnet.sampling.guidance import faint_levels
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages

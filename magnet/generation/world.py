@@ -35,7 +35,7 @@ from magnet.motion.frames import (
 from magnet.motion.placement import Placement, place
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
-from magnet.sampling.guidance import steps_since
+from magnet.sampling.faint import steps_since
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried

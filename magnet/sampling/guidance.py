@@ -175,47 +175,6 @@ class Guidance:
         return cond + self.weight * (special - uncond)
 
 
-def faint_levels(
-    guidance: Guidance, known: Tensor, active: tuple[int, int], since: Tensor | None = None, live: bool = False
-) -> Tensor | None:
-    """Levels at which a stage that changes the rows `active` shows what is finished. (N, P) int, None: all clean
-
-    Args:
-        guidance: says how noisy.
-        known: (N, P) bool, tokens that were given; they are shown clean.
-        active: the first row and one past the last.
-        since: (P,) int, as for `shown_clean`.
-        live: whether poses are final as soon as their tokens are; then nobody's are fainter `beside` others.
-    """
-    levels = torch.zeros(known.shape, dtype=torch.long)
-    if guidance.stabilization_level:
-        levels[~shown_clean(known, guidance.stabilization_after, since)] = guidance.stabilization_level
-    if guidance.stabilization_beside and not live:
-        given = known[slice(*active)].all(dim=0)
-        beside = given.sum() > given.long()
-        levels[beside & ~known] = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
-    return levels if bool(levels.any()) else None
-
-
-def shown_clean(known: Tensor, after: int, since: Tensor | None = None) -> Tensor:
-    """Tokens that were given, or come within `after` token steps of one or of the beginning. (N, P) bool -> same
-
-    since (P,) int of `steps_since`, of the rows before; None: there are none.
-    """
-    row = torch.arange(len(known))[:, None]
-    last = torch.where(known, row, -1 if since is None else -since).cummax(dim=0).values
-    return row - last <= after
-
-
-def steps_since(known: Tensor, since: Tensor | None = None) -> Tensor:
-    """Token steps from each one's last given one, or the beginning, to the row after these. (N, P) bool -> (P,) int
-
-    since (P,) the same for the rows before; None: there are none.
-    """
-    row = torch.arange(len(known))[:, None]
-    return len(known) - torch.where(known, row, -1 if since is None else -since).amax(dim=0)
-
-
 def noisier(tokens: Tensor, noise: Tensor, now: Tensor, wanted: Tensor) -> Tensor:
     """Tokens of levels `now` brought to the levels `wanted` where these are higher. (..., D) each"""
     share = alpha_bar(wanted) / alpha_bar(now).clamp_min(1e-12)

@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import DenoiseFn, Guidance, faint_levels
+from magnet.sampling.faint import faint_levels
+from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import NoiseStream
 from magnet.sampling.planned_stage import Correct, run_planned_stage
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver
 
-Faint = Callable[[tuple[int, int]], Tensor | None]
-"""From the rows that a stage changes, the levels at which finished tokens are shown, as `faint_levels` has them."""
+Faint = Callable[[Stage], Tensor | None]
+"""The levels at which finished tokens are shown in a stage, as `faint_levels` has them."""
 
 StageCallback = Callable[[Tensor, Tensor, bool], Tensor]
 """Called after each stage with the tokens (B, N, P, D), which of them it finished (N, P) bool, and whether it was
@@ -112,8 +113,8 @@ def run_stages(
     tokens, guidance = tokens.clone(), guidance or Guidance()
     for stage in stages:
         window = slice(stage.start, stage.stop)
-        levels = None if faint is None else faint(stage.active)
-        levels = None if levels is None or not levels[window].any() else levels[window].to(tokens.device)
+        levels = None if faint is None else faint(stage)
+        levels = None if levels is None or not bool((shown := levels[window]).any()) else shown.to(tokens.device)
         tokens[:, window] = run_planned_stage(
             denoise,
             stage,

@@ -98,7 +98,7 @@ def test_what_is_not_given_is_not_read(model, name) -> None:
 
 
 def test_scenes_do_not_depend_on_those_beside_them(model) -> None:
-    scenes = random_scene(2, 40, 2, torch.Generator().manual_seed(5))
+    scenes = random_scene(2, 40, 2, torch.Generator().manual_seed(4))
 
     def sampled(rows: list[int]) -> Scene:
         generators = [torch.Generator().manual_seed(row) for row in rows]
@@ -125,7 +125,7 @@ def test_people_of_a_shipped_model_are_out_of_each_other() -> None:
     def depth(**how: Separation) -> float:
         """Centimetres beyond 5, mean over frames of the two who are worst."""
         model = replace(duet, sampler=replace(duet.sampler, steps=2, **how))
-        joints = body.joints(model.generate(people=3, frames=48, samples=2, seed=0).plain())
+        joints = body.joints(model.generate(people=3, frames=48, samples=2, seed=2).plain())
         pairs = [joints[:, :, pair].flatten(0, 1).unbind(1) for pair in ([0, 1], [0, 2], [1, 2])]
         worst = torch.stack([deepest(one, other)[:, 1] for one, other in pairs]).amax(dim=0)
         return 100 * float((worst - 0.05).clamp_min(0).mean())

@@ -7,7 +7,8 @@ import torch
 
 from magnet.generation.rollout import generate, stream
 from magnet.motion.scene import Scene, cat_time
-from magnet.sampling.guidance import Guidance, shown_clean, steps_since
+from magnet.sampling.faint import shown_clean, steps_since
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.joint import JointFuture

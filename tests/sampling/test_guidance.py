@@ -6,8 +6,9 @@ from torch import Tensor
 
 from magnet.denoiser.options import Sampling
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
-from magnet.sampling.guidance import Guidance, faint_levels, roughness
+from magnet.sampling.guidance import Guidance, roughness
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.planned_stage import run_planned_stage
@@ -147,10 +148,20 @@ def test_given_tokens_are_shown_clean_beside_finished_ones_that_are_not(given):
         seen.append((noisy, shown))
         return model(noisy, shown, present)
 
-    guidance.predict(spy, tokens, levels, present, mask_noise, LAYOUT, faint_levels(guidance, known, (4, 5)))
+    guidance.predict(
+        spy, tokens, levels, present, mask_noise, LAYOUT, faint_levels(guidance, known, changing(4, 5, known))
+    )
     (noisy, shown), own = seen[0], LAYOUT.groups() == 0
     assert (shown[:, :2, 0] == 0).all() and torch.equal(noisy[:, :2, 0, own], tokens[:, :2, 0, own])
     assert (shown[:, 2:4, 0] == 40).all() and (shown[:, :4, 1] == 40).all()
+
+
+def changing(first: int, stop: int, known: Tensor) -> Stage:
+    """A stage of one step that makes these rows."""
+    levels = torch.where(known, 0, LEVELS).repeat(2, 1, 1)
+    levels[:, :first] = 0
+    levels[1, first:stop] = 0
+    return Stage(0, levels)
 
 
 def test_people_beside_somebody_given_are_shown_faintly_and_nobody_else():
@@ -158,18 +169,23 @@ def test_people_beside_somebody_given_are_shown_faintly_and_nobody_else():
     known = torch.zeros(8, 4, dtype=torch.bool)
     known[:, 1] = known[:3, 0] = known[:3, 2] = True
     beside = Guidance(stabilization_level=40, stabilization_after=2, stabilization_beside=700)
-    levels = faint_levels(beside, known, (5, 8))
+    levels = faint_levels(beside, known, changing(5, 8, known))
     assert levels is not None
     assert (levels[known] == 0).all() and (levels[3:, [0, 2, 3]] == 700).all()
     known[6, 1] = False  # not given for all of the block that is made
-    assert faint_levels(beside, known, (5, 8)).tolist() == faint_levels(beside, known, (5, 8), live=True).tolist()
-    assert faint_levels(beside, known, (5, 8))[:, 0].tolist() == [0] * 5 + [40] * 3
-    assert (faint_levels(beside, known, (7, 8))[3:, 0] == 700).all()
-    assert faint_levels(beside, known, (7, 8), live=True).max() == 40  # for them continuity matters more
-    assert faint_levels(Guidance(), known, (5, 8)) is None
+    assert (
+        faint_levels(beside, known, changing(5, 8, known)).tolist()
+        == faint_levels(beside, known, changing(5, 8, known), live=True).tolist()
+    )
+    assert faint_levels(beside, known, changing(5, 8, known))[:, 0].tolist() == [0] * 5 + [40] * 3
+    assert (faint_levels(beside, known, changing(7, 8, known))[3:, 0] == 700).all()
+    assert faint_levels(beside, known, changing(7, 8, known), live=True).max() == 40  # for them continuity matters more
+    assert faint_levels(Guidance(), known, changing(5, 8, known)) is None
     alone = torch.zeros(8, 2, dtype=torch.bool)
     alone[:, 0] = True
-    assert (faint_levels(Guidance(stabilization_beside=9), alone, (0, 8))[:, 0] == 0).all()  # nobody beside oneself
+    assert (
+        faint_levels(Guidance(stabilization_beside=9), alone, changing(0, 8, alone))[:, 0] == 0
+    ).all()  # nobody beside oneself
     with pytest.raises(ValueError, match="stabilization_beside: got 1000"):
         Guidance(stabilization_beside=1000)
 
