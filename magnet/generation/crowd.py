@@ -119,7 +119,9 @@ class CrowdRollout(Rollout):
             self.settle = options.filled(model.sampling).settle or "off"
             self._settled: SettledGroups = {}
             self._sight = options.crowd_enter, options.crowd_leave
-            options = replace(options, settle="off", apart="firm" if options.apart == "off" else options.apart)
+            beside = replace(options.guidance, stabilization_beside=0)  # somebody who is given may be far away
+            apart = "firm" if options.apart == "off" else options.apart
+            options = replace(options, settle="off", apart=apart, guidance=beside)
         self.viewer, self.model = model, copy.copy(model)  # the same weights with tokens of another layout
         self.model.denoise = self._denoise_in_views  # type: ignore[method-assign, assignment]
         self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with

@@ -21,6 +21,7 @@ from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import inverse, pairwise, partners, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing import random_scene, standing_people, tiny_denoiser
@@ -278,3 +279,15 @@ def test_what_is_not_made_for_crowds_is_refused(model: Denoiser) -> None:
     refused("joint_future", "settle_blocks", settle_blocks=True)
     refused("joint_future", "body_guidance", body_guidance="light")
     refused("joint_future", "at most", people=201)
+
+
+def test_somebody_given_who_may_be_far_away_makes_nobody_s_past_faint(model: Denoiser) -> None:
+    """In a small group it does, beside whoever is given (test_stabilization.py)."""
+    scene, task = random_scene(1, 48, 6, torch.Generator().manual_seed(0)), registry.get("partner_inpainting")
+
+    def made(beside: int | None) -> Scene:
+        options = replace(QUICK, guidance=Guidance(stabilization_beside=beside))
+        generator = torch.Generator().manual_seed(0)
+        return generate_crowd(model, scene, task(target=(0, 1), own_past=True), 16, 32, 1, options, generator)
+
+    assert torch.equal(made(None).T_world_root, made(700).T_world_root)
