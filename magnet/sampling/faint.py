@@ -26,7 +26,7 @@ def faint_levels(
         sure = shown_clean(known, guidance.stabilization_after, since)
         levels = torch.where(sure, 0, guidance.stabilization_level)
     if guidance.stabilization_beside and not live:
-        given = known[slice(*stage.active)].all(dim=0)
+        given = known[stage.start : stage.stop].all(dim=0)
         beside = (given.sum() > given.long()) & ~known
         highest = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
         levels = torch.where(beside, highest, 0 if levels is None else levels)

@@ -39,9 +39,10 @@ class Guidance:
             clean. None: as the model is best sampled, or 0.
         stabilization_after: token steps after the last given one of the same person, or the beginning, that are shown
             clean too. Read where `stabilization_level` is said.
-        stabilization_beside: a higher such level for people beside somebody whose motion is given, in tasks that are
-            not live (partner inpainting): the given one tells more of where they are than a past that is a little
-            wrong, and which keeps them wrong. None: as the model is best sampled, or 0.
+        stabilization_beside: a higher such level for people beside somebody who is given throughout the window, in
+            tasks that are not live (partner inpainting), and not in crowds: the given one tells more of where they are
+            than a past that is a little wrong, and which keeps them wrong. None: as the model is best sampled where
+            `stabilization_level` is open too, or 0.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """

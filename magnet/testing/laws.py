@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
+from magnet.sampling.faint import faint_levels
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.sampler import begin, run_stages, sample
@@ -187,10 +189,14 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     tokens = begin(tokens, noise, schedule.known, layout)
     history = History.empty(tokens)
+    faint = (
+        None if guidance is None else functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal)
+    )
     last = max((n for n, stage in enumerate(schedule.stages) if stage.visibility is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
         before, past = tokens, history.copy()
-        tokens = run_stages(mixing, [stage], before, mask_noise, present, layout, guidance=guidance, history=history)
+        same = mask_noise, present, layout
+        tokens = run_stages(mixing, [stage], before, *same, guidance=guidance, history=history, faint=faint)
         if stage.visibility is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -208,13 +214,11 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
 
             # Smoothing follows what is said of everybody, in each agent's own view: not told by what is hidden.
             model = mixing if guidance is not None and guidance.smooth else lying
-            after = run_stages(
-                model, [stage], changed, mask_noise, present, layout, guidance=guidance, history=remembered
-            )
-            same = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
+            after = run_stages(model, [stage], changed, *same, guidance=guidance, history=remembered, faint=faint)
+            alike = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (every == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
-                _require(same[agent], f"{_place(task, grid)}: {message}")
+                _require(alike[agent], f"{_place(task, grid)}: {message}")
 
 
 def renaming_law(task: Task, renamed: Task, grid: Grid, order: Tensor) -> None:

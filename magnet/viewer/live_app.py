@@ -45,6 +45,11 @@ another frame; *drag its* hand or foot by their own arrows; give it a time, whic
 """
 
 
+def at_a_time(task: str) -> int:
+    """Tokens at a time with which a task begins: who does not see two tokens of the others walks into them."""
+    return 1 if task == "agentic_sync" else 2
+
+
 def add_guide(server: Any) -> None:
     """A button that opens the page."""
     button = server.gui.add_button("How to", icon="help")
@@ -201,7 +206,7 @@ class LiveApp(ViewerBase):
             weight = gui.add_slider("weight", 0.0, 3.0, 0.1, settings.guidance.weight)
             smooth = gui.add_slider("smoothing", 0.0, 0.1, 0.01, settings.guidance.smooth, hint="smoother, and slower")
             offset = gui.add_slider("offset of turns", 0.0, 1.0, 0.25, 1.0, visible=False)
-            block = gui.add_slider("tokens at a time", 1, 4, 1, 2, hint="a token is 4 frames")
+            block = gui.add_slider("tokens at a time", 1, 4, 1, at_a_time(settings.task), hint="a token is 4 frames")
             running = gui.add_checkbox("generate", True)
             number = gui.add_slider("how many people", 1, slots, 1, people)
             example = gui.add_dropdown("example", (NOTHING, *self.examples), initial_value=self.example)
@@ -242,7 +247,7 @@ class LiveApp(ViewerBase):
             apply()
 
         def chosen(_: Any) -> None:
-            block.value = 1 if task.value == "agentic_sync" else 2  # who does not see two tokens of others meets them
+            block.value = at_a_time(task.value)
 
         task.on_update(chosen)
         for control in (task, steps, kind, weight, smooth, offset, block, running):

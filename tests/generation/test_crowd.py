@@ -241,7 +241,7 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
 
 
 def test_each_sample_of_a_crowd_from_nothing_begins_anew_and_nothing_was_given(model: Denoiser) -> None:
-    made = magnet.api.Model(model, QUICK).generate(5, 12, samples=2, seed=0)
+    made = magnet.Model(model, QUICK).generate(5, 12, samples=2, seed=0)
     assert (made.scenes, made.frames, made.agents, made.context) == (2, 12, 5, 0)
     assert not torch.equal(made.T_world_root[0, 0], made.T_world_root[1, 0])
     assert len(made.betas[0].unique(dim=0)) == 5 and torch.equal(made.betas[0], made.betas[1])
