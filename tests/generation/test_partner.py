@@ -252,7 +252,8 @@ class Counting(torch.utils._python_dispatch.TorchDispatchMode):
 def test_an_answer_takes_the_same_work_however_long_the_past():
     model = tiny_denoiser(max_agents=2, window=8)
     scene = random_scene(1, 240, 2, torch.Generator().manual_seed(0))
-    partner = Partner(model, scene.slice(0, 32), (0,), SamplerOptions(steps=2, any_floor=True))
+    options = SamplerOptions(steps=2, any_floor=True)
+    partner = Partner(model, scene.slice(0, 32), (0,), options, torch.Generator().manual_seed(0))
     work = []
     for first in range(32, 240, 4):
         with Counting() as mode:
