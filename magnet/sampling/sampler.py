@@ -114,7 +114,8 @@ def run_stages(
     for stage in stages:
         window = slice(stage.start, stage.stop)
         levels = None if faint is None else faint(stage)
-        levels = None if levels is None or not bool((shown := levels[window]).any()) else shown.to(tokens.device)
+        if levels is not None:
+            levels = levels[window].to(tokens.device) if bool(levels[window].any()) else None
         tokens[:, window] = run_planned_stage(
             denoise,
             stage,

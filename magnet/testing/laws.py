@@ -189,9 +189,7 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     tokens = begin(tokens, noise, schedule.known, layout)
     history = History.empty(tokens)
-    faint = (
-        None if guidance is None else functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal)
-    )
+    faint = functools.partial(faint_levels, guidance or Guidance(), schedule.known, live=schedule.causal)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.visibility is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
         before, past = tokens, history.copy()
