@@ -197,7 +197,7 @@ class LeanTransformer:
                 whole = answer.new_zeros(len(x), x.shape[1] * x.shape[2], answer.shape[-1])
                 whole[:, asked] = answer
                 answer = whole
-            answer = answer.unflatten(1, (ends - begins, -1))
+            answer = answer.unflatten(1, (ends - begins, -1)).to(finished.dtype)  # bfloat16 under autocast on a GPU
             if scenes is None:
                 finished[:, begins:ends, slots] = answer
             else:

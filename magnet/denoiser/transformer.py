@@ -16,6 +16,9 @@ from magnet.denoiser.options import TransformerOptions
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
+FEW_SLOTS = 8
+"""Most agent slots that a GPU runs at once, whoever is in them; with more, the empty ones cost too much."""
+
 
 def sinusoids(values: Tensor, width: int, longest: float = 10_000.0) -> Tensor:
     """Sines and cosines of geometrically spaced frequencies. (...) -> (..., width)"""
@@ -29,11 +32,21 @@ def rotate(x: Tensor, time: Tensor, base: float = 10_000.0) -> Tensor:
 
     x (..., L, D) with D even, time (L,) -> same as x
     """
-    half = x.shape[-1] // 2
-    frequency = base ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
+    return rotated(x, *rotation(time, x.shape[-1], base))
+
+
+def rotation(time: Tensor, width: int, base: float = 10_000.0) -> tuple[Tensor, Tensor]:
+    """Cosines and sines by which `rotated` turns vectors of `width` numbers. time (L,) -> (L, width / 2) each"""
+    half = width // 2
+    frequency = base ** (-torch.arange(half, device=time.device, dtype=torch.float32) / half)
     angle = time[:, None].float() * frequency
-    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
-    a, b = x[..., :half], x[..., half:]
+    return angle.cos(), angle.sin()
+
+
+def rotated(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """`rotate` by a `rotation` that is known. x (..., L, D), cos and sin (L, D / 2) -> same as x"""
+    cos, sin = cos.to(x.dtype), sin.to(x.dtype)
+    a, b = x.chunk(2, dim=-1)
     return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
 
 
@@ -100,11 +113,15 @@ class TransformerBlock(nn.Module):
         self.norm_mlp = nn.LayerNorm(width)
         self.drop = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, time: Tensor, sees: Tensor | None = None) -> Tensor:
-        """x (B, L, d), time (L,), sees (L, L) or (B, 1, L, L) bool, whom each one sees; None: everybody -> (B, L, d)"""
-        query, key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        if self.rope_heads:
-            query, key = rotate(query, time), rotate(key, time)
+    def forward(self, x: Tensor, cos: Tensor, sin: Tensor, sees: Tensor | None = None) -> Tensor:
+        """x (B, L, d) -> (B, L, d)
+
+        cos, sin (L, d / heads / 2) each token's `rotation`; sees (L, L) or (B, 1, L, L) bool, whom each one sees; None:
+        everybody.
+        """
+        query_key, value = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).split([2, 1])
+        query, key = rotated(query_key, cos, sin) if self.rope_heads else query_key
+        value = value[0]
         dropout = self.dropout if self.training else 0.0
         with quick_to_train(query) if self.training else nullcontext():
             looked = F.scaled_dot_product_attention(query, key, value, attn_mask=sees, dropout_p=dropout)
@@ -195,8 +212,13 @@ class Transformer(nn.Module):
         return torch.where(known, embedded, self.no_cond)
 
     def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
-        """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)"""
-        if is_sharded(self.blocks[0]) or not self.in_groups:
+        """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)
+
+        Off a CPU all slots run at once while they are few: a GPU waits for the host to start each operator, not for
+        arithmetic, and would wait for it again to hear which groups there are.
+        """
+        at_once = x.device.type != "cpu" and x.shape[2] <= FEW_SLOTS
+        if is_sharded(self.blocks[0]) or not self.in_groups or at_once:
             return self._blocks_once(x, present)
         people = present.sum(dim=1)
         slots_in_use = (~present).int().argsort(dim=1, stable=True)
@@ -209,10 +231,7 @@ class Transformer(nn.Module):
             y = x[scenes, :, slots].transpose(1, 2).flatten(1, 2)  # (b, N * size, d)
             time = torch.arange(x.shape[1], device=x.device).repeat_interleave(size)
             sees = block_causal(time, self.options.causal_block) if self.options.causal_block else None
-            if self.options.rope == "hidden":
-                y = y + rotate(y, time)
-            for block in self.blocks:
-                y = block(y, time, sees)
+            y = self._through(y, time, sees)
             finished[scenes, :, slots] = y.unflatten(1, (-1, size)).transpose(1, 2).to(finished.dtype)
         return finished
 
@@ -225,9 +244,13 @@ class Transformer(nn.Module):
         sees = there | torch.eye(N * P, dtype=torch.bool, device=x.device)
         if self.options.causal_block:
             sees = sees & block_causal(time, self.options.causal_block)
-        y = x.flatten(1, 2)
+        return self._through(x.flatten(1, 2), time, sees).unflatten(1, (N, P))
+
+    def _through(self, y: Tensor, time: Tensor, sees: Tensor | None) -> Tensor:
+        """All blocks. y (b, L, d), time (L,), sees as in `TransformerBlock` -> (b, L, d)"""
         if self.options.rope == "hidden":
             y = y + rotate(y, time)
+        turn = rotation(time, self.options.width // self.options.heads)
         for block in self.blocks:
-            y = block(y, time, sees)
-        return y.unflatten(1, (N, P))
+            y = block(y, *turn, sees)
+        return y

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from magnet.checks import require_number, require_whole
-from magnet.denoiser.transformer import TransformerBlock, rotate
+from magnet.denoiser.transformer import TransformerBlock, rotated, rotation
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,12 @@ class CrossBlock(nn.Module):
 
     def forward(self, x: Tensor, partner: Tensor, sees: Tensor | None, sees_partner: Tensor | None) -> Tensor:
         """x (B, N, d), partner (B, M, d), sees (N, N) and sees_partner (N, M) bool; None: everything -> (B, N, d)"""
-        time, partners_time = (torch.arange(each.shape[1], device=x.device) for each in (x, partner))
-        x = self.own(x, time, sees)
-        query = rotate(self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), time)
+        width = x.shape[-1] // self.heads
+        turn, partners_turn = (rotation(torch.arange(each.shape[1], device=x.device), width) for each in (x, partner))
+        x = self.own(x, *turn, sees)
+        query = rotated(self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), *turn)
         key, value = self.key_value(partner).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        looked = F.scaled_dot_product_attention(query, rotate(key, partners_time), value, attn_mask=sees_partner)
+        looked = F.scaled_dot_product_attention(query, rotated(key, *partners_turn), value, attn_mask=sees_partner)
         return self.norm(x + self.out(looked.transpose(1, 2).flatten(-2)))
 
 

@@ -24,11 +24,13 @@ class WeightEMA(WeightAveraging):
         if not 0 <= decay < 1:
             raise ValueError(f"decay: got {decay}, expected 0 to 1")
 
-        def average(averaged: Tensor, current: Tensor, steps: Tensor | int) -> Tensor:
-            young = min(decay, (1 + float(steps)) / (10 + float(steps)))
-            return torch.lerp(averaged, current, 1 - young)
+        def average(averaged: list[Tensor], current: list[Tensor], steps: Tensor | int) -> None:
+            """All weights at once: on a GPU, one by one would wait for `steps` each time."""
+            done = float(steps)
+            young = min(decay, (1 + done) / (10 + done))
+            torch._foreach_lerp_(averaged, current, 1 - young)
 
-        super().__init__(use_buffers=False, avg_fn=average)
+        super().__init__(use_buffers=False, multi_avg_fn=average)
         self._own: dict[str, Tensor] | None = None  # weights of a training that has ended, before the average took over
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:

@@ -14,8 +14,21 @@ FASTEST = (3.4445, -4.7750, 2.0315)
 """Jordan's coefficients of the iteration, with which singular values come near 1 in five steps."""
 
 
-class Float32Muon(torch.optim.Muon):
-    """torch's Muon with its iteration in float32: torch's is in bfloat16, which a CPU without AVX-512 only emulates."""
+class StackedMuon(torch.optim.Muon):
+    """torch's Muon, for all matrices of one shape at once and in a chosen precision.
+
+    torch's iterates one matrix after the other, some thirty operators each, which a GPU starts more slowly than it
+    computes them, and always in bfloat16, which a CPU without AVX-512 only emulates.
+
+    Args:
+        matrices: what is trained.
+        dtype: in which the iteration runs.
+        **options: as torch's.
+    """
+
+    def __init__(self, matrices: list[nn.Parameter], dtype: torch.dtype, **options: Any) -> None:
+        super().__init__(matrices, **options)
+        self.dtype = dtype
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
@@ -24,30 +37,39 @@ class Float32Muon(torch.optim.Muon):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
+            shapes: dict[torch.Size, list[nn.Parameter]] = {}
             for matrix in group["params"]:
-                if matrix.grad is None:
-                    continue
-                state = self.state[matrix]
-                if not state:
-                    state["momentum_buffer"] = torch.zeros_like(matrix)
-                mean = state["momentum_buffer"].lerp_(matrix.grad, 1 - group["momentum"])
-                ahead = matrix.grad.lerp(mean, group["momentum"])
-                matrix.mul_(1 - group["lr"] * group["weight_decay"])
-                length = 0.2 * max(matrix.shape) ** 0.5  # as long as AdamW's steps are
-                matrix.sub_(orthogonal(ahead), alpha=group["lr"] * length)
+                if matrix.grad is not None:
+                    shapes.setdefault(matrix.shape, []).append(matrix)
+            for matrices in shapes.values():
+                self._step(matrices, group)
         return loss
+
+    def _step(self, matrices: list[nn.Parameter], group: dict[str, Any]) -> None:
+        """The step of matrices of one shape."""
+        for matrix in matrices:
+            if not self.state[matrix]:
+                self.state[matrix]["momentum_buffer"] = torch.zeros_like(matrix)
+        means = [self.state[matrix]["momentum_buffer"] for matrix in matrices]
+        grads = [matrix.grad for matrix in matrices]
+        torch._foreach_lerp_(means, grads, 1 - group["momentum"])
+        ahead = torch.stack(torch._foreach_lerp(grads, means, group["momentum"]))
+        torch._foreach_mul_(matrices, 1 - group["lr"] * group["weight_decay"])
+        length = 0.2 * max(matrices[0].shape) ** 0.5  # as long as AdamW's steps are
+        turned = orthogonal(ahead.to(self.dtype)).to(ahead.dtype)
+        torch._foreach_add_(matrices, list(turned.unbind()), alpha=-group["lr"] * length)
 
 
 def orthogonal(matrix: Tensor, steps: int = 5) -> Tensor:
-    """The matrix with all singular values near 1, by the Newton-Schulz iteration of Jordan 2024. (m, n) -> (m, n)"""
+    """Matrices with all singular values near 1, by the Newton-Schulz iteration of Jordan 2024. (..., m, n) -> same"""
     a, b, c = FASTEST
-    wide = matrix.shape[0] <= matrix.shape[1]
-    x = matrix if wide else matrix.T
-    x = x / x.norm().clamp_min(1e-7)
+    wide = matrix.shape[-2] <= matrix.shape[-1]
+    x = matrix if wide else matrix.mT
+    x = x / x.norm(dim=(-2, -1), keepdim=True).clamp_min(1e-7)
     for _ in range(steps):
-        gram = x @ x.T
+        gram = x @ x.mT
         x = a * x + (b * gram + c * gram @ gram) @ x
-    return x if wide else x.T
+    return x if wide else x.mT
 
 
 class MuonAdamW(torch.optim.Optimizer):
@@ -69,9 +91,13 @@ class MuonAdamW(torch.optim.Optimizer):
         matrices = [parameter for parameter in trained if parameter.ndim == 2]
         others = [parameter for parameter in trained if parameter.ndim != 2]
         quick = all(quick_bf16(matrix.device) for matrix in matrices)
-        self.muon = (torch.optim.Muon if quick else Float32Muon)(
-            matrices, lr=faster * lr, weight_decay=weight_decay / faster, adjust_lr_fn="match_rms_adamw"
-        )
+        on_cpu = all(matrix.device.type == "cpu" for matrix in matrices)
+        sharded = any(hasattr(matrix, "placements") for matrix in matrices)  # which cannot be stacked
+        muon = {"lr": faster * lr, "weight_decay": weight_decay / faster, "adjust_lr_fn": "match_rms_adamw"}
+        if (quick and on_cpu) or sharded:
+            self.muon = torch.optim.Muon(matrices, **muon)  # type: ignore[arg-type]
+        else:
+            self.muon = StackedMuon(matrices, torch.bfloat16 if quick else torch.float32, **muon)
         self.adamw = torch.optim.AdamW(others, lr=lr, weight_decay=weight_decay)
         super().__init__([*self.muon.param_groups, *self.adamw.param_groups], {})
 

@@ -6,9 +6,10 @@ from torch.nn import functional as F
 
 from magnet.denoiser import transformer
 from magnet.denoiser.options import TransformerOptions
-from magnet.denoiser.transformer import Transformer, block_causal, rotate, skipped
+from magnet.denoiser.transformer import Transformer, block_causal, rotate, rotation, skipped
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
+from tests.counting import Counting
 
 LAYOUT = TokenLayout(latent=8, agents=4)
 SMALL = {"width": 32, "layers": 2, "heads": 2, "level_width": 16, "agent_width": 16, "slot_width": 4}
@@ -41,6 +42,26 @@ def test_all_slots_at_once_are_the_groups_of_equally_many_people(options, genera
     (groups, slopes), (once, same) = run(True), run(False)
     assert once.isfinite().all() and torch.allclose(groups[there], once[there], atol=1e-5)
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(slopes, same, strict=True))
+
+
+@pytest.mark.parametrize("rope", ["hidden", "heads"])
+def test_all_slots_at_once_are_few_operators_however_many_groups_there_are(
+    rope: str, generator: torch.Generator
+) -> None:
+    """Of which a GPU's host starts some fifty thousand a second; the groups would be so many times the layers."""
+    noisy, levels = (each.repeat(2, 1, 1, *[1] * (each.ndim - 3)) for each in batch(generator))
+    present = torch.tensor([[1, 1, 1, 1], [0, 1, 0, 1], [0, 0, 1, 0], [1, 1, 1, 0]], dtype=torch.bool)
+
+    def operators(layers: int) -> int:
+        model = build(rope=rope, layers=layers)
+        model.in_groups = False
+        with Counting() as counted:
+            model(noisy, levels, present)
+        assert not counted.waits
+        return counted.operators
+
+    one, two = operators(1), operators(2)
+    assert two - one <= 56, "operators a layer, views among them"
 
 
 def test_the_paper_size_has_about_19_million_weights():
@@ -89,7 +110,7 @@ def test_leaving_absent_agents_out_equals_masking_them(generator):
         y = x.flatten(1, 2)
         y = y + rotate(y, time)
         for block in model.blocks:
-            y = block(y, time)
+            y = block(y, *rotation(time, y.shape[-1] // block.heads))
         return y.unflatten(1, (6, 4))
 
     def masked(query, key, value, attn_mask=None, dropout_p=0.0):

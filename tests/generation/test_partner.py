@@ -20,6 +20,7 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
+from tests.counting import Counting
 
 FAST = SamplerOptions(steps=2)
 
@@ -232,20 +233,6 @@ def test_the_partner_in_the_docs_answers():
     exec(next(block for block in blocks if "partner.answer" in block), told)
     assert told["answer"].frames == 4
     assert torch.equal(told["answer"].T_world_root[:, :, 1], told["coming"].T_world_root[:, :, 1])
-
-
-class Counting(torch.utils._python_dispatch.TorchDispatchMode):
-    """Counts operators, and the numbers that they make."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.operators = self.numbers = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        made = func(*args, **(kwargs or {}))
-        self.operators += 1
-        self.numbers += made.numel() if isinstance(made, torch.Tensor) else 0
-        return made
 
 
 @pytest.mark.slow

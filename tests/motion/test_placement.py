@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from magnet.motion.frames import from_planar, to_planar
 from magnet.motion.placement import PLACEMENTS, Placement, place
 from magnet.motion.planar import rotate_ground
+from tests.counting import Counting
 
 
 def test_every_placement_has_a_function():
@@ -80,16 +81,8 @@ def test_fuse_takes_few_products_however_many_frames_there_are() -> None:
     def operators(frames: int) -> int:
         deltas = from_planar(torch.zeros(1, frames, 2), torch.zeros(1, frames, 2, 2))
         pairs = from_planar(torch.zeros(1, frames, 2, 1), torch.ones(1, frames, 2, 1, 2))
-        with Counter() as counter:
+        with Counting() as counter:
             place(deltas, pairs, from_planar(torch.zeros(1, 2), torch.zeros(1, 2, 2)), "fuse")
         return counter.operators
 
     assert operators(256) < operators(16) + 240, "a loop would take twenty for each frame more"
-
-
-class Counter(torch.utils._python_dispatch.TorchDispatchMode):
-    operators = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.operators += 1
-        return func(*args, **(kwargs or {}))

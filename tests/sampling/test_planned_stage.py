@@ -18,6 +18,7 @@ from magnet.sampling.schedule import MaskSchedule, Stage
 from magnet.sampling.solvers import History
 from magnet.tasks import registry
 from tests.cases import few
+from tests.counting import Counting
 from tests.sampling.plain import run_stage
 
 P, N, B = 3, 20, 2
@@ -72,22 +73,6 @@ def test_a_stage_like_an_earlier_one_is_not_planned_again() -> None:
     assert one.start < other.start
     plans = [planned_stage.plan_of(stage, LAYOUT, 1.0, None, torch.device("cpu")) for stage in (one, other)]
     assert plans[0] is plans[1]
-
-
-class Counting(torch.utils._python_dispatch.TorchDispatchMode):
-    """Counts operators, and those that would make a GPU and the CPU wait for each other."""
-
-    WAITS = ("_local_scalar_dense", "nonzero", "_unique", "unique_dim", "masked_select", "equal", "is_nonzero")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.operators, self.waits = 0, []
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = func._schema.name.removeprefix("aten::")
-        self.operators += 1
-        self.waits += [name] if name.startswith(self.WAITS) else []
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize("task", ["joint_future", "motion_control", "agentic_sync"])

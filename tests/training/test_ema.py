@@ -4,6 +4,7 @@ from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.testing import random_scene, tiny_tokenizer
 from magnet.training.ema import WeightEMA
+from tests.counting import Counting
 from tests.denoiser.test_module import build, data, save, trainer
 
 
@@ -38,6 +39,16 @@ def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_
     assert torch.equal(own, watch.seen[-1])  # what a longer training goes on from
     assert all(torch.equal(value, before[name]) for name, value in loaded.tokenizer.state_dict().items())
     assert loaded.normalizer.ready
+
+
+def test_all_weights_are_averaged_at_once() -> None:
+    """One by one, a GPU and its host would wait for each other at each of them."""
+    net = torch.nn.Sequential(*[torch.nn.Linear(3, 3) for _ in range(20)])
+    average = torch.optim.swa_utils.AveragedModel(net, use_buffers=False, **WeightEMA(0.5)._kwargs)
+    average.update_parameters(net)
+    with Counting() as counted:
+        average.update_parameters(net)
+    assert len(counted.waits) <= 4
 
 
 def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from magnet.training.muon import MuonAdamW, orthogonal
+from magnet.training.muon import MuonAdamW, StackedMuon, orthogonal
+from tests.counting import Counting
 
 
 def small_net() -> nn.Module:
@@ -50,6 +51,38 @@ def test_a_step_is_the_one_of_torchs_two_optimizers(faster: float, monkeypatch: 
         adamw.step()
     for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_matrices_of_one_shape_step_together() -> None:
+    """As alone, and in as many operators however many they are: a GPU's host starts them one by one."""
+    torch.manual_seed(0)
+    together = [nn.Parameter(torch.randn(6, 4)) for _ in range(5)]
+    alone = [nn.Parameter(matrix.detach().clone()) for matrix in together]
+    grads = torch.randn(3, 5, 6, 4)
+    options = {"lr": 1e-2, "weight_decay": 0.1, "adjust_lr_fn": "match_rms_adamw"}
+    optimizers = [StackedMuon(together, torch.float32, **options)]
+    optimizers += [StackedMuon([matrix], torch.float32, **options) for matrix in alone]
+    counts = []
+    for step in grads:
+        for matrices in (together, alone):
+            for matrix, grad in zip(matrices, step, strict=True):
+                matrix.grad = grad.clone()
+        for optimizer in optimizers:
+            with Counting() as counted:
+                optimizer.step()
+            counts.append(counted.operators)
+    torch.testing.assert_close(together, alone)
+    assert counts[-6] <= counts[-1] + 2 * len(together)  # taken from the stack and put back
+
+
+def test_on_a_gpu_matrices_are_stacked() -> None:
+    """One that cannot be read does here."""
+    net = small_net().to("meta")
+    optimizer = MuonAdamW(net.parameters(), lr=1e-2)
+    assert isinstance(optimizer.muon, StackedMuon) and optimizer.muon.dtype == torch.bfloat16
+    for parameter in net.parameters():
+        parameter.grad = torch.empty_like(parameter)
+    optimizer.step()
 
 
 @pytest.mark.parametrize("shape", [(5, 9), (9, 5), (6, 6)])

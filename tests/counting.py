@@ -1,0 +1,26 @@
+"""How many operators something runs, which is what a GPU's host starts one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+
+class Counting(torch.utils._python_dispatch.TorchDispatchMode):
+    """Counts operators, the numbers that they make, and those that make a GPU and its host wait for each other."""
+
+    WAITS = ("_local_scalar_dense", "nonzero", "_unique", "unique_dim", "masked_select", "equal", "is_nonzero")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operators = self.numbers = 0
+        self.waits: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = func(*args, **(kwargs or {}))
+        name = func._schema.name.removeprefix("aten::")
+        self.operators += 1
+        self.numbers += made.numel() if isinstance(made, torch.Tensor) else 0
+        self.waits += [name] if name.startswith(self.WAITS) else []
+        return made
