@@ -46,9 +46,20 @@ def steps_left(trainer: Trainer) -> float:
 
 def seconds_left(trainer: Trainer) -> float:
     """Seconds until `max_time` ends a training; infinite where none was given."""
-    timers = [each for each in trainer.callbacks if isinstance(each, Timer)]  # type: ignore[attr-defined]
-    left = [time for time in (each.time_remaining() for each in timers) if time is not None]
+    left = [left for _, left in times(trainer)]
     return max(min(left, default=math.inf), 0.0)
+
+
+def share_of_time(trainer: Trainer) -> float:
+    """The share of `max_time` that is over, of what was resumed as well; 0 where none was given."""
+    return max((over / max(over + left, 1e-9) for over, left in times(trainer)), default=0.0)
+
+
+def times(trainer: Trainer) -> list[tuple[float, float]]:
+    """Seconds that are over and left for each limit of time."""
+    timers = [each for each in trainer.callbacks if isinstance(each, Timer)]  # type: ignore[attr-defined]
+    both = [(each.time_elapsed(), each.time_remaining()) for each in timers]
+    return [(over, left) for over, left in both if left is not None]
 
 
 def announced(seconds: float, steps: float, place: str) -> str:

@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import nn
 
+from magnet.training.duration import share_of_time
 from magnet.training.muon import MuonAdamW
 from magnet.training.options import OptimizerOptions
 
@@ -19,7 +20,8 @@ def warmup_cosine(
 ) -> dict[str, Any]:
     """AdamW, or Muon for matrices, whose rate rises over a warm-up and falls to zero on a cosine by the end of the run.
 
-    In a run without an end the rate is constant after the warm-up.
+    The end is that of its steps or of its time (`max_time`), whichever comes first. In a run without an end the rate is
+    constant after the warm-up.
     """
     lr, decay = options.learning_rate, options.weight_decay
     optimizer: torch.optim.Optimizer
@@ -31,7 +33,7 @@ def warmup_cosine(
 
     def rate(step: int) -> float:
         rise = min(1.0, (step + 1) / (warmup + 1))
-        done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1)))
+        done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1), share_of_time(module.trainer)))
         return rise * 0.5 * (1 + math.cos(math.pi * done))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)

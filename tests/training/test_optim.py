@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch import Callback
+from lightning.pytorch.callbacks import Timer
 from torch import nn
 
 from magnet.training.muon import MuonAdamW
@@ -14,9 +16,10 @@ from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions
 
 
-def in_training(steps: int) -> Any:
+def in_training(steps: float, *callbacks: Callback) -> Any:
     """What `warmup_cosine` asks of a module in training."""
-    return SimpleNamespace(device=torch.device("cpu"), trainer=SimpleNamespace(estimated_stepping_batches=steps))
+    trainer = SimpleNamespace(estimated_stepping_batches=steps, callbacks=list(callbacks))
+    return SimpleNamespace(device=torch.device("cpu"), trainer=trainer)
 
 
 @pytest.mark.parametrize(("muon", "kind"), [(0.0, torch.optim.AdamW), (3.0, MuonAdamW)])
@@ -36,6 +39,21 @@ def test_rates_rise_and_fall(muon: float, kind: type) -> None:
         assert each[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
         assert each[8] == pytest.approx(0.5)
         assert each[12] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("steps", [1000, float("inf")])
+def test_rates_fall_by_the_clock_where_time_ends_a_run_first(steps: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a run of some minutes ends at its highest rate."""
+    clock = Timer(duration={"minutes": 10})
+    options = OptimizerOptions(learning_rate=1e-2, warmup_steps=0)
+    made = warmup_cosine(in_training(steps, Timer(), clock), nn.Linear(2, 2).parameters(), options)
+    rates = []
+    for minutes in (0, 5, 10, 11):
+        monkeypatch.setattr(clock, "time_elapsed", lambda stage="train", over=60 * minutes: over)
+        made["optimizer"].step()
+        made["lr_scheduler"]["scheduler"].step()
+        rates.append(made["optimizer"].param_groups[0]["lr"] / 1e-2)
+    assert rates == pytest.approx([1.0, 0.5, 0.0, 0.0], abs=1e-4)
 
 
 def test_a_factor_below_zero_is_refused() -> None:
