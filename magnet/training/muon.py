@@ -60,15 +60,15 @@ class StackedMuon(torch.optim.Muon):
         torch._foreach_add_(matrices, list(turned.unbind()), alpha=-group["lr"] * length)
 
 
-def orthogonal(matrix: Tensor, steps: int = 5) -> Tensor:
-    """Matrices with all singular values near 1, by the Newton-Schulz iteration of Jordan 2024. (..., m, n) -> same"""
+def orthogonal(matrices: Tensor, steps: int = 5) -> Tensor:
+    """Matrices with all singular values near 1, by the Newton-Schulz iteration of Jordan 2024. (k, m, n) -> same"""
     a, b, c = FASTEST
-    wide = matrix.shape[-2] <= matrix.shape[-1]
-    x = matrix if wide else matrix.mT
+    wide = matrices.shape[-2] <= matrices.shape[-1]
+    x = matrices if wide else matrices.mT
     x = x / x.norm(dim=(-2, -1), keepdim=True).clamp_min(1e-7)
     for _ in range(steps):
         gram = x @ x.mT
-        x = a * x + (b * gram + c * gram @ gram) @ x
+        x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
     return x if wide else x.mT
 
 

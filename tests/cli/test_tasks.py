@@ -95,6 +95,7 @@ def test_show_writes_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Pat
 def test_fields_change_the_plan(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
     first = printed(capsys, "show", "agentic_async", "--task.order=[1]")
     assert first != printed(capsys, "show", "agentic_async")
+    assert "o 9 9 ." in printed(capsys, "show", "agentic_async", "--turn", "2")  # as `duet` takes turns
     assert "o o o o o o 9" in printed(capsys, "show", "foreign", "--task.keep", "2", "--window", "16")
 
 

@@ -88,7 +88,7 @@ def test_on_a_gpu_matrices_are_stacked() -> None:
 @pytest.mark.parametrize("shape", [(5, 9), (9, 5), (6, 6)])
 def test_a_matrix_becomes_nearly_orthogonal(shape: tuple[int, int]) -> None:
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    made = orthogonal(matrix)
+    made = orthogonal(matrix[None])[0]
     left, _, right = torch.linalg.svd(matrix, full_matrices=False)
     assert torch.linalg.svdvals(made).sub(1).abs().max() < 0.35
     assert (left.T @ made @ right.T - torch.diag(torch.linalg.svdvals(made).new_ones(min(shape)))).abs().max() < 0.35
