@@ -37,7 +37,7 @@ class StackedMuon(torch.optim.Muon):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            shapes: dict[torch.Size, list[nn.Parameter]] = {}
+            shapes: dict[torch.Size, list[Tensor]] = {}
             for matrix in group["params"]:
                 if matrix.grad is not None:
                     shapes.setdefault(matrix.shape, []).append(matrix)
@@ -45,13 +45,13 @@ class StackedMuon(torch.optim.Muon):
                 self._step(matrices, group)
         return loss
 
-    def _step(self, matrices: list[nn.Parameter], group: dict[str, Any]) -> None:
+    def _step(self, matrices: list[Tensor], group: dict[str, Any]) -> None:
         """The step of matrices of one shape."""
         for matrix in matrices:
             if not self.state[matrix]:
                 self.state[matrix]["momentum_buffer"] = torch.zeros_like(matrix)
         means = [self.state[matrix]["momentum_buffer"] for matrix in matrices]
-        grads = [matrix.grad for matrix in matrices]
+        grads = [matrix.grad for matrix in matrices if matrix.grad is not None]
         torch._foreach_lerp_(means, grads, 1 - group["momentum"])
         ahead = torch.stack(torch._foreach_lerp(grads, means, group["momentum"]))
         torch._foreach_mul_(matrices, 1 - group["lr"] * group["weight_decay"])
