@@ -51,8 +51,13 @@ def seconds_left(trainer: Trainer) -> float:
 
 
 def share_of_time(trainer: Trainer) -> float:
-    """The share of `max_time` that is over, of what was resumed as well; 0 where none was given."""
-    return max((over / max(over + left, 1e-9) for over, left in times(trainer)), default=0.0)
+    """The share of `max_time` that is over, of what was resumed as well; 0 where none was given.
+
+    All processes hear that of the first one, whose clocks differ: it must be asked for by all of them.
+    """
+    clocks = times(trainer)
+    share = max((over / max(over + left, 1e-9) for over, left in clocks), default=0.0)
+    return trainer.strategy.broadcast(share) if clocks and trainer.world_size > 1 else share
 
 
 def times(trainer: Trainer) -> list[tuple[float, float]]:

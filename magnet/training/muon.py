@@ -23,12 +23,15 @@ class StackedMuon(torch.optim.Muon):
     Args:
         matrices: what is trained.
         dtype: in which the iteration runs.
-        **options: as torch's.
+        **options: torch's `lr`, `weight_decay` and `momentum`; all else is as Jordan 2024 has it.
     """
 
     def __init__(self, matrices: list[nn.Parameter], dtype: torch.dtype, **options: Any) -> None:
         super().__init__(matrices, **options)
         self.dtype = dtype
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "dtype": self.dtype}
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:

@@ -75,6 +75,17 @@ def test_matrices_of_one_shape_step_together() -> None:
     assert counts[-6] <= counts[-1] + 2 * len(together)  # taken from the stack and put back
 
 
+def test_a_copy_of_the_stacked_optimizer_steps_alike() -> None:
+    torch.manual_seed(0)
+    optimizer = StackedMuon([nn.Parameter(torch.randn(3, 2))], torch.float32, lr=1e-2)
+    copied = copy.deepcopy(optimizer)
+    for each in (optimizer, copied):
+        (matrix,) = each.param_groups[0]["params"]
+        matrix.grad = torch.ones_like(matrix)
+        each.step()
+    assert torch.equal(copied.param_groups[0]["params"][0], optimizer.param_groups[0]["params"][0])
+
+
 def test_on_a_gpu_matrices_are_stacked() -> None:
     """One that cannot be read does here."""
     net = small_net().to("meta")

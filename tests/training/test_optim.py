@@ -18,7 +18,7 @@ from magnet.training.options import OptimizerOptions
 
 def in_training(steps: float, *callbacks: Callback) -> Any:
     """What `warmup_cosine` asks of a module in training."""
-    trainer = SimpleNamespace(estimated_stepping_batches=steps, callbacks=list(callbacks))
+    trainer = SimpleNamespace(estimated_stepping_batches=steps, callbacks=list(callbacks), world_size=1)
     return SimpleNamespace(device=torch.device("cpu"), trainer=trainer)
 
 
@@ -54,6 +54,19 @@ def test_rates_fall_by_the_clock_where_time_ends_a_run_first(steps: float, monke
         made["lr_scheduler"]["scheduler"].step()
         rates.append(made["optimizer"].param_groups[0]["lr"] / 1e-2)
     assert rates == pytest.approx([1.0, 0.5, 0.0, 0.0], abs=1e-4)
+
+
+def test_processes_go_by_the_clock_of_the_first() -> None:
+    """Else their weights part: only slopes are averaged over them."""
+    heard = 0.25
+    module = in_training(1000, Timer(duration={"minutes": 10}))
+    module.trainer.world_size = 2
+    module.trainer.strategy = SimpleNamespace(broadcast=lambda share: heard)
+    made = warmup_cosine(module, nn.Linear(2, 2).parameters(), OptimizerOptions(learning_rate=1.0, warmup_steps=0))
+    heard = 0.5
+    made["optimizer"].step()
+    made["lr_scheduler"]["scheduler"].step()
+    assert made["optimizer"].param_groups[0]["lr"] == pytest.approx(0.5)
 
 
 def test_a_factor_below_zero_is_refused() -> None:
