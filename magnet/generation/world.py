@@ -11,6 +11,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import (
     crossfade_given,
     delta_between,
+    eased_in,
     freeze_after,
     gone_on,
     smoothed_path,
@@ -264,9 +265,10 @@ class WorldState:
         known = self.placed[first].to(deltas.device)
         true_deltas = from_9d(by_frame(self.placed_deltas(first, stop)))
         T_prev_can = torch.where(known[:, None, None], true_deltas, project_se2(from_9d(by_frame(deltas))))
-        T_self_partner = None
-        if pairs is not None:
-            T_self_partner = from_9d(pairwise_by_frame(pairs))
+        if self.causal and self.options.smooth_path and first:
+            made, last = (self.placed & ~self.known)[first - 1].to(new.device), first * TOKEN_FRAMES
+            T_prev_can = eased_in(self.T_world_can[:, last - 2 : last], T_prev_can, made & new)
+        T_self_partner = None if pairs is None else from_9d(pairwise_by_frame(pairs))
         there = self.given.present & (known | new)  # of others, nothing is known here
         placed = place(
             T_prev_can,

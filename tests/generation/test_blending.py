@@ -7,13 +7,14 @@ import torch
 from magnet.generation.blending import (
     SPRING,
     crossfade_given,
+    eased_in,
     gone_on,
     seam_weights,
     smoothed_path,
     spring_from_given,
     spring_weights,
 )
-from magnet.motion.frames import canonical_frame, from_planar, to_planar
+from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -159,6 +160,20 @@ def path(*places: float) -> torch.Tensor:
     T_world_can = torch.eye(4).repeat(1, len(places), 2, 1, 1)
     T_world_can[..., 0, 3] = torch.tensor(places)[None, :, None]
     return T_world_can
+
+
+def test_a_live_token_comes_to_its_own_speed_within_its_frames() -> None:
+    """And turns so; who is not eased, and who goes on as before, is left to the bit."""
+    before = path(0, 1)
+    T_prev_can = inverse(path(0, 5, 10, 15, 20)[:, :-1]) @ path(0, 5, 10, 15, 20)[:, 1:]
+    T_prev_can[..., :3, :3] = from_planar(torch.tensor(0.4), torch.zeros(2))[:3, :3]
+    eased = eased_in(before, T_prev_can, torch.tensor([True, False]))
+    yaw, ground = to_planar(eased)
+    assert torch.allclose(ground[0, :, 0, 0], torch.tensor([2.0, 3.0, 4.0, 5.0]), atol=1e-5)
+    assert torch.allclose(yaw[0, :, 0], torch.tensor([0.1, 0.2, 0.3, 0.4]), atol=1e-5)
+    assert torch.equal(eased[:, :, 1], T_prev_can[:, :, 1])
+    even = inverse(before[:, :1]) @ before[:, 1:]
+    assert torch.allclose(eased_in(before, even.expand(-1, 4, -1, -1, -1), torch.ones(2, dtype=torch.bool)), even)
 
 
 def test_a_smoothed_path_keeps_a_steady_walk_and_stops_a_tremble():
