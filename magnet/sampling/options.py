@@ -63,8 +63,8 @@ class SamplerOptions:
             is best sampled, or `off`, as in streams and for a live partner (docs/corrections.md).
         smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
-            the one after the last is as it is expected. And people go on from what is given as fast as they went.
-            None: as the model is best sampled, or not.
+            the one after the last is as it is expected. And people go on from what is given as fast as they went, in
+            live tasks from each token to the next. None: as the model is best sampled, or not.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
