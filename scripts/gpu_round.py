@@ -43,7 +43,9 @@ def fit_command(given: Any, run: Path) -> list[str]:
 def main(arguments: list[str] | None = None) -> None:
     """Train for so long, then write the weights in parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, help="wall-clock time of all of it")
+    parser.add_argument(
+        "--minutes", type=float, help="wall-clock time of all of it; the learning rate falls to zero by its end"
+    )
     parser.add_argument("--steps", type=int, help="optimiser steps at most; the learning rate falls to zero with them")
     parser.add_argument("--start", help="weights of an earlier round, or any denoiser of these sizes")
     parser.add_argument("--out", type=Path, required=True, help="folder for what comes back")

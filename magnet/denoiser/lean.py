@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
 from magnet.denoiser.compiled import Compiled
-from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, sinusoids
+from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, rotation, sinusoids
 from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of, packs
 from magnet.precision import quick_bf16, quick_int8
 from magnet.sampling.noise import LEVELS
@@ -359,14 +359,11 @@ def _seats(present: bytes, B: int, P: int, device: torch.device) -> list[tuple[T
 
 
 @functools.lru_cache(maxsize=64)
-def turns(steps: int, people: int, width: int, device: torch.device, base: float = 10_000.0) -> Tensor:
+def turns(steps: int, people: int, width: int, device: torch.device) -> Tensor:
     """What each token's channels are turned by, as `rotate` has it. -> (steps * people, width / 2) complex"""
     with torch.inference_mode(False):
-        half = width // 2
-        frequency = base ** (-torch.arange(half, device=device, dtype=torch.float32) / half)
         time = torch.arange(steps, device=device).repeat_interleave(people)
-        angle = time[:, None].float() * frequency
-        return torch.complex(angle.cos(), angle.sin())
+        return torch.complex(*rotation(time, width))
 
 
 @functools.lru_cache(maxsize=64)

@@ -27,12 +27,12 @@ def sinusoids(values: Tensor, width: int, longest: float = 10_000.0) -> Tensor:
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
 
-def rotate(x: Tensor, time: Tensor, base: float = 10_000.0) -> Tensor:
+def rotate(x: Tensor, time: Tensor) -> Tensor:
     """Rotary position encoding: pairs of channels (d, d + D/2) turned by an angle that grows with time.
 
     x (..., L, D) with D even, time (L,) -> same as x
     """
-    return rotated(x, *rotation(time, x.shape[-1], base))
+    return rotated(x, *rotation(time, x.shape[-1]))
 
 
 def rotation(time: Tensor, width: int, base: float = 10_000.0) -> tuple[Tensor, Tensor]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class WeightEMA(WeightAveraging):
@@ -27,8 +27,7 @@ class WeightEMA(WeightAveraging):
         def average(averaged: list[Tensor], current: list[Tensor], steps: Tensor | int) -> None:
             """All weights at once: on a GPU, one by one would wait for `steps` each time."""
             done = float(steps)
-            young = min(decay, (1 + done) / (10 + done))
-            torch._foreach_lerp_(averaged, current, 1 - young)
+            get_ema_multi_avg_fn(min(decay, (1 + done) / (10 + done)))(averaged, current, steps)
 
         super().__init__(use_buffers=False, multi_avg_fn=average)
         self._own: dict[str, Tensor] | None = None  # weights of a training that has ended, before the average took over
