@@ -16,6 +16,7 @@ from magnet.sampling.noise import alpha_bar
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.losses import length, masked_mean, matrices, moved, world_velocity
 from magnet.tokenizer.normalizer import Normalizer
+from magnet.waiting import may_look
 
 BODY_LOSSES = ("joint", "velocity", "partner", "hands")
 
@@ -59,14 +60,18 @@ def decoded_losses(
     chosen = least_noisy(signal, there, max(1, round(share * len(clean))))
     few, kind = scene.select(chosen), clean.device.type
     dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
-    people, true_pose = few.present, pose_features(few)
+    people, true_pose, seen = few.present, pose_features(few), may_look(clean.device)
 
     def decode(latent: Tensor, betas: Tensor, deltas: Tensor) -> Tensor:
-        """Poses of those who are there; empty slots, half of them or more, cost nothing and stay as they are."""
-        by_person = [x.transpose(1, 2)[people][:, :, None] for x in (latent, deltas)]
+        """Poses of those who are there; empty slots stay as they are, and on a CPU cost nothing."""
+        by_slot = (latent.transpose(1, 2), betas, deltas.transpose(1, 2))
+        by_person = [x[people] if seen else x.flatten(0, 1) for x in by_slot]
         with torch.autocast(kind, dtype, half):  # only networks may run in half precision
-            decoded = tokenizer.decode(by_person[0], betas[people][:, None], by_person[1])[:, :, 0].float()
-        return true_pose.transpose(1, 2).index_put((people,), decoded).transpose(1, 2)
+            decoded = tokenizer.decode(by_person[0][:, :, None], by_person[1][:, None], by_person[2][:, :, None])
+        poses, decoded = true_pose.transpose(1, 2), decoded[:, :, 0].float()
+        if seen:
+            return poses.index_put((people,), decoded).transpose(1, 2)
+        return torch.where(people[..., None, None], decoded.view_as(poses), poses).transpose(1, 2)
 
     with torch.autocast(kind, enabled=False):
         return body_losses(
@@ -151,7 +156,8 @@ def _between_wrists(mine: Tensor, seen: Tensor) -> Tensor:
 
     mine (B, T, P, 22, 3), seen (B, T, P, P - 1, 22, 3) -> (B, T, P, P - 1, 2, 2, 3)
     """
-    return seen[..., None, WRISTS, :] - mine[:, :, :, None, WRISTS, None, :]
+    wrists = slice(WRISTS[0], WRISTS[1] + 1)
+    return seen[..., None, wrists, :] - mine[:, :, :, None, wrists, None, :]
 
 
 def _mean_length(away: Tensor) -> Tensor:

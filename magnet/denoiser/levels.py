@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -79,8 +82,7 @@ def draw_levels(
         return uniform(B, 1, 1)
     if kind != "mixture":
         raise ValueError(f"noise.distribution: got {kind!r}, expected per_token, per_timestep, per_sequence or mixture")
-    share = torch.tensor(MIXTURE, device=device)
-    which = torch.multinomial(share, B, replacement=True, generator=generator)[:, None, None]
+    which = drawn_kinds(MIXTURE, (B, 1, 1), generator)
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
     rolled = rollout_levels(B, N, P, generator, shift, faint)
@@ -88,6 +90,15 @@ def draw_levels(
         chosen = torch.rand(B, 1, 1, generator=generator, device=device) < live
         rolled = torch.where(chosen, live_levels(B, N, P, generator, shift, faint), rolled)
     return torch.where(which == ROLLOUT, rolled, levels)
+
+
+def drawn_kinds(shares: Sequence[float], shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Which of several kinds, each so likely, is drawn for each place. -> `shape` int"""
+    draw = torch.rand(shape, generator=generator, device=generator.device)
+    kind = torch.zeros(shape, dtype=torch.long, device=generator.device)
+    for below in itertools.accumulate(shares[:-1]):
+        kind += draw >= below
+    return kind
 
 
 def rollout_levels(
@@ -131,8 +142,7 @@ def rollout_levels(
     generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
-    shares = torch.tensor(ROLES, device=device)
-    role = torch.multinomial(shares, B * P, replacement=True, generator=generator).view(B, 1, P)
+    role = drawn_kinds(ROLES, (B, 1, P), generator)
     role = torch.where(mixed, role, 0)
     levels = torch.where(role == 1, given, generated)
     levels = torch.where(role == 2, torch.zeros_like(levels), levels)
@@ -156,8 +166,7 @@ def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float
     level = shifted(1 + (draw[2] * LEVELS).long().clamp_max(LEVELS - 1), shift)
     since = torch.where(draw[3] < 0.5, 0, draw[3] * past)
     behind = torch.where((draw[4] < faint) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0)
-    shares = torch.tensor(LIVE_ROLES, device=device)
-    role = torch.multinomial(shares, B * P, replacement=True, generator=generator).view(B, 1, P)
+    role = drawn_kinds(LIVE_ROLES, (B, 1, P), generator)
     somebody = torch.randint(P, (B, 1, 1), generator=generator, device=device)
     role = torch.where(torch.arange(P, device=device) == somebody, 0, role)
     shown = torch.where(role == 1, 0, behind)

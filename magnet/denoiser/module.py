@@ -21,14 +21,16 @@ from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_mad
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.token_model import TokenModel
 from magnet.denoiser.transformer import Transformer, is_sharded, skipped
-from magnet.motion.scene import Scene
-from magnet.motion.tokens import TokenLayout
+from magnet.motion.scene import Scene, all_valid
+from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.precision import dtype_of
+from magnet.recorded import RecordedStep
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
+from magnet.waiting import constant
 
 Target = Literal["quantized", "continuous"]
 
@@ -55,6 +57,8 @@ class Denoiser(TokenModel):
         optimizer: AdamW, or Muon for matrices.
         sampling: how the trained model is best sampled, where a sampler leaves it open.
         compile: compile the blocks for training; worth it on a GPU, not on a CPU.
+        cuda_graph: train by replaying one CUDA graph of forward and backward, which a GPU does not wait for its host
+            in; on other devices nothing changes.
         seed: all training noise follows from it.
     """
 
@@ -72,6 +76,7 @@ class Denoiser(TokenModel):
         optimizer: OptimizerOptions = OptimizerOptions(warmup_steps=1000),
         sampling: Sampling = Sampling(),
         compile: bool = False,
+        cuda_graph: bool = False,
         seed: int = 1111,
     ) -> None:
         super().__init__()
@@ -81,11 +86,12 @@ class Denoiser(TokenModel):
         self.optimizer, self.sampling = group_of(OptimizerOptions, optimizer), group_of(Sampling, sampling)
         groups = {"network": self.network, "noise": self.noise, "loss": self.loss, "self_forcing": self.self_forcing}
         sizes = {"tokenizer": tokenizer, "max_agents": max_agents, "window": window, "target": target}
-        rest = {"start_from": start_from, "compile": compile, "seed": seed}
+        rest = {"start_from": start_from, "compile": compile, "cuda_graph": cuda_graph, "seed": seed}
         groups |= {"optimizer": self.optimizer, "sampling": self.sampling}
         self.save_hyperparameters(plain({**sizes, **groups, **rest}))
         self.window = window
         self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
+        self.recorded: RecordedStep | None = None  # of the training that is going on
         self.build_named(tokenizer)
         if tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
             self.build(starting.tokenizer_of(start_from))
@@ -161,8 +167,8 @@ class Denoiser(TokenModel):
 
     def _without_lead(self, tokens: Tensor) -> Tensor:
         lead = slice(self.layout.latent, self.layout.latent + 9)
-        identity = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], device=tokens.device)
-        still = (identity - self.normalizer.mean[lead]) / self.normalizer.std[lead]
+        mean, std = self.normalizer.mean, self.normalizer.std
+        still = (constant((1, 0, 0, 0, 1, 0, 0, 0, 0), mean) - mean[lead]) / std[lead]
         tokens = tokens.clone()
         tokens[:, 0, :, lead] = still.to(tokens.dtype)
         return tokens
@@ -185,9 +191,17 @@ class Denoiser(TokenModel):
                 self.take_over(self.hparams["start_from"])
             if not self.normalizer.ready:
                 self._fit_statistics()
-        if self.hparams["compile"]:
+        self.recorded = None
+        if self.hparams["cuda_graph"] and self.device.type == "cuda":
+            if is_sharded(self.transformer):
+                raise ValueError("cuda_graph: weights in shards cannot be recorded; use another strategy, or leave it")
+            self.recorded = RecordedStep(self._recorded_losses, self._trained())
+        elif self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
+
+    def on_fit_end(self) -> None:
+        self.recorded = None  # its memory
 
     def take_over(self, path: str | Path) -> None:
         """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
@@ -200,12 +214,14 @@ class Denoiser(TokenModel):
         self.normalizer.set(*token_statistics(self.layout, tokens, there, *scales))
 
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
-        generator = step_generator(
-            self.device, self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank
-        )
+        place = (self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank)
+        generator = step_generator(self.device, *place)
         scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
-        losses = self.losses(scene, generator, made)
+        if self.recorded is None:
+            losses = self.losses(scene, generator, made)
+        else:
+            losses = self.recorded(self._inputs(scene, made), derive(*place, "recorded"))
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
         return losses["loss"]
@@ -218,10 +234,33 @@ class Denoiser(TokenModel):
         logged = {f"val/{name}": value for name, value in losses.items()}
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
-    def losses(self, scene: Scene, generator: torch.Generator, made: Tensor | None = None) -> dict[str, Tensor]:
+    def _inputs(self, scene: Scene, made: Tensor | None) -> dict[str, Tensor]:
+        """What `losses` depends on in a training step, as tensors; `_recorded_losses` takes it."""
+        if made is None:
+            made = torch.zeros(scene.scenes, scene.frames // TOKEN_FRAMES, dtype=torch.bool, device=scene.device)
+        scene = scene.replace(valid=all_valid(scene) if scene.valid is None else scene.valid, given=None)
+        return {**scene.tensors(), "made": made, "ramp": torch.full((), self._ramp(), device=scene.device)}
+
+    def _recorded_losses(self, inputs: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+        tensors = dict(inputs)
+        made, ramp = tensors.pop("made"), tensors.pop("ramp")
+        return self.losses(Scene(**tensors), generator, made, ramp)  # type: ignore[arg-type]
+
+    def _ramp(self) -> float:
+        """Share of the consistency loss that counts by now."""
+        return min(1.0, (self.global_step + 1) / max(self.loss.consistency_warmup, 1)) if self.training else 1.0
+
+    def losses(
+        self,
+        scene: Scene,
+        generator: torch.Generator,
+        made: Tensor | None = None,
+        ramp: float | Tensor | None = None,
+    ) -> dict[str, Tensor]:
         """The weighted sum `loss` and its parts, unweighted; all noise comes from the generator (paper Eq. 9-11).
 
-        made (B, N) bool: token steps that the model has made itself; they are shown clean and do not count.
+        made (B, N) bool: token steps that the model has made itself; they are shown clean and do not count. ramp:
+        share of the consistency loss that counts; None: as far as training has come.
         """
         layout, weight = self.layout, self.loss
         with torch.no_grad():
@@ -250,7 +289,7 @@ class Denoiser(TokenModel):
         if layout.slots:
             rotation, translation = consistency_losses(predicted, layout, there)
             losses["consistency"] = rotation + translation
-            ramp = min(1.0, (self.global_step + 1) / max(weight.consistency_warmup, 1)) if self.training else 1.0
+            ramp = self._ramp() if ramp is None else ramp
             total = total + weight.pairwise * losses["pairwise"] + ramp * weight.consistency * losses["consistency"]
             if weight.near:
                 losses["near"] = near_loss(predicted, tokens, layout, there, group_levels)
@@ -299,8 +338,10 @@ class Denoiser(TokenModel):
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()
+        return warmup_cosine(self, self._trained(), self.optimizer)
+
+    def _trained(self) -> list[nn.Parameter]:
         parts: list[nn.Module] = [self.transformer]
         if self.posterior is not None:
             parts.append(self.posterior)
-        trained = [parameter for part in parts for parameter in part.parameters()]
-        return warmup_cosine(self, trained, self.optimizer)
+        return [parameter for part in parts for parameter in part.parameters()]

@@ -16,6 +16,7 @@ from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.packing import Kept, state_of
 from magnet.sampling.noise import LEVELS, alpha_bar
 from magnet.tokenizer.normalizer import Normalizer
+from magnet.waiting import may_look
 
 KNOTS = 11
 """Noise levels at which a learnt deviation is stored; between them it is interpolated."""
@@ -94,7 +95,7 @@ class PairwisePosterior(nn.Module):
         return tokens[..., self.layout.latent :].unflatten(-1, (-1, TOKEN_FRAMES, 9))
 
     def _keeps(self, levels: Tensor) -> bool:
-        return levels.device.type == "cpu" and not torch.is_grad_enabled() and not self.log_pair_yaw.is_inference()
+        return may_look(levels.device) and not torch.is_grad_enabled() and not self.log_pair_yaw.is_inference()
 
     def _kinds(self, levels: Tensor, present: Tensor) -> list[Tensor]:
         """Numbers of scenes that share a setting, kind by kind; none where there is one, or more than people.
@@ -232,7 +233,7 @@ def frames_fused(told: Tensor, shown: Tensor, known: Setting) -> Tensor:
     origin, target = torch.cat([before, here.expand_as(others)], dim=-1), torch.cat([here, others], dim=-1)
     back = origin[0].conj()
     nine = torch.zeros_like(frames[0], dtype=told.dtype)
-    nine[..., 4] = 1
+    nine[..., 4].fill_(1)
     nine[..., :3:2] = torch.view_as_real(target[0] * back)
     nine[..., 6::2] = torch.view_as_real((target[1] - origin[1]) * back)
     nine[:, 0, :, 0] = told[:, 0, :, 0, 0]

@@ -10,6 +10,7 @@ from torch import Tensor
 from magnet.motion.frames import partners
 from magnet.motion.pose_graph import PoseGraph
 from magnet.motion.tokens import TokenLayout
+from magnet.waiting import may_look
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class SlotsInUse:
     @classmethod
     def of(cls, present: Tensor, layout: TokenLayout) -> SlotsInUse:
         # On a GPU all slots: counting people would have to wait for it.
-        most = max(2, int(present.sum(dim=1).max())) if present.device.type == "cpu" else layout.agents
+        most = max(2, int(present.sum(dim=1).max())) if may_look(present.device) else layout.agents
         slots = (~present).int().argsort(dim=1, stable=True)[:, :most]
         own, other = slots[..., None], slots[:, partners(most, present.device)]
         groups = torch.cat([torch.zeros_like(own), other + (other < own)], dim=-1)

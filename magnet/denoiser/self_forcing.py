@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
 from magnet.tokenizer.normalizer import Normalizer
+from magnet.waiting import may_look
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 """noisy (B, N, P, D), levels (B, N, P), present (B, P), condition (B, ...) -> clean (B, N, P, D), all normalized"""
@@ -49,17 +51,12 @@ def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Gener
     """Replace some scenes of a batch. -> the batch, (B, N) bool which token steps the model has made, or None"""
     if made is None:
         return scene, None
-    B = scene.scenes
-    replaced = torch.rand(B, generator=generator, device=generator.device) < made.share
-    count = int(replaced.sum())
-    if not count:
-        return scene, None
-    chosen = torch.randint(made.scenes.scenes, (count,), generator=generator, device=generator.device)
-    kept = (~replaced).nonzero()[:, 0]
-    parts = [scene.select(kept)] if len(kept) else []
-    own = torch.zeros(B, scene.frames // TOKEN_FRAMES, dtype=torch.bool, device=generator.device)
-    own[B - count :, : made.past] = True
-    return concatenate([*parts, made.scenes.select(chosen)]), own
+    B, N, device = scene.scenes, scene.frames // TOKEN_FRAMES, generator.device
+    replaced = torch.rand(B, generator=generator, device=device) < made.share
+    chosen = torch.randint(made.scenes.scenes, (B,), generator=generator, device=device)
+    both = concatenate([scene, made.scenes])
+    mixed = both.select(torch.where(replaced, B + chosen, torch.arange(B, device=device)))
+    return mixed, replaced[:, None] & (torch.arange(N, device=device) < made.past)
 
 
 @torch.no_grad()
@@ -118,6 +115,7 @@ def with_self_forcing(
     Noise is added to a past, the model restores it in one step, and it is rounded to codes and placed in the world, as
     finished tokens are in sampling. It is then a little blurred and calm. Recorded pairwise transforms keep people
     where they stood to each other, so that what follows, which is still the truth, does not begin with a jump.
+    Off a CPU it is always equally many scenes, the first, some of which have no past.
 
     Args:
         denoise: the model.
@@ -133,13 +131,15 @@ def with_self_forcing(
     Returns:
         (B, N, P, D).
     """
-    past = past_of(levels, faint)
-    selected = torch.rand(len(levels), generator=generator, device=levels.device) < options.share
-    few = (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]
-    if not len(few):
-        return truth
+    past, seen = past_of(levels, faint), may_look(levels.device)
+    few: Tensor | slice = slice(math.ceil(options.share * len(levels)))
+    if seen:
+        selected = torch.rand(len(levels), generator=generator, device=levels.device) < options.share
+        few = (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]
+        if not len(few):
+            return truth
     past, T_world_can = past[few], canonical_frame(scene.T_world_root[few])
-    drawn = torch.rand(len(few), 1, 1, generator=generator, device=levels.device)
+    drawn = torch.rand(len(past), 1, 1, generator=generator, device=levels.device)
     even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * drawn
     renoised = torch.where(past, shifted((even * LEVELS).long(), shift), levels[few])
     noise = torch.randn(truth[few].shape, generator=generator, device=truth.device)

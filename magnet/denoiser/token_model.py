@@ -16,6 +16,7 @@ from magnet import checkpoints
 from magnet.body import Body, load_body
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.statistics import token_statistics
+from magnet.denoiser.transformer import FEW_SLOTS
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
 from magnet.old_names import renamed_checkpoint
@@ -25,6 +26,7 @@ from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
 from magnet.tokenizer.module import RawPose, Tokenizer
 from magnet.tokenizer.normalizer import Normalizer
+from magnet.waiting import may_look
 
 
 class TokenModel(L.LightningModule):
@@ -144,11 +146,15 @@ class TokenModel(L.LightningModule):
         convolution sees zeros, which would give the last known token, of all, a code that is used nowhere else.
         `tokens` says which are wanted; `packed`, `growing`: see `magnet.tokenizer.lean`.
         """
-        held = scene.people().pad_frames(TOKEN_FRAMES)
+        everybody = not may_look(scene.device) and scene.agents <= FEW_SLOTS
+        held = (scene.slots() if everybody else scene.people()).pad_frames(TOKEN_FRAMES)
         first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
         wanted = slice(first + 1, stop + 1)
         encode = functools.partial(encoded, growing=growing) if packed else encoded_plainly
         people = encode(self.tokenizer, held, self.quantized, wanted)[:, :, 0]
+        if everybody:
+            latent = people.unflatten(0, scene.present.shape)
+            return torch.where(scene.present[..., None, None], latent, 0.0).transpose(1, 2)
         latent = people.new_zeros(scene.scenes, scene.agents, *people.shape[1:])
         latent[scene.present] = people
         return latent.transpose(1, 2)

@@ -15,6 +15,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from magnet.denoiser.options import TransformerOptions
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
+from magnet.waiting import may_look
 
 FEW_SLOTS = 8
 """Most agent slots that a GPU runs at once, whoever is in them; with more, the empty ones cost too much."""
@@ -217,7 +218,7 @@ class Transformer(nn.Module):
         Off a CPU all slots run at once while they are few: a GPU waits for the host to start each operator, not for
         arithmetic, and would wait for it again to hear which groups there are.
         """
-        at_once = x.device.type != "cpu" and x.shape[2] <= FEW_SLOTS
+        at_once = not may_look(x.device) and x.shape[2] <= FEW_SLOTS
         if is_sharded(self.blocks[0]) or not self.in_groups or at_once:
             return self._blocks_once(x, present)
         people = present.sum(dim=1)

@@ -45,4 +45,4 @@ def rotate_ground(yaw: Tensor, ground: Tensor) -> Tensor:
 def unit_ground(nine: Tensor) -> tuple[Tensor, Tensor]:
     """Unit (cos, sin) of the yaw and ground position of a transform in 9-D. (..., 9) -> (..., 2) x 2"""
     unit = torch.stack([nine[..., 0], -nine[..., 2]], dim=-1)
-    return F.normalize(unit, dim=-1, eps=1e-6), nine[..., [6, 8]]
+    return F.normalize(unit, dim=-1, eps=1e-6), nine[..., 6:9:2]

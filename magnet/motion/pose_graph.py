@@ -16,10 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from magnet.motion.cholesky import factored, solved
 from magnet.motion.frames import partners
 
 GAUGE = 1e-6
-"""Small precision of the integrated deltas, which decides where nothing else determines a position."""
+"""Small precision of the integrated deltas, which decides where nothing else determines a position; so all
+matrices are positive definite."""
 
 WHOLE = 2 * 128**3
 """A batch of matrices is factored whole if their number times their size cubed is at most this; else reduced first."""
@@ -199,7 +201,7 @@ class BlockTridiagonal:
     def solve(self, right: Tensor) -> Tensor:
         """(..., T, P, C) -> (..., T, P, C)"""
         if self.reach is None or self.rest is None:
-            return torch.cholesky_solve(right.flatten(-3, -2), self.inner).view(right.shape)
+            return solved(right.flatten(-3, -2), self.inner).view(right.shape)
         T, P = right.shape[-3:-1]
         runs = pad(right, (0, 0, 0, 0, 0, -T % RUN)).unflatten(-3, (-1, RUN))
         first = runs[..., :-1, :, :].flatten(-3, -2)
@@ -207,7 +209,7 @@ class BlockTridiagonal:
         onto = pad(carried[..., 1:, :P, :], (0, 0, 0, 0, 0, 1)) + carried[..., P:, :]
         last = self.rest.solve(runs[..., -1, :, :] - onto)
         around = torch.cat([pad(last, (0, 0, 0, 0, 1, -1)), last], dim=-2)
-        first = torch.cholesky_solve(first, self.inner) - self.reach @ around
+        first = solved(first, self.inner) - self.reach @ around
         both = torch.cat([first.unflatten(-2, (-1, P)), last.unsqueeze(-3)], dim=-3)
         return both.flatten(-4, -3)[..., :T, :, :]
 
@@ -224,26 +226,21 @@ def factor(diagonal: Tensor, before: Tensor) -> BlockTridiagonal:
     """
     T, P = diagonal.shape[-3:-1]
     if T == 1 or diagonal.shape[:-3].numel() * (T * P) ** 3 <= WHOLE:
-        return BlockTridiagonal(_cholesky(_whole(diagonal, before)))
+        return BlockTridiagonal(factored(_whole(diagonal, before)))
     if T % RUN:
         diagonal = _with_unit_blocks(diagonal, -T % RUN)
         before = pad(before, (0, 0, 0, 0, 0, -T % RUN))
     before = torch.cat([torch.zeros_like(before[..., :1, :, :]), before[..., 1:, :, :]], dim=-3)
     diagonal, before = diagonal.unflatten(-3, (-1, RUN)), before.unflatten(-3, (-1, RUN))
-    inner = _cholesky(_whole(diagonal[..., :-1, :, :], before[..., :-1, :, :]))
+    inner = factored(_whole(diagonal[..., :-1, :, :], before[..., :-1, :, :]))
     # What ties the first blocks of a run to the last one of the run before and to that of their own.
     entry, leave = before[..., 0, :, :], before[..., -1, :, :].transpose(-1, -2)
     further = (RUN - 2) * P
     ties = torch.cat([pad(entry, (0, 0, 0, further)), pad(leave, (0, 0, further, 0))], dim=-1)
-    reach = torch.cholesky_solve(ties, inner)
+    reach = solved(ties, inner)
     left = ties.transpose(-1, -2) @ reach
     onto = pad(left[..., 1:, :P, :P], (0, 0, 0, 0, 0, 1)) + left[..., P:, P:]
     return BlockTridiagonal(inner, reach, factor(diagonal[..., -1, :, :] - onto, -left[..., P:, :P]))
-
-
-def _cholesky(matrix: Tensor) -> Tensor:
-    # Without checks, for which a GPU would have to be waited for: GAUGE makes all of these positive definite.
-    return torch.linalg.cholesky_ex(matrix).L
 
 
 def _whole(diagonal: Tensor, before: Tensor) -> Tensor:

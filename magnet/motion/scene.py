@@ -135,9 +135,11 @@ class Scene:
             scenes = torch.as_tensor(scenes, device=self.device, dtype=torch.long if empty else None)
             if scenes.dtype == torch.bool:
                 scenes = scenes.nonzero()[:, 0]
-        chosen = torch.arange(self.scenes, device=self.device)[scenes].tolist()
         changes: dict[str, object] = {name: value[scenes] for name, value in self.tensors().items()}
-        return self.replace(**changes, names=tuple(self.names[i] for i in chosen) if self.names else ())
+        if not self.names:  # else a GPU is waited for
+            return self.replace(**changes)
+        chosen = torch.arange(self.scenes, device=self.device)[scenes].tolist()
+        return self.replace(**changes, names=tuple(self.names[i] for i in chosen))
 
     def repeat(self, samples: int) -> Scene:
         """Each scene `samples` times in a row: scene b becomes b * samples ... b * samples + samples - 1."""
@@ -166,6 +168,20 @@ class Scene:
             body=self.body,
             valid=None if self.valid is None else self.valid[:, None].expand(-1, self.agents, -1)[there],
             given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
+        )
+
+    def slots(self) -> Scene:
+        """Each slot as a scene of its own, (B P, T, 1), whether somebody is in it or not; names are dropped."""
+        B, P = self.present.shape
+        return Scene(
+            body_rot=self.body_rot.transpose(1, 2).flatten(0, 1).unsqueeze(2),
+            T_world_root=self.T_world_root.transpose(1, 2).flatten(0, 1).unsqueeze(2),
+            betas=self.betas.view(B * P, 1, -1),
+            present=self.present.view(B * P, 1),
+            fps=self.fps,
+            body=self.body,
+            valid=None if self.valid is None else self.valid.repeat_interleave(P, dim=0),
+            given=None if self.given is None else self.given.transpose(1, 2).reshape(B * P, -1, 1),
         )
 
     def pad_frames(self, frames: int) -> Scene:

@@ -13,6 +13,7 @@ from magnet.body.joints import FEET, TOES
 from magnet.motion.frames import from_9d
 from magnet.motion.rotations import from_6d, geodesic
 from magnet.motion.scene import FPS
+from magnet.waiting import constant
 
 STANDS = (0.05, 0.2)
 """Height in metres and speed in m/s under which a recorded toe stands."""
@@ -28,7 +29,7 @@ def orthonormalize(pose: Tensor) -> Tensor:
     """Orthonormalize a pose's 6-D rotations and put the pelvis above its canonical frame. (..., 135) -> same"""
     rotations = torch.cat([pose[..., :BODY], pose[..., BODY : BODY + 6]], dim=-1).unflatten(-1, (22, 6))
     rotations = from_6d(rotations)[..., :2].transpose(-1, -2).flatten(-3)
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=pose.dtype, device=pose.device)
+    up = constant((0.0, 1.0, 0.0), pose)
     return torch.cat([rotations, pose[..., BODY + 6 :] * up], dim=-1)
 
 

@@ -64,6 +64,7 @@ class ResidualVQ(Float32):
         self._lengths: tuple[tuple[int, int], Tensor] | None = None  # of codes, squared, while they stay
         self._searched: tuple[tuple[int, int], list[Book]] | None = None  # while codes stay
         self._lookups = 0  # of few vectors, since then
+        self._started: tuple[tuple[int, int], bool] | None = None  # whether there are codes, while that stays
         self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
         self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
         self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
@@ -113,7 +114,12 @@ class ResidualVQ(Float32):
     @property
     def waiting(self) -> bool:
         """Whether vectors are left as they are, because there are no codes yet."""
-        return self.waits and not bool(self.initialized)
+        if not self.waits or self.initialized.is_inference():
+            return self.waits and not bool(self.initialized)
+        now = (self.initialized.data_ptr(), self.initialized._version)
+        if self._started is None or self._started[0] != now:  # a GPU would be waited for each time
+            self._started = (now, bool(self.initialized))
+        return not self._started[1]
 
     def continuous(self, vectors: Tensor) -> Tensor:
         """The vectors as they are, not quantized: codes lie in the same space."""

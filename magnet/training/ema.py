@@ -4,10 +4,30 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
-from torch import Tensor
-from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+
+class Average(AveragedModel):
+    """torch's average whose count of steps stays on the CPU: a GPU would be waited for to read it, three times a step."""
+
+    def __init__(self, model: nn.Module, device: torch.device, decay: float) -> None:
+        super().__init__(model, device)
+        self.decay = decay
+        self.n_averaged = torch.zeros((), dtype=torch.long)
+
+    @torch.no_grad()
+    def update_parameters(self, model: nn.Module) -> None:
+        done = float(self.n_averaged)
+        decay = min(self.decay, (1 + done) / (10 + done)) if done else 0.0
+        averaged, current = list(self.module.parameters()), list(model.parameters())
+        torch._foreach_lerp_(averaged, current, 1 - decay)
+        for own, its in zip(self.module.buffers(), model.buffers(), strict=True):
+            own.copy_(its)
+        self.n_averaged += 1
 
 
 class WeightEMA(WeightAveraging):
@@ -24,12 +44,8 @@ class WeightEMA(WeightAveraging):
         if not 0 <= decay < 1:
             raise ValueError(f"decay: got {decay}, expected 0 to 1")
 
-        def average(averaged: list[Tensor], current: list[Tensor], steps: Tensor | int) -> None:
-            """All weights at once: on a GPU, one by one would wait for `steps` each time."""
-            done = float(steps)
-            get_ema_multi_avg_fn(min(decay, (1 + done) / (10 + done)))(averaged, current, steps)
-
-        super().__init__(use_buffers=False, multi_avg_fn=average)
+        super().__init__(use_buffers=False)
+        self.decay = decay
         self._own: dict[str, Tensor] | None = None  # weights of a training that has ended, before the average took over
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -38,6 +54,8 @@ class WeightEMA(WeightAveraging):
                 stage
             )  # Lightning sets callbacks up first, and a copy would lack what the model makes there
         super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            self._average_model = Average(self._average_model.module, self._device or pl_module.device, self.decay)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._own = None

@@ -1,0 +1,43 @@
+"""Whether the host may look at numbers: of a CPU at any time, for those of a GPU it would have to wait.
+
+What looks chooses shapes by what it sees (only those who are there, only scenes with a past). Off a CPU such code takes
+fixed shapes and masks, so that nothing waits and a whole training step can be recorded once (`magnet.recorded`).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+_looking = True
+
+
+def may_look(device: torch.device) -> bool:
+    """Whether looking at numbers that are on a device costs nothing."""
+    return _looking and device.type == "cpu"
+
+
+@contextmanager
+def as_off_cpu() -> Iterator[None]:
+    """Within it numbers on a CPU are not looked at either, as if they were on a GPU: for tests and rehearsals."""
+    global _looking
+    before, _looking = _looking, False
+    try:
+        yield
+    finally:
+        _looking = before
+
+
+def constant(values: tuple[float, ...], like: Tensor) -> Tensor:
+    """A vector of numbers on the device and of the type of another tensor, sent there once."""
+    return _constant(values, like.device, like.dtype)
+
+
+@functools.cache
+def _constant(values: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):  # or training, later, could not use it
+        return torch.tensor(values, device=device, dtype=dtype)
