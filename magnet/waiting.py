@@ -1,7 +1,7 @@
 """Whether the host may look at numbers: of a CPU at any time, for those of a GPU it would have to wait.
 
 What looks chooses shapes by what it sees (only those who are there, only scenes with a past). Off a CPU such code takes
-fixed shapes and masks, so that nothing waits and a whole training step can be recorded once (`magnet.recorded`).
+fixed shapes and masks, so that nothing waits and a whole training step can be recorded once (`magnet.cuda_graphs`).
 """
 
 from __future__ import annotations

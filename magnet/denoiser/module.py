@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from magnet import checkpoints
 from magnet.checks import require_choice
+from magnet.cuda_graphs import GraphedStep
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.levels import FAINT, draw_levels
@@ -24,7 +25,6 @@ from magnet.denoiser.transformer import Transformer, is_sharded, skipped
 from magnet.motion.scene import Scene, all_valid
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.precision import dtype_of
-from magnet.recorded import RecordedStep
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.tokenizer.base import PoseTokenizer
@@ -91,7 +91,7 @@ class Denoiser(TokenModel):
         self.save_hyperparameters(plain({**sizes, **groups, **rest}))
         self.window = window
         self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
-        self.recorded: RecordedStep | None = None  # of the training that is going on
+        self.graphed: GraphedStep | None = None  # of the training that is going on
         self.build_named(tokenizer)
         if tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
             self.build(starting.tokenizer_of(start_from))
@@ -191,17 +191,17 @@ class Denoiser(TokenModel):
                 self.take_over(self.hparams["start_from"])
             if not self.normalizer.ready:
                 self._fit_statistics()
-        self.recorded = None
+        self.graphed = None
         if self.hparams["cuda_graph"] and self.device.type == "cuda":
             if is_sharded(self.transformer):
                 raise ValueError("cuda_graph: weights in shards cannot be recorded; use another strategy, or leave it")
-            self.recorded = RecordedStep(self._recorded_losses, self._trained())
+            self.graphed = GraphedStep(self.losses_of, self.trained())
         elif self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
 
     def on_fit_end(self) -> None:
-        self.recorded = None  # its memory
+        self.graphed = None  # its memory
 
     def take_over(self, path: str | Path) -> None:
         """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
@@ -218,10 +218,10 @@ class Denoiser(TokenModel):
         generator = step_generator(self.device, *place)
         scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
-        if self.recorded is None:
+        if self.graphed is None:
             losses = self.losses(scene, generator, made)
         else:
-            losses = self.recorded(self._inputs(scene, made), derive(*place, "recorded"))
+            losses = self.graphed(self._inputs(scene, made), derive(*place, "graph"))
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
         return losses["loss"]
@@ -235,13 +235,13 @@ class Denoiser(TokenModel):
         self.log_dict(logged, batch_size=batch.scenes, sync_dist=True, prog_bar=False)
 
     def _inputs(self, scene: Scene, made: Tensor | None) -> dict[str, Tensor]:
-        """What `losses` depends on in a training step, as tensors; `_recorded_losses` takes it."""
+        """What `losses` depends on in a training step, as tensors; `losses_of` takes it."""
         if made is None:
             made = torch.zeros(scene.scenes, scene.frames // TOKEN_FRAMES, dtype=torch.bool, device=scene.device)
         scene = scene.replace(valid=all_valid(scene) if scene.valid is None else scene.valid, given=None)
         return {**scene.tensors(), "made": made, "ramp": torch.full((), self._ramp(), device=scene.device)}
 
-    def _recorded_losses(self, inputs: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+    def losses_of(self, inputs: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
         tensors = dict(inputs)
         made, ramp = tensors.pop("made"), tensors.pop("ramp")
         return self.losses(Scene(**tensors), generator, made, ramp)  # type: ignore[arg-type]
@@ -338,9 +338,10 @@ class Denoiser(TokenModel):
 
     def configure_optimizers(self) -> Any:
         self.require_tokenizer()
-        return warmup_cosine(self, self._trained(), self.optimizer)
+        return warmup_cosine(self, self.trained(), self.optimizer)
 
-    def _trained(self) -> list[nn.Parameter]:
+    def trained(self) -> list[nn.Parameter]:
+        """The parameters that training moves: the network's and the posterior's."""
         parts: list[nn.Module] = [self.transformer]
         if self.posterior is not None:
             parts.append(self.posterior)

@@ -85,7 +85,7 @@ def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -
     T_turn = from_planar(yaw, torch.zeros_like(ground)).to(dtype)
     T_world_root = scene.T_world_root.clone()
     T_world_root[..., :3, :3] = T_turn[..., :3, :3] @ T_world_root[..., :3, :3]
-    T_world_root[..., [0, 2], 3] += ground.to(dtype)
+    T_world_root[..., :3:2, 3] += ground.to(dtype)
     return scene.replace(T_world_root=T_world_root)
 
 
@@ -115,7 +115,6 @@ def with_self_forcing(
     Noise is added to a past, the model restores it in one step, and it is rounded to codes and placed in the world, as
     finished tokens are in sampling. It is then a little blurred and calm. Recorded pairwise transforms keep people
     where they stood to each other, so that what follows, which is still the truth, does not begin with a jump.
-    Off a CPU it is always equally many scenes, the first, some of which have no past.
 
     Args:
         denoise: the model.
@@ -131,13 +130,10 @@ def with_self_forcing(
     Returns:
         (B, N, P, D).
     """
-    past, seen = past_of(levels, faint), may_look(levels.device)
-    few: Tensor | slice = slice(math.ceil(options.share * len(levels)))
-    if seen:
-        selected = torch.rand(len(levels), generator=generator, device=levels.device) < options.share
-        few = (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]
-        if not len(few):
-            return truth
+    past = past_of(levels, faint)
+    few = _some(past, options.share, generator)
+    if isinstance(few, Tensor) and not len(few):
+        return truth
     past, T_world_can = past[few], canonical_frame(scene.T_world_root[few])
     drawn = torch.rand(len(past), 1, 1, generator=generator, device=levels.device)
     even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * drawn
@@ -168,3 +164,11 @@ def with_self_forcing(
     shown = truth.clone()
     shown[few] = torch.where(layout.spread(moved), made, truth[few])
     return shown
+
+
+def _some(past: Tensor, share: float, generator: torch.Generator) -> Tensor | slice:
+    """A share of the scenes: chosen among those with a past, or off a CPU the first, some of which may have none."""
+    if not may_look(past.device):
+        return slice(math.ceil(share * len(past)))
+    selected = torch.rand(len(past), generator=generator, device=past.device) < share
+    return (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]

@@ -147,7 +147,7 @@ class TokenModel(L.LightningModule):
         `tokens` says which are wanted; `packed`, `growing`: see `magnet.tokenizer.lean`.
         """
         everybody = not may_look(scene.device) and scene.agents <= FEW_SLOTS
-        held = (scene.slots() if everybody else scene.people()).pad_frames(TOKEN_FRAMES)
+        held = (each_slot(scene) if everybody else scene.people()).pad_frames(TOKEN_FRAMES)
         first, stop, _ = tokens.indices(scene.frames // TOKEN_FRAMES)
         wanted = slice(first + 1, stop + 1)
         encode = functools.partial(encoded, growing=growing) if packed else encoded_plainly
@@ -207,3 +207,17 @@ class TokenModel(L.LightningModule):
             # A copy, because this one moves to the model's device.
             self._body = (copy.deepcopy(getattr(datamodule, "body", None) or load_body()).to(self.device),)
         return self._body[0]
+
+
+def each_slot(scene: Scene) -> Scene:
+    """Each slot as a scene of its own, (B P, T, 1), whether somebody is in it or not: nobody is looked for."""
+    B, P = scene.present.shape
+    return Scene(
+        body_rot=scene.body_rot.transpose(1, 2).flatten(0, 1).unsqueeze(2),
+        T_world_root=scene.T_world_root.transpose(1, 2).flatten(0, 1).unsqueeze(2),
+        betas=scene.betas.reshape(B * P, 1, -1),
+        present=scene.present.reshape(B * P, 1),
+        fps=scene.fps,
+        body=scene.body,
+        valid=None if scene.valid is None else scene.valid.repeat_interleave(P, dim=0),
+    )

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_whole
+from magnet.denoiser.compiled import answered
 from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import Sampling
@@ -321,15 +322,15 @@ class Rollout:
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
-        width = noisy.shape[1]
         if self._ahead:  # nobody's: shown as the mean of pure noise, which tells nothing of anybody
             noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
             levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
             cond = self._condition(*noisy.shape[:2])
-            clean = self.model.denoise(noisy, levels, present, cond, self._network()).float()
-        self._clean = clean.detach()
-        return clean[:, :width]
+            clean = answered(self.model, noisy, levels, present, cond, self.options.compile)
+            clean = self.model.denoise(noisy, levels, present, cond, self._network()) if clean is None else clean
+        self._clean = clean.detach().float()
+        return clean.float()[:, : clean.shape[1] - self._ahead]
 
     def _condition(self, batch: int, width: int) -> Tensor | None:
         """The condition of a window, for all views and branches of guidance of each scene."""
@@ -367,8 +368,7 @@ class Rollout:
             last = int(min(self.stop + (self.chunk or FEW), self.there))
             # What is known is encoded with all the neighbours that its codes can depend on.
             low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
-            known = self._known(low, high)
-            given = self._given(low, high)
+            known, given = self._known(low, high), self._given(low, high)
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
             limits, packed = self._limits(low, high, part), self.options.precision != "reference"

@@ -170,20 +170,6 @@ class Scene:
             given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
         )
 
-    def slots(self) -> Scene:
-        """Each slot as a scene of its own, (B P, T, 1), whether somebody is in it or not; names are dropped."""
-        B, P = self.present.shape
-        return Scene(
-            body_rot=self.body_rot.transpose(1, 2).flatten(0, 1).unsqueeze(2),
-            T_world_root=self.T_world_root.transpose(1, 2).flatten(0, 1).unsqueeze(2),
-            betas=self.betas.view(B * P, 1, -1),
-            present=self.present.view(B * P, 1),
-            fps=self.fps,
-            body=self.body,
-            valid=None if self.valid is None else self.valid.repeat_interleave(P, dim=0),
-            given=None if self.given is None else self.given.transpose(1, 2).reshape(B * P, -1, 1),
-        )
-
     def pad_frames(self, frames: int) -> Scene:
         """The scene with its first and last frame repeated so many times, before and after it."""
         T = self.frames

@@ -12,9 +12,9 @@ from torch.optim.swa_utils import AveragedModel
 
 
 class Average(AveragedModel):
-    """torch's average whose count of steps stays on the CPU: a GPU would be waited for to read it, three times a step."""
+    """torch's average whose count of steps stays on the CPU: on a GPU it would be waited for, three times a step."""
 
-    def __init__(self, model: nn.Module, device: torch.device, decay: float) -> None:
+    def __init__(self, model: nn.Module, device: torch.device | int, decay: float) -> None:
         super().__init__(model, device)
         self.decay = decay
         self.n_averaged = torch.zeros((), dtype=torch.long)
@@ -23,7 +23,8 @@ class Average(AveragedModel):
     def update_parameters(self, model: nn.Module) -> None:
         done = float(self.n_averaged)
         decay = min(self.decay, (1 + done) / (10 + done)) if done else 0.0
-        averaged, current = list(self.module.parameters()), list(model.parameters())
+        averaged: list[Tensor] = list(self.module.parameters())
+        current: list[Tensor] = list(model.parameters())
         torch._foreach_lerp_(averaged, current, 1 - decay)
         for own, its in zip(self.module.buffers(), model.buffers(), strict=True):
             own.copy_(its)

@@ -19,7 +19,7 @@ WARM_UP = 3
 """Runs before a recording, in which libraries start and tables are sent to the GPU."""
 
 
-class Recording:
+class CudaGraph:
     """A function of tensors, recorded.
 
     Args:
@@ -58,7 +58,26 @@ def kind_of(inputs: Mapping[str, Tensor]) -> tuple[Any, ...]:
     return tuple((name, tuple(value.shape), value.dtype) for name, value in inputs.items())
 
 
-class RecordedStep:
+def replayed(
+    graphs: dict[tuple[Any, ...], CudaGraph], run: Callable[..., Tensor], inputs: Mapping[str, Tensor]
+) -> Tensor:
+    """What a function that draws nothing makes of its inputs, without gradients; recorded in its first such call.
+
+    Args:
+        graphs: of the same function.
+        run: takes inputs by name.
+        inputs: by name.
+    """
+    device = next(iter(inputs.values())).device
+    kind = (torch.is_autocast_enabled(device.type), torch.get_autocast_dtype(device.type), *kind_of(inputs))
+    with torch.inference_mode(False), torch.no_grad():  # what is recorded in inference mode is not written to outside
+        if kind not in graphs:
+            graphs[kind] = CudaGraph(lambda given, _: run(**given), inputs)
+        made: Tensor = graphs[kind].replay(inputs)
+        return made.clone()
+
+
+class GraphedStep:
     """Losses and their gradients, recorded for each kind of inputs.
 
     Args:
@@ -69,13 +88,13 @@ class RecordedStep:
     def __init__(self, losses: Losses, parameters: Sequence[nn.Parameter]) -> None:
         self.losses, self.parameters = losses, list(parameters)
         self.names: list[str] = []
-        self.recordings: dict[tuple[Any, ...], Recording] = {}
+        self.recordings: dict[tuple[Any, ...], CudaGraph] = {}
 
     def __call__(self, inputs: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
         """Losses by name, of which `loss` can be backpropagated, once, to the parameters."""
         kind = kind_of(inputs)
         if kind not in self.recordings:
-            self.recordings[kind] = Recording(self._with_gradients, inputs)
+            self.recordings[kind] = CudaGraph(self._with_gradients, inputs)
         recording = self.recordings[kind]
         torch.manual_seed(seed)
         recording.generator.manual_seed(seed)
