@@ -78,4 +78,4 @@ def test_what_comes_back_is_a_model_in_parts_and_its_curve(tmp_path: Path, monke
 
 def test_the_configuration_is_of_the_papers_size() -> None:
     model = yaml.safe_load((ROOT / "configs" / "gpu_round.yaml").read_text())["model"]["init_args"]
-    assert (model["network"]["width"], model["network"]["layers"], model["compile"]) == (512, 6, True)
+    assert (model["network"]["width"], model["network"]["layers"], model["cuda_graph"]) == (512, 6, True)

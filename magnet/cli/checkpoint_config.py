@@ -234,7 +234,7 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
     return layer
 
 
-OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "seed"}
+OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "cuda_graph", "seed"}
 """Options that a model does not take over from the one that it starts from."""
 
 
