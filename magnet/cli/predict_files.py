@@ -102,6 +102,9 @@ def main(arguments: Sequence[str]) -> int:
         taken, words = taken_out(words, rf"--{name}\.")
         groups[name] = list(itertools.chain.from_iterable(taken))
     options = parser().parse_args(words)
+    for path in options.inputs:
+        if Path(path).suffix.lower() in READ and not Path(path).exists():  # before anything else is asked for
+            raise CommandError(f"{path}: no such file")
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     for name, least in (("frames", 1), ("context", 0), ("samples", 1)):

@@ -120,11 +120,12 @@ def test_a_crowd_comes_from_nothing_as_far_apart_as_is_said(tmp_path, capsys) ->
             ("BVH --out a.npz --sampler steddy", "did you mean steady?"),
             ("BVH --out a.npz --task partner_inpaintin", "did you mean partner_inpainting?"),
             ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
-            ("none.bvh --out a.npz", "none.bvh"),
+            ("none.bvh --out a.npz", "none.bvh: no such file"),
+            ("none.npz --task joint_future", "none.npz: no such file"),
             ("one.npz --task partner_inpainting --out a.npz", "`magnet predict --people 2` adds another"),
             ("--task joint_future BVH --out a.obj", "nothing writes .obj"),
         ],
-        4,
+        5,
     ),
 )
 def test_a_mistake_is_answered_by_what_would_be_right(
