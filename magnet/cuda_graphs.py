@@ -6,7 +6,7 @@ A replayed graph is one of them. What is recorded must take fixed shapes and nev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -33,7 +33,8 @@ class CudaGraph:
         self.generator = torch.Generator(device=device)
         half = torch.is_autocast_enabled(device.type)
         # Casts of weights that autocast keeps would be those of the first step for ever.
-        with torch.autocast(device.type, torch.get_autocast_dtype(device.type), half, cache_enabled=False):
+        cast = torch.autocast(device.type, torch.get_autocast_dtype(device.type), half, cache_enabled=False)
+        with torch.cuda.device(device), cast:
             current, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
             aside.wait_stream(current)
             with torch.cuda.stream(aside):
@@ -42,7 +43,7 @@ class CudaGraph:
             current.wait_stream(aside)
             self.graph = torch.cuda.CUDAGraph()
             self.graph.register_generator_state(self.generator)
-            with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+            with torch.cuda.graph(self.graph, stream=aside, capture_error_mode="thread_local"):
                 self.made = run(self.inputs, self.generator)
 
     def replay(self, inputs: Mapping[str, Tensor]) -> Any:
@@ -86,13 +87,16 @@ class GraphedStep:
     """
 
     def __init__(self, losses: Losses, parameters: Sequence[nn.Parameter]) -> None:
-        self.losses, self.parameters = losses, list(parameters)
+        self.losses, self.parameters = losses, [each for each in parameters if each.requires_grad]
         self.names: list[str] = []
         self.recordings: dict[tuple[Any, ...], CudaGraph] = {}
 
-    def __call__(self, inputs: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
-        """Losses by name, of which `loss` can be backpropagated, once, to the parameters."""
-        kind = kind_of(inputs)
+    def __call__(self, inputs: Mapping[str, Tensor], seed: int, settings: Hashable = None) -> dict[str, Tensor]:
+        """Losses by name, of which `loss` can be backpropagated, once, to the parameters.
+
+        `settings` are what the losses depend on beside: with others they are recorded anew.
+        """
+        kind = (settings, *kind_of(inputs))
         if kind not in self.recordings:
             self.recordings[kind] = CudaGraph(self._with_gradients, inputs)
         recording = self.recordings[kind]

@@ -21,9 +21,14 @@ def may_look(device: torch.device) -> bool:
     return _looking and device.type == "cpu"
 
 
+def is_recording(device: torch.device) -> bool:
+    """Whether a CUDA graph is being recorded, in which looking is not slow but impossible."""
+    return not _looking or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
+
+
 @contextmanager
 def as_off_cpu() -> Iterator[None]:
-    """Within it numbers on a CPU are not looked at either, as if they were on a GPU: for tests and rehearsals."""
+    """Within it numbers on a CPU are not looked at either, as if a GPU recorded what runs: for tests and rehearsals."""
     global _looking
     before, _looking = _looking, False
     try:

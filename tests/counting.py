@@ -10,12 +10,23 @@ import torch
 class Counting(torch.utils._python_dispatch.TorchDispatchMode):
     """Counts operators, the numbers that they make, and those that make a GPU and its host wait for each other.
 
+    On a CPU `tolist`, `numpy` and `cpu` run no operator, and are not seen.
+
     Attributes:
         waits: names of operators whose answer, or the shape of it, the host waits for.
         sent: how many constants of the host went to the device, which a CUDA graph cannot hold.
     """
 
-    WAITS = ("_local_scalar_dense", "nonzero", "_unique", "unique_dim", "masked_select", "equal", "is_nonzero")
+    WAITS = (
+        "_local_scalar_dense",
+        "_linalg_check_errors",
+        "nonzero",
+        "_unique",
+        "unique_dim",
+        "masked_select",
+        "equal",
+        "is_nonzero",
+    )
 
     def __init__(self) -> None:
         super().__init__()

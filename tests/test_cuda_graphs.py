@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,9 +12,14 @@ from torch import Tensor
 
 from magnet import cuda_graphs
 from magnet.cuda_graphs import CudaGraph, GraphedStep, replayed
+from magnet.denoiser import compiled
 from magnet.denoiser.compiled import answered
 from magnet.denoiser.module import Denoiser
+from magnet.generation.crowd import generate_crowd
+from magnet.generation.rollout import generate
+from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive
+from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
@@ -122,10 +128,84 @@ def test_evaluations_are_recorded_once_for_each_kind_and_handed_out_as_copies(st
     assert len(graphs) == StandIn.recorded == 3
 
 
+def test_what_else_losses_depend_on_is_recorded_anew_and_what_is_frozen_has_no_gradient(stand_in: None) -> None:
+    net = torch.nn.Linear(3, 2)
+    net.bias.requires_grad_(False)
+    step, x = GraphedStep(noisy_square(net), list(net.parameters())), torch.randn(4, 3)
+    for settings, count in (("a", 1), ("b", 2), ("a", 2)):
+        step({"x": x}, 0, settings)["loss"].backward()
+        assert StandIn.recorded == count
+    assert net.weight.grad is not None and net.bias.grad is None
+
+
 def test_on_a_cpu_nothing_is_replayed() -> None:
     question = torch.zeros(1, 8, 3, 4), torch.zeros(1, 8, 3, dtype=torch.long), torch.ones(1, 3, dtype=torch.bool)
     with torch.no_grad():
         assert answered(None, *question, None, compiled=True) is None
+
+
+@pytest.mark.parametrize("people", [3, 5])
+def test_scenes_are_the_same_and_crowds_are_not_recorded(
+    people: int, stand_in: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiled, "records", lambda tensor: True)
+    model = tiny_denoiser()
+    scene = random_scene(1, 8, people, torch.Generator().manual_seed(0))
+
+    def made(**options: Any) -> Tensor:
+        sampler, generator = SamplerOptions(steps=2, **options), torch.Generator().manual_seed(1)
+        sample = generate if people == 3 else generate_crowd
+        return sample(model, scene, registry.get("joint_future")(), 8, 16, 1, sampler, generator).T_world_root
+
+    replayed_scene = made(compile=True)
+    assert torch.allclose(replayed_scene, made(precision="reference" if people == 3 else "float32"), atol=1e-4)
+    assert StandIn.recorded == (1 if people == 3 else 0)
+
+
+def test_a_graph_reads_weights_where_they_lie(stand_in: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "records", lambda tensor: True)
+    model = tiny_denoiser()
+    size = model.layout.width
+    question = torch.randn(1, 8, 3, size), torch.full((1, 8, 3), 500), torch.ones(1, 3, dtype=torch.bool)
+
+    def same() -> bool:
+        with torch.no_grad():
+            answer = answered(model, *question, None, compiled=True)
+            return answer is not None and torch.allclose(answer, model.denoise(*question), atol=1e-6)
+
+    assert same() and StandIn.recorded == 1
+    with torch.no_grad():
+        model.transformer.out_proj.bias += 1
+    assert same() and StandIn.recorded == 1
+    model.normalizer.load_state_dict({k: v.clone() for k, v in model.normalizer.state_dict().items()}, assign=True)
+    assert same() and StandIn.recorded == 2
+
+
+class Conditioned(Denoiser):
+    def condition(self, scene: Any) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("kind", "precision", "word"),
+    [(Denoiser, "16-mixed", "bf16-mixed"), (Conditioned, "bf16-mixed", "conditions"), (Denoiser, "bf16-mixed", "")],
+)
+def test_what_a_graph_would_not_repeat_is_refused(
+    kind: type[Denoiser], precision: str, word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tiny_denoiser(cuda_graph=True)
+    model.__class__ = kind
+    scaler = object() if precision == "16-mixed" else None
+    monkeypatch.setattr(kind, "device", torch.device("cuda"))
+    monkeypatch.setattr(kind, "trainer", SimpleNamespace(precision_plugin=SimpleNamespace(scaler=scaler)))
+    if word:
+        with pytest.raises(ValueError, match=f"cuda_graph: .*{word}"):
+            model.on_fit_start()
+    else:
+        model.on_fit_start()
+        assert model.graphed is not None
+        model.on_fit_end()
+        assert model.graphed is None
 
 
 @on_gpu

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
+import weakref
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch._dynamo.exc import TorchDynamoException
 
 from magnet.cuda_graphs import CudaGraph, replayed
-from magnet.packing import Kept
+from magnet.denoiser.transformer import is_sharded
 
 Run = Callable[..., Any]
 
-GRAPHS: Kept[dict[tuple[Any, ...], CudaGraph]] = Kept(lambda network: {})
-"""CUDA graphs of a model's evaluations, of each kind of question, as long as its weights stay."""
+_GRAPHS: weakref.WeakKeyDictionary[nn.Module, tuple[list[int], dict[tuple[Any, ...], CudaGraph]]]
+_GRAPHS = weakref.WeakKeyDictionary()
+"""CUDA graphs of a model's evaluations, and where its numbers lie that these read: other values there are seen."""
 
 
 def answered(
@@ -24,11 +27,23 @@ def answered(
 ) -> Tensor | None:
     """What `Denoiser.denoise` answers, by a CUDA graph of it, in which the network runs as it is trained.
 
-    None: it was not asked for, or this is no GPU, or the question has a condition or wants a gradient.
+    None: it was not asked for, or cannot be: this is no GPU, or the question has a condition or wants a gradient, or
+    weights lie in shards, or this is a crowd, which asks in views that change.
     """
-    if not compiled or cond is not None or noisy.device.type != "cuda" or torch.is_grad_enabled():
+    if not compiled or cond is not None or not records(noisy) or torch.is_grad_enabled():
         return None
-    return replayed(GRAPHS.of(model), model.denoise, {"noisy": noisy, "levels": levels, "present": present})
+    if "denoise" in vars(model) or is_sharded(model.transformer):
+        return None
+    where = [each.data_ptr() for each in itertools.chain(model.parameters(), model.buffers())]
+    kept = _GRAPHS.get(model)
+    if kept is None or kept[0] != where:
+        kept = _GRAPHS[model] = (where, {})
+    return replayed(kept[1], model.denoise, {"noisy": noisy, "levels": levels, "present": present})
+
+
+def records(tensor: Tensor) -> bool:
+    """Whether what runs on this tensor's device can be recorded."""
+    return tensor.device.type == "cuda"
 
 
 class Compiled:

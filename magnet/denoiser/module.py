@@ -193,15 +193,34 @@ class Denoiser(TokenModel):
                 self._fit_statistics()
         self.graphed = None
         if self.hparams["cuda_graph"] and self.device.type == "cuda":
-            if is_sharded(self.transformer):
-                raise ValueError("cuda_graph: weights in shards cannot be recorded; use another strategy, or leave it")
+            self._require_recordable()
             self.graphed = GraphedStep(self.losses_of, self.trained())
         elif self.hparams["compile"]:
             for block in self.transformer.blocks:
                 block.compile(dynamic=True)
 
+    def setup(self, stage: str) -> None:
+        self.graphed = None  # of a training that was interrupted; it cannot be copied
+        super().setup(stage)
+
     def on_fit_end(self) -> None:
         self.graphed = None  # its memory
+
+    def _require_recordable(self) -> None:
+        """Refuse a training that a CUDA graph would not repeat.
+
+        Raises:
+            ValueError: weights in shards, a loss that is scaled, or conditions, which may read what is no tensor.
+        """
+        why = ""
+        if is_sharded(self.transformer):
+            why = "weights in shards cannot be recorded; use another strategy"
+        if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
+            why = "gradients of 16-mixed would vanish before they are scaled; take --trainer.precision bf16-mixed"
+        if type(self).condition is not Denoiser.condition:
+            why = "conditions are not recorded"
+        if why:
+            raise ValueError(f"cuda_graph: {why}, or leave out --model.cuda_graph")
 
     def take_over(self, path: str | Path) -> None:
         """Start from another denoiser's weights; see `magnet.denoiser.starting.start_from`."""
@@ -218,10 +237,11 @@ class Denoiser(TokenModel):
         generator = step_generator(self.device, *place)
         scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
+        settings = (self.loss, self.noise, self.self_forcing)
         if self.graphed is None:
             losses = self.losses(scene, generator, made)
         else:
-            losses = self.graphed(self._inputs(scene, made), derive(*place, "graph"))
+            losses = self.graphed(self._inputs(scene, made), derive(*place, "graph"), settings)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
         return losses["loss"]
@@ -239,6 +259,7 @@ class Denoiser(TokenModel):
         if made is None:
             made = torch.zeros(scene.scenes, scene.frames // TOKEN_FRAMES, dtype=torch.bool, device=scene.device)
         scene = scene.replace(valid=all_valid(scene) if scene.valid is None else scene.valid, given=None)
+        scene = scene.pad_agents(self.layout.agents)  # one recording for all
         return {**scene.tensors(), "made": made, "ramp": torch.full((), self._ramp(), device=scene.device)}
 
     def losses_of(self, inputs: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
@@ -265,7 +286,7 @@ class Denoiser(TokenModel):
         layout, weight = self.layout, self.loss
         with torch.no_grad():
             tokens, there = self.tokenize(scene)
-            scene = scene.pad_agents(layout.agents)
+            scene = scene.pad_agents(layout.agents).replace(names=())  # by which a GPU would be waited for
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             drawn = self.noise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -54,7 +53,7 @@ def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Gener
     B, N, device = scene.scenes, scene.frames // TOKEN_FRAMES, generator.device
     replaced = torch.rand(B, generator=generator, device=device) < made.share
     chosen = torch.randint(made.scenes.scenes, (B,), generator=generator, device=device)
-    both = concatenate([scene, made.scenes])
+    both = concatenate([each.replace(names=()) for each in (scene, made.scenes)])  # names are the host's
     mixed = both.select(torch.where(replaced, B + chosen, torch.arange(B, device=device)))
     return mixed, replaced[:, None] & (torch.arange(N, device=device) < made.past)
 
@@ -169,6 +168,6 @@ def with_self_forcing(
 def _some(past: Tensor, share: float, generator: torch.Generator) -> Tensor | slice:
     """A share of the scenes: chosen among those with a past, or off a CPU the first, some of which may have none."""
     if not may_look(past.device):
-        return slice(math.ceil(share * len(past)))
+        return slice(max(round(share * len(past)), 1))
     selected = torch.rand(len(past), generator=generator, device=past.device) < share
     return (past.flatten(1).any(dim=1) & selected).nonzero()[:, 0]

@@ -17,14 +17,17 @@ from torch import Tensor
 from magnet.motion.cholesky import factored, inverted
 from magnet.motion.frames import from_planar, partners, project_se2, to_planar
 from magnet.motion.planar import rotate_ground
-from magnet.waiting import may_look
+from magnet.waiting import is_recording
 
 Placement = Literal["integrate", "anchor", "fuse"]
 
 TURN = 2 * math.pi
 
 ROUNDS = 3
-"""How often `fuse` counts whole turns where it cannot see whether they have changed; twice nearly always suffices."""
+"""How often `fuse` counts whole turns while a CUDA graph is recorded, when it cannot see whether they still change.
+
+Twice suffices where pairs and deltas agree; where they contradict each other, it may take dozens.
+"""
 
 FIXED = 1e9
 """Weight of a delta that is known: `fuse` moves such an agent by less than rounding does."""
@@ -159,7 +162,7 @@ def fuse(predicted: Predicted) -> Tensor:
     for rounds in itertools.count():
         # A pair's heading counts the short way round: by whole turns that follow from the frames before.
         new = ((pair_yaw - (turned[:, :, partner] - turned[..., None])) / TURN).round()
-        if turns is not None and (torch.equal(new, turns) if may_look(new.device) else rounds == ROUNDS):
+        if turns is not None and (rounds == ROUNDS if is_recording(new.device) else torch.equal(new, turns)):
             break
         turns = new
         yaw = accumulated(keep, keep @ steps + pulled((pair_yaw - TURN * turns)[..., None]), begins)[..., 0]

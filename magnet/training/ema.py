@@ -23,10 +23,12 @@ class Average(AveragedModel):
     def update_parameters(self, model: nn.Module) -> None:
         done = float(self.n_averaged)
         decay = min(self.decay, (1 + done) / (10 + done)) if done else 0.0
-        averaged: list[Tensor] = list(self.module.parameters())
-        current: list[Tensor] = list(model.parameters())
+        pairs = list(zip(self.module.parameters(), model.parameters(), strict=True))
+        averaged: list[Tensor] = [own for own, _ in pairs if own.is_floating_point()]
+        current: list[Tensor] = [its for _, its in pairs if its.is_floating_point()]
         torch._foreach_lerp_(averaged, current, 1 - decay)
-        for own, its in zip(self.module.buffers(), model.buffers(), strict=True):
+        others = [pair for pair in pairs if not pair[0].is_floating_point()]
+        for own, its in [*others, *zip(self.module.buffers(), model.buffers(), strict=True)]:
             own.copy_(its)
         self.n_averaged += 1
 

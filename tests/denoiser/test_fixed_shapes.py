@@ -40,7 +40,7 @@ def scene() -> Scene:
     made = random_scene(6, 4 * N, 3, torch.Generator().manual_seed(5), present)
     valid = torch.ones(6, 4 * N, dtype=torch.bool)
     valid[2, 20:] = False
-    return made.replace(valid=valid)
+    return made.replace(valid=valid, names=tuple("abcdef"))
 
 
 def taught(kind: str, **more: Any) -> Denoiser:
@@ -58,6 +58,7 @@ def test_a_training_step_looks_at_nothing_and_sends_nothing_off_a_cpu(
     monkeypatch.setattr(Denoiser, "global_step", 1)
     model, batch = taught(kind, self_forcing={"share": 0.5, "displaced": 0.5}), shown(kind, scene)
     past = MadePasts(batch.select([0, 1]), 3, 0.5)
+    assert (batch.names and past.scenes.names) or kind == "alone"
 
     def step() -> None:
         generator = torch.Generator().manual_seed(0)

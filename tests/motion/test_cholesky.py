@@ -21,6 +21,9 @@ def test_what_is_solved_solves_the_equations_on_every_device() -> None:
     assert torch.allclose(factor @ factor.mT, matrix)
     assert torch.allclose(matrix @ solved(right, factor), right)
     assert torch.allclose(matrix @ inverted(factor), torch.eye(5, dtype=torch.float64).expand_as(matrix))
+    with Counting() as checked:
+        torch.linalg.cholesky(matrix)
+    assert checked.waits  # so that the next lines can fail
     with as_off_cpu(), Counting() as counted:
         off = solved(right, factored(matrix)), inverted(factored(matrix))
     assert not counted.waits
