@@ -22,12 +22,14 @@ from magnet.sampling.grid import Grid
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive
 from magnet.tasks import registry
+from magnet.tasks.base import Task
+from magnet.tasks.joint import JointFuture
 
 COMPARED = 16
 """Frames at the end of a generated past by which the recorded continuation is chosen."""
 
 GOING_ON = Grid(tokens=8, agents=2, context=4)
-"""On which it is found out whether a task goes on from a past alone."""
+"""On which it is found out what a task reads and finishes."""
 
 BLEND = 8
 """Frames over which poses change from the generated past to the recorded continuation."""
@@ -52,7 +54,8 @@ class RollOuts(Callback):
         steps: denoising steps of the sampler.
         return_frames: frames over which people return to their recorded places.
         stretches: training clips that are kept to choose from.
-        tasks: the tasks of which each roll-out draws one; tasks that go on from a past alone.
+        tasks: the tasks of which each roll-out draws one. A task that reads what is to come, as `motion_control` does
+            of those whom it answers, reads a joint future that the model has made before.
     """
 
     def __init__(
@@ -84,8 +87,8 @@ class RollOuts(Callback):
         self.tasks = [registry.get(task)() for task in tasks]
         for name, task in zip(tasks, self.tasks, strict=True):
             plan = task.schedule(GOING_ON)
-            if not torch.equal(plan.known, GOING_ON.past()) or not bool(plan.finished.all()):
-                raise ValueError(f"tasks: got {name}, expected tasks that make everybody's future from a past alone")
+            if not bool(plan.known[GOING_ON.past()].all()) or not bool(plan.finished.all()):
+                raise ValueError(f"tasks: got {name}, expected tasks that go on from a past and leave nobody unknown")
         self.kept: list[Scene] = []
         self.filled, self.start = -1, start
 
@@ -137,7 +140,10 @@ class RollOuts(Callback):
         if past < COMPARED:
             raise ValueError(f"RollOuts: got windows of {frames} frames, expected at least {2 * COMPARED}")
         near = NearestNeighbour(concatenate(self.kept).slice(0, COMPARED + frames - past))
-        people = torch.tensor([int(n) in near.stretches for n in batch.present.sum(dim=1)])
+        count = len(self.tasks)
+        which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
+        task, fewest = self.tasks[which], 2 if reads_ahead(self.tasks[which]) else 1
+        people = torch.tensor([int(n) in near.stretches and int(n) >= fewest for n in batch.present.sum(dim=1)])
         whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()
         chosen = whole.nonzero()[: self.scenes, 0]
         if not len(chosen):
@@ -145,17 +151,27 @@ class RollOuts(Callback):
         low, high = (-(-count // TOKEN_FRAMES) * TOKEN_FRAMES for count in self.frames)
         draw = torch.rand((), generator=generator, device=generator.device)
         more = low + int(draw * ((high - low) // TOKEN_FRAMES + 1)) * TOKEN_FRAMES
-        count = len(self.tasks)
-        which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
         start = batch.select(chosen).slice(0, past)
         training = model.training
         model.eval()
         with precision or nullcontext():
-            made = generate(model, start, self.tasks[which], past, more, 1, self.sampler, generator)
+            made = self._continued(model, start, task, more, generator)
         model.train(training)
         made = made.slice(made.frames - past)
         behind = near(made.slice(past - COMPARED).to("cpu"), frames - past).to(made.device)
         return MadePasts(cat_time([made, eased(made, behind, self.return_frames)]), past // TOKEN_FRAMES, self.share)
+
+    def _continued(self, model: Denoiser, start: Scene, task: Task, more: int, generator: torch.Generator) -> Scene:
+        """A past and so many frames more, made by a task."""
+        rest = start.frames, more, 1, self.sampler, generator
+        if reads_ahead(task):  # who is given comes first
+            start = generate(model, start, JointFuture(), *rest)
+        return generate(model, start, task, *rest)
+
+
+def reads_ahead(task: Task) -> bool:
+    """Whether a task reads what comes after the past: of somebody who is given, or at keyframes."""
+    return not torch.equal(task.schedule(GOING_ON).known, GOING_ON.past())
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:

@@ -5,8 +5,12 @@ import torch
 
 from magnet.callbacks import RollOuts
 from magnet.callbacks.rollouts import eased
+from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.rotations import geodesic
+from magnet.motion.scene import Scene
+from magnet.tasks.joint import JointFuture
+from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 from tests.denoiser.test_module import data, trainer
 
@@ -123,21 +127,42 @@ def test_wrong_options_are_refused(wrong):
         RollOuts(**wrong)
 
 
-OTHERS = ("partner_prediction", "motion_control", "partner_inpainting", "generation", "inbetweening")
+OTHERS = ("partner_prediction", "generation")
 
 
 @pytest.mark.parametrize("task", OTHERS)
 def test_only_tasks_that_go_on_from_a_past_are_rolled_out(task):
-    with pytest.raises(ValueError, match=f"tasks: got {task}, expected tasks that make everybody's future"):
+    with pytest.raises(ValueError, match=f"tasks: got {task}, expected tasks that go on from a past"):
         RollOuts(tasks=(task,))
     with pytest.raises(ValueError, match="tasks: got none"):
         RollOuts(tasks=())
 
 
-def test_people_who_take_turns_are_rolled_out(made):
+@pytest.mark.parametrize("task", ["agentic_async", "motion_control", "inbetweening"])
+def test_other_tasks_are_rolled_out_too(task, made):
     batch, _, model = made
-    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2, tasks=("agentic_async",))
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2, tasks=(task,))
     rolling.keep(batch)
     pasts = rolling.rolled_out(model, batch, torch.Generator().manual_seed(1))
     assert pasts.scenes.frames == FRAMES and pasts.scenes.T_world_root.isfinite().all()
     assert not torch.equal(pasts.scenes.T_world_root, made[1].scenes.T_world_root)
+
+
+def test_who_is_given_in_a_roll_out_was_made_before(made, monkeypatch):
+    batch, _, model = made
+    asked: list[tuple[type, Scene, Scene]] = []
+
+    def watched(model, scene, task, *rest):
+        asked.append((type(task), scene, generate(model, scene, task, *rest)))
+        return asked[-1][2]
+
+    monkeypatch.setattr("magnet.callbacks.rollouts.generate", watched)
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2, tasks=("motion_control",))
+    rolling.keep(batch)
+    rolling.rolled_out(model, batch, torch.Generator().manual_seed(1))
+    (first, start, joint), (second, read, answered) = asked
+    assert (first, second) == (JointFuture, MotionControl)
+    assert read is joint and joint.frames == start.frames + 32
+    assert bool(joint.present[:, 1].all())  # the first answers the others, so somebody else is there
+    assert torch.equal(answered.T_world_root[:, :, 1], joint.T_world_root[:, :, 1])
+    assert not torch.equal(answered.T_world_root[:, -16:, 0], joint.T_world_root[:, -16:, 0])
