@@ -142,8 +142,10 @@ class RollOuts(Callback):
         near = NearestNeighbour(concatenate(self.kept).slice(0, COMPARED + frames - past))
         count = len(self.tasks)
         which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
-        task, fewest = self.tasks[which], 2 if reads_ahead(self.tasks[which]) else 1
-        people = torch.tensor([int(n) in near.stretches and int(n) >= fewest for n in batch.present.sum(dim=1)])
+        task = self.tasks[which]
+        people = torch.tensor([int(n) in near.stretches for n in batch.present.sum(dim=1)])
+        if reads_ahead(task):  # the first slot answers others, who must be there
+            people &= (batch.present[:, 0] & batch.present[:, 1:].any(dim=1)).cpu()
         whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()
         chosen = whole.nonzero()[: self.scenes, 0]
         if not len(chosen):
