@@ -156,7 +156,7 @@ def _between_wrists(mine: Tensor, seen: Tensor) -> Tensor:
 
     mine (B, T, P, 22, 3), seen (B, T, P, P - 1, 22, 3) -> (B, T, P, P - 1, 2, 2, 3)
     """
-    wrists = slice(WRISTS[0], WRISTS[1] + 1)
+    wrists = slice(WRISTS[0], WRISTS[1] + 1)  # a tuple would be sent to the device each time
     return seen[..., None, wrists, :] - mine[:, :, :, None, wrists, None, :]
 
 

@@ -57,8 +57,8 @@ class Denoiser(TokenModel):
         optimizer: AdamW, or Muon for matrices.
         sampling: how the trained model is best sampled, where a sampler leaves it open.
         compile: compile the blocks for training; worth it on a GPU, not on a CPU.
-        cuda_graph: train by replaying one CUDA graph of forward and backward, which a GPU does not wait for its host
-            in; on other devices nothing changes.
+        cuda_graph: train by replaying forward and backward as one CUDA graph, so that a GPU does not wait for its host;
+            on other devices nothing changes.
         seed: all training noise follows from it.
     """
 
@@ -191,7 +191,6 @@ class Denoiser(TokenModel):
                 self.take_over(self.hparams["start_from"])
             if not self.normalizer.ready:
                 self._fit_statistics()
-        self.graphed = None
         if self.hparams["cuda_graph"] and self.device.type == "cuda":
             self._require_recordable()
             self.graphed = GraphedStep(self.losses_of, self.trained())
@@ -237,10 +236,10 @@ class Denoiser(TokenModel):
         generator = step_generator(self.device, *place)
         scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
-        settings = (self.loss, self.noise, self.self_forcing)
         if self.graphed is None:
             losses = self.losses(scene, generator, made)
         else:
+            settings = (self.loss, self.noise, self.self_forcing)
             losses = self.graphed(self._inputs(scene, made), derive(*place, "graph"), settings)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
         self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
@@ -263,6 +262,7 @@ class Denoiser(TokenModel):
         return {**scene.tensors(), "made": made, "ramp": torch.full((), self._ramp(), device=scene.device)}
 
     def losses_of(self, inputs: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+        """`losses` of a training step whose batch is tensors by name: what a CUDA graph of it replays."""
         tensors = dict(inputs)
         made, ramp = tensors.pop("made"), tensors.pop("ramp")
         return self.losses(Scene(**tensors), generator, made, ramp)  # type: ignore[arg-type]

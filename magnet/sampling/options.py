@@ -92,8 +92,8 @@ class SamplerOptions:
             fast on a CPU and rounds otherwise than the network as it is trained, `reference`; or `bf16` or `int8`,
             the blocks in half precision or in 8-bit whole numbers, trades (docs/speed.md says what they cost in
             poses). On a processor without such instructions they round as much and are no faster.
-        compile: on a GPU a whole evaluation as one CUDA graph, recorded in a second for each size of question, and run
-            as `reference`; on a CPU the network's blocks by torch.compile, with `int8`, for which the first evaluation
+        compile: on a GPU a whole evaluation as one CUDA graph, recorded at the first question of each size, and run as
+            `reference`; on a CPU the network's blocks by torch.compile, with `int8`, for which the first evaluation
             waits half a minute, in later runs ten seconds; with packed weights it says that it does not. Conditions and
             smoothing guidance go without, networks with `causal_block` on a CPU too (docs/speed.md).
     """

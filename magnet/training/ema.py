@@ -14,10 +14,10 @@ from torch.optim.swa_utils import AveragedModel
 class Average(AveragedModel):
     """torch's average whose count of steps stays on the CPU: on a GPU it would be waited for, three times a step."""
 
-    def __init__(self, model: nn.Module, device: torch.device | int, decay: float) -> None:
-        super().__init__(model, device)
-        self.decay = decay
-        self.n_averaged = torch.zeros((), dtype=torch.long)
+    def __init__(self, copied: nn.Module, decay: float) -> None:
+        nn.Module.__init__(self)  # torch's would copy the copy
+        self.module, self.decay = copied, decay
+        self.register_buffer("n_averaged", torch.zeros((), dtype=torch.long))
 
     @torch.no_grad()
     def update_parameters(self, model: nn.Module) -> None:
@@ -58,7 +58,7 @@ class WeightEMA(WeightAveraging):
             )  # Lightning sets callbacks up first, and a copy would lack what the model makes there
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model = Average(self._average_model.module, self._device or pl_module.device, self.decay)
+            self._average_model = Average(self._average_model.module, self.decay)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._own = None

@@ -1,3 +1,5 @@
+import copy
+
 import torch
 
 from magnet import checkpoints
@@ -44,12 +46,12 @@ def test_checkpoints_hold_the_average_and_leave_the_tokenizer_bit_identical(tmp_
 def test_all_weights_are_averaged_at_once() -> None:
     """One by one, a GPU and its host would wait for each other at each of them."""
     net = torch.nn.Sequential(*[torch.nn.Linear(3, 3) for _ in range(20)])
-    average = Average(net, torch.device("cpu"), 0.5)
+    average = Average(copy.deepcopy(net), 0.5)
     average.update_parameters(net)
     with Counting() as counted:
         average.update_parameters(net)
     assert len(counted.waits) == 1  # the count of steps, which is on the CPU wherever weights are
-    assert Average(net, torch.device("meta"), 0.5).n_averaged.device.type == "cpu"
+    assert Average(net.to("meta"), 0.5).n_averaged.device.type == "cpu"
 
 
 def test_a_released_model_is_a_checkpoint_like_any_other(tmp_path):
