@@ -62,7 +62,7 @@ def read_yaml(file: str) -> dict[str, Any]:
     """
     path = Path(file)
     if not path.is_file():
-        near = sorted(str(p) for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+        near = sorted(str(p) for p in path.parent.glob("[!.]*.yaml")) if path.parent.is_dir() else []
         hint = f"; there are {', '.join(near)}" if near else ""
         raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
     try:
