@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from magnet.baselines.nearest_neighbour import NearestNeighbour
 from magnet.checks import require_number, require_whole
+from magnet.denoiser.compiled import records
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.self_forcing import MadePasts
 from magnet.generation.rollout import generate
@@ -43,7 +45,8 @@ class RollOuts(Callback):
     moved there and appended, and the remaining difference fades out. Such scenes replace a share of the batch. The
     generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.) A
     training that is gone on with rolls out at the steps at which it would have; until then it has no generated pasts,
-    for clips and roll-outs are not in its checkpoint.
+    for clips and roll-outs are not in its checkpoint. With `cuda_graph` the model's evaluations are replayed, too. A
+    training may have several of other tasks, such as long ones of some; each takes the place of what the other made.
 
     Args:
         share: share of the batch's scenes that are replaced.
@@ -84,7 +87,7 @@ class RollOuts(Callback):
         self.return_frames = return_frames
         if not tasks:
             raise ValueError("tasks: got none, expected at least one")
-        self.tasks = [registry.get(task)() for task in tasks]
+        self.names, self.tasks = tuple(tasks), [registry.get(task)() for task in tasks]
         for name, task in zip(tasks, self.tasks, strict=True):
             plan = task.schedule(GOING_ON)
             if not bool(plan.known[GOING_ON.past()].all()) or not bool(plan.finished.all()):
@@ -105,6 +108,12 @@ class RollOuts(Callback):
         generator = torch.Generator(device=pl_module.device).manual_seed(seed)
         precision = trainer.precision_plugin.forward_context()
         pl_module.made_pasts = self.rolled_out(pl_module, batch, generator, precision)
+
+    @property
+    def state_key(self) -> str:
+        """By which checkpoints tell several apart."""
+        key: str = super().state_key
+        return key if self.names == ("joint_future",) else self._generate_state_key(tasks=self.names)
 
     def state_dict(self) -> dict[str, Any]:
         return {"filled": self.filled}
@@ -165,7 +174,8 @@ class RollOuts(Callback):
 
     def _continued(self, model: Denoiser, start: Scene, task: Task, more: int, generator: torch.Generator) -> Scene:
         """A past and so many frames more, made by a task."""
-        rest = start.frames, more, 1, self.sampler, generator
+        replays = bool(model.hparams["cuda_graph"]) and records(start.T_world_root)
+        rest = start.frames, more, 1, replace(self.sampler, compile=replays), generator
         if reads_ahead(task):  # who is given comes first
             start = generate(model, start, JointFuture(), *rest)
         return generate(model, start, task, *rest)

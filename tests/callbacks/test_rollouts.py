@@ -1,8 +1,12 @@
 """Training that goes on from what the model has made."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
+from magnet import checkpoints
 from magnet.callbacks import RollOuts
 from magnet.callbacks.rollouts import eased
 from magnet.generation.rollout import generate
@@ -168,3 +172,33 @@ def test_who_is_given_in_a_roll_out_was_made_before(made, monkeypatch):
     assert torch.equal(joint.present, batch.present[[1, 3, 4, 6]])  # the first one answers, and somebody else is there
     assert torch.equal(answered.T_world_root[:, :, 1], joint.T_world_root[:, :, 1])
     assert not torch.equal(answered.T_world_root[:, -16:, 0], joint.T_world_root[:, -16:, 0])
+
+
+def test_a_training_may_have_several_of_other_tasks(tmp_path):
+    """Each rolls out when it is due, and a checkpoint says when each did last."""
+    options = {"share": 0.5, "scenes": 2, "frames": (8, 8), "steps": 1, "stretches": 8}
+    both = [RollOuts(every=2, **options), RollOuts(every=3, tasks=("agentic_async",), **options)]
+    saving = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=7)
+    run = trainer(7, default_root_dir=tmp_path, callbacks=[*both, saving], enable_checkpointing=True)
+    run.fit(tiny_denoiser(max_agents=3), datamodule=data())
+    states = checkpoints.read(saving.best_model_path)["callbacks"]
+    assert [states[each.state_key] for each in both] == [{"filled": 5}, {"filled": 4}]
+    assert RollOuts().state_key == "RollOuts", "as older checkpoints call it"
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_its_evaluations_are_replayed_on_a_gpu_where_the_step_is(made, monkeypatch, wanted):
+    batch, _, model = made
+    asked: list[bool] = []
+
+    def watched(model, scene, task, context, frames, samples, options, generator):
+        asked.append(options.compile)
+        return generate(model, scene, task, context, frames, samples, replace(options, compile=False), generator)
+
+    monkeypatch.setattr("magnet.callbacks.rollouts.generate", watched)
+    monkeypatch.setattr("magnet.callbacks.rollouts.records", lambda tensor: wanted)
+    monkeypatch.setitem(model.hparams, "cuda_graph", True)
+    rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
+    rolling.keep(batch)
+    rolling.rolled_out(model, batch, torch.Generator().manual_seed(1))
+    assert asked == [wanted]
