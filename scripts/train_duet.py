@@ -3,11 +3,10 @@
     MAGNET_CMU=FOLDER python scripts/train_duet.py            # the same as: make train-duet
 
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
-`--out`. The stage `on` goes on from the denoiser, `again` from the mean of the weights before and after `on`. From the
-mean of the weights before and after `again` the sisters (`SISTERS`) go on, each for itself, and the mean of it, twice,
-and them is released. Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is
-run again; a stage that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2
-first=2 decoder=2` rehearses it to the end.
+`--out`, and begins from the weights of others or from their mean (`BEGINS`); the mean of some is released (`RELEASED`).
+Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage
+that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2 first=2 decoder=2`
+rehearses it to the end.
 """
 
 from __future__ import annotations
@@ -27,19 +26,26 @@ from magnet.callbacks.narrow_codes import NAME as NARROW
 from magnet.cli.child import run_to_its_end
 
 ROOT = Path(__file__).resolve().parents[1]
-SISTERS = ("live", "clean", "first")
-"""Stages that go on from the same weights; the mean of theirs and of those, which count twice, is what ships."""
+Shares = dict[str, int]
+"""Stages, each with how often its weights count in their mean."""
 
-BEFORE = {
-    "tokenizer": "",
-    "denoiser": "tokenizer",
-    "on": "denoiser",
-    "again": "on",
-    **dict.fromkeys(SISTERS, "again"),
-    "decoder": "tokenizer",
+AGAIN: Shares = {"denoiser": 1, "on": 1, "again": 2}
+DUET: Shares = {"denoiser": 2, "on": 2, "again": 4, "live": 4, "clean": 4, "first": 4}
+
+BEGINS: dict[str, Shares] = {
+    "tokenizer": {},
+    "denoiser": {"tokenizer": 1},
+    "on": {"denoiser": 1},
+    "again": {"denoiser": 1, "on": 1},
+    "live": AGAIN,
+    "clean": AGAIN,
+    "first": AGAIN,
+    "decoder": {"tokenizer": 1},
 }
-"""The stages in the order they are run, each with the one whose weights it begins from."""
-STAGES = tuple(BEFORE)
+"""The stages in the order they are run, each with those from whose mean it begins."""
+RELEASED = DUET
+"""Of whose mean the released denoiser is."""
+STAGES = tuple(BEGINS)
 
 
 def config_of(stage: str) -> Path:
@@ -66,15 +72,18 @@ def steps_done(folder: Path) -> int:
         raise SystemExit(f"{path} cannot be read ({why}); move {folder} away to train this stage anew") from None
 
 
-def mean_checkpoint(folder: Path) -> Path:
-    """The mean of a stage's weights and of those that it began from."""
-    return folder / "checkpoints" / "mean.ckpt"
+def mean_checkpoint(out: Path, stage: str) -> Path:
+    """The mean from which a stage begins, or which is `released`."""
+    return out / "means" / f"{stage}.ckpt"
 
 
-def average(made: Path, *checkpoints: Path) -> None:
-    """Write the mean of the weights of some checkpoints."""
-    script, each = str(ROOT / "scripts" / "average_weights.py"), [str(path) for path in checkpoints]
-    run([sys.executable, script, str(made), *each, "--overwrite"], f"mean of {made.parent.parent.name}")
+def average(out: Path, stage: str, shares: Shares) -> None:
+    """Write the mean of the weights of some stages."""
+    each = [str(last_checkpoint(out / name)) for name, share in shares.items() for _ in range(share)]
+    made = mean_checkpoint(out, stage)
+    made.parent.mkdir(exist_ok=True)
+    script = str(ROOT / "scripts" / "average_weights.py")
+    run([sys.executable, script, str(made), *each, "--overwrite"], f"mean of {', '.join(shares)}")
 
 
 def narrow_codes(out: Path) -> Path:
@@ -90,15 +99,16 @@ def steps_left(out: Path, steps: dict[str, int]) -> dict[str, tuple[int, int]]:
     """
     done = {stage: steps_done(out / stage) for stage in STAGES}
     left = {stage: (done[stage], steps[stage]) for stage in STAGES if done[stage] < steps[stage]}
-    for stage, begun_from in BEFORE.items():
-        if done[stage] and begun_from in left:
-            raise SystemExit(
-                f"{out / stage} began from {begun_from} at step {done[begun_from]}, which would go on to step "
-                f"{steps[begun_from]}; move it away to train it anew, or leave --steps {begun_from}={done[begun_from]}"
-            )
+    for stage, sources in BEGINS.items():
+        for source in sources:
+            if done[stage] and source in left:
+                raise SystemExit(
+                    f"{out / stage} began from {source} at step {done[source]}, which would go on to step "
+                    f"{steps[source]}; move it away to train it anew, or leave --steps {source}={done[source]}"
+                )
     if "tokenizer" in left or narrow_codes(out).is_file():
         return left
-    readers = [stage for stage, begun_from in BEFORE.items() if begun_from == "tokenizer"]
+    readers = [stage for stage, sources in BEGINS.items() if "tokenizer" in sources]
     if not any(done[stage] for stage in readers):  # stopped between its last step and them
         return {"tokenizer": (done["tokenizer"], done["tokenizer"] + 1), **left}
     if any(stage in left and not done[stage] for stage in readers):
@@ -119,22 +129,20 @@ def fit_command(stage: str, out: Path, steps: int, extra: list[str]) -> list[str
 
     Args:
         stage: of `STAGES`.
-        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers, `on` with the
-            denoiser, `again` with the mean of both, the sisters with the mean before and after that.
+        out: folder of all stages; denoiser and decoder begin with the tokenizer's codes of few numbers.
         steps: how many optimiser steps it has in the end.
         extra: options added as they are, such as --trainer.accelerator=gpu.
     """
     command = [sys.executable, "-m", "magnet", "fit", "--config", str(config_of(stage)), "--out", str(out / stage)]
     command += ["--trainer.max_steps", str(steps)]
-    tokenizer = str(narrow_codes(out))
-    if stage == "denoiser":
-        command += ["--model.tokenizer", tokenizer]
-    if stage == "on":
-        command += ["--model.start_from", str(last_checkpoint(out / "denoiser"))]
-    if stage in ("again", *SISTERS):
-        command += ["--model.start_from", str(mean_checkpoint(out / BEFORE[stage]))]
-    if stage == "decoder":
-        command += ["--model.start_from", tokenizer]
+    sources = BEGINS[stage]
+    if "tokenizer" in sources:
+        option = "--model.start_from" if stage == "decoder" else "--model.tokenizer"
+        command += [option, str(narrow_codes(out))]
+    elif sources:
+        (first, *others) = sources
+        start = mean_checkpoint(out, stage) if others else last_checkpoint(out / first)
+        command += ["--model.start_from", str(start)]
     if last_checkpoint(out / stage).is_file():
         command += ["--ckpt_path", str(last_checkpoint(out / stage))]
     return command + extra
@@ -204,16 +212,13 @@ def train(given: Any, out: Path, steps: dict[str, int]) -> None:
             continue
         done, wanted = left[stage]
         put_aside(out / stage)
-        if stage == "again":
-            average(mean_checkpoint(out / "on"), last_checkpoint(out / "on"), last_checkpoint(out / "denoiser"))
-        if stage in SISTERS:
-            average(mean_checkpoint(out / "again"), last_checkpoint(out / "again"), mean_checkpoint(out / "on"))
+        if len(BEGINS[stage]) > 1:
+            average(out, stage, BEGINS[stage])
         run(fit_command(stage, out, wanted, given.fit), f"{stage}, step {done} to {wanted}")
         if steps_done(out / stage) < wanted:  # stopped, and ended without an error
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
-    released, sisters = mean_checkpoint(out / SISTERS[-1]), [last_checkpoint(out / stage) for stage in SISTERS]
-    start = mean_checkpoint(out / "again")
-    average(released, start, start, *sisters)  # where they began counts twice
+    average(out, "released", RELEASED)
+    released = mean_checkpoint(out, "released")
     release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(released)]
     release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(folder)]

@@ -43,11 +43,13 @@ def test_a_stage_begins_from_the_stage_before_and_goes_on_from_its_own_last_chec
         assert command[command.index(flag) + 1] == tokenizer
         assert command[command.index("--trainer.max_steps") + 1] == "9"
         assert command[-1] == "--data.batch_size=4" and "--ckpt_path" not in command
-    before = str(recipe.last_checkpoint(tmp_path / "denoiser"))
-    half, whole = (str(recipe.mean_checkpoint(tmp_path / stage)) for stage in ("on", "again"))
-    for stage, start in (("on", before), ("again", half), *((sister, whole) for sister in recipe.SISTERS)):
-        command = recipe.fit_command(stage, tmp_path, 9, [])
-        assert command[command.index("--model.start_from") + 1] == start and "--model.tokenizer" not in command
+    for stage, sources in recipe.BEGINS.items():
+        if sources and "tokenizer" not in sources:
+            command = recipe.fit_command(stage, tmp_path, 9, [])
+            start = recipe.mean_checkpoint(tmp_path, stage)
+            if len(sources) == 1:
+                start = recipe.last_checkpoint(tmp_path / next(iter(sources)))
+            assert command[command.index("--model.start_from") + 1] == str(start) and "--model.tokenizer" not in command
     assert recipe.steps_done(tmp_path / "denoiser") == 0
     save(tmp_path / "denoiser", 5)
     assert recipe.steps_done(tmp_path / "denoiser") == 5
@@ -77,18 +79,15 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
     assert [Path(config).stem for config in configs] == [f"duet_{stage}" for stage in recipe.STAGES[1:]]
     means = [command for command in ran if "average_weights.py" in command[1]]
     assert all(command[-1] == "--overwrite" for command in means)  # a stopped stage takes it anew
-    half, whole_mean, released = (
-        str(recipe.mean_checkpoint(tmp_path / stage)) for stage in ("on", "again", recipe.SISTERS[-1])
-    )
-    denoiser, on, again, *sisters = (
-        str(recipe.last_checkpoint(tmp_path / stage)) for stage in ("denoiser", "on", "again", *recipe.SISTERS)
-    )
-    assert [command[2:-1] for command in means] == [
-        [half, on, denoiser],
-        *[[whole_mean, again, half]] * len(sisters),  # before each of those that go on from it
-        [released, whole_mean, whole_mean, *sisters],
-    ]
-    assert ran.index(means[0]) == 2 and ran.index(means[1]) == 4
+    shares = {stage: sources for stage, sources in recipe.BEGINS.items() if len(sources) > 1}
+    for command, (stage, sources) in zip(means, [*shares.items(), ("released", recipe.RELEASED)], strict=True):
+        made, *each = command[2:-1]
+        assert made == str(recipe.mean_checkpoint(tmp_path, stage))
+        assert {name: each.count(str(recipe.last_checkpoint(tmp_path / name))) for name in sources} == sources
+        assert len(each) == sum(sources.values())
+        if stage != "released":  # right before the stage that begins from it
+            assert str(tmp_path / stage) in ran[ran.index(command) + 1]
+    released = str(recipe.mean_checkpoint(tmp_path, "released"))
     assert released in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
@@ -122,6 +121,12 @@ def test_codes_that_are_gone_are_not_made_anew_under_stages_that_read_them(tmp_p
     assert not recipe.steps_left(tmp_path, steps)
 
 
+def test_stages_begin_from_earlier_ones() -> None:
+    for number, (stage, sources) in enumerate(recipe.BEGINS.items()):
+        assert set(sources) <= set(recipe.STAGES[:number]), stage
+    assert set(recipe.RELEASED) <= set(recipe.STAGES)
+
+
 def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
     with (tmp_path / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -134,9 +139,9 @@ def test_what_others_began_from_does_not_go_on(tmp_path: Path) -> None:
         save(tmp_path / stage, 3)
     recipe.narrow_codes(tmp_path).touch()
     assert not recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3))
-    last = recipe.SISTERS[-1]  # nothing begins from it
+    last = next(stage for stage in recipe.STAGES if all(stage not in sources for sources in recipe.BEGINS.values()))
     assert set(recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {last: 5})) == {last}
-    for stage, others in (("denoiser", "on"), ("tokenizer", "denoiser"), ("again", recipe.SISTERS[0])):
+    for stage, others in (("denoiser", "on"), ("tokenizer", "denoiser"), ("again", "live")):
         with pytest.raises(SystemExit, match=f"{others} began from {stage} at step 3, which would go on to step 5"):
             recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {stage: 5})
 
