@@ -5,8 +5,7 @@
 Nobody need watch it. Each stage is `magnet fit` with its configuration in configs/, in a folder of its own under
 `--out`, and begins from the weights of others or from their mean (`BEGINS`); the mean of some is released (`RELEASED`).
 Stopped at any moment, by hand or by a power cut, all goes on from the last checkpoint when it is run again; a stage
-that has its steps is not run again. `--steps tokenizer=2 denoiser=2 on=2 again=2 live=2 clean=2 first=2 decoder=2`
-rehearses it to the end.
+that has its steps is not run again. `--steps tokenizer=2 denoiser=2 ...`, with every stage, rehearses it to the end.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ Shares = dict[str, int]
 """Stages, each with how often its weights count in their mean."""
 
 AGAIN: Shares = {"denoiser": 1, "on": 1, "again": 2}
-DUET: Shares = {"denoiser": 2, "on": 2, "again": 4, "live": 4, "clean": 4, "first": 4}
+SIDES: Shares = {"left": 1, "right": 1}
+ENDS: Shares = SIDES | {"left_end": 1, "right_end": 1}
 
 BEGINS: dict[str, Shares] = {
     "tokenizer": {},
@@ -40,10 +40,17 @@ BEGINS: dict[str, Shares] = {
     "live": AGAIN,
     "clean": AGAIN,
     "first": AGAIN,
+    "wide": {"denoiser": 2, "on": 2, "again": 4, "live": 4, "clean": 4, "first": 4},
+    "left": {"wide": 1},
+    "right": {"wide": 1},
+    "left_end": SIDES,
+    "right_end": SIDES,
+    "answers": ENDS,
+    "long": ENDS,
     "decoder": {"tokenizer": 1},
 }
 """The stages in the order they are run, each with those from whose mean it begins."""
-RELEASED = DUET
+RELEASED = ENDS | {"answers": 2, "long": 2}
 """Of whose mean the released denoiser is."""
 STAGES = tuple(BEGINS)
 
