@@ -127,8 +127,8 @@ class RollOuts(Callback):
             pl_module.made_pasts = None
 
     def keep(self, batch: Scene) -> None:
-        """Keep a batch's clips, and drop the oldest."""
-        self.kept.append(batch.to("cpu"))
+        """Keep a batch's clips, and drop the oldest; where they are, for a GPU would be waited for at every step."""
+        self.kept.append(batch)
         while sum(each.scenes for each in self.kept[1:]) >= self.stretches:
             self.kept.pop(0)
 
@@ -148,7 +148,8 @@ class RollOuts(Callback):
         past = frames // 2 // TOKEN_FRAMES * TOKEN_FRAMES
         if past < COMPARED:
             raise ValueError(f"RollOuts: got windows of {frames} frames, expected at least {2 * COMPARED}")
-        near = NearestNeighbour(concatenate(self.kept).slice(0, COMPARED + frames - past))
+        clips = concatenate([each.slice(0, COMPARED + frames - past) for each in self.kept])
+        near = NearestNeighbour(clips.to("cpu"))
         count = len(self.tasks)
         which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
         task = self.tasks[which]

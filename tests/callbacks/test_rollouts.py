@@ -186,6 +186,16 @@ def test_a_training_may_have_several_of_other_tasks(tmp_path):
     assert RollOuts().state_key == "RollOuts", "as older checkpoints call it"
 
 
+def test_clips_are_kept_as_they_come_and_shared_by_several(made):
+    """Where they are: to send every batch to the host would make a GPU wait at every step."""
+    batch, *_ = made
+    both = [RollOuts(stretches=20), RollOuts(stretches=20)]
+    for rolling in both:
+        for _ in range(4):
+            rolling.keep(batch)
+        assert len(rolling.kept) == 2 and all(each is batch for each in rolling.kept)
+
+
 @pytest.mark.parametrize("wanted", [True, False])
 def test_its_evaluations_are_replayed_on_a_gpu_where_the_step_is(made, monkeypatch, wanted):
     batch, _, model = made
