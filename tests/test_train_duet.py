@@ -167,10 +167,10 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
     each = {stage: 1 for stage in recipe.STAGES}
-    for steps in (each, each | {"clean": 2}):
+    for steps in (each, each | {"long": 2}):
         recipe.main(["--out", str(tmp_path), "--steps", *(f"{name}={count}" for name, count in steps.items()), *small])
     said = capfd.readouterr().out
-    assert "tokenizer: has its 1 steps already" in said and "clean, step 1 to 2: done" in said
+    assert "tokenizer: has its 1 steps already" in said and "long, step 1 to 2: done" in said
     model = Denoiser.load(tmp_path / "weights" / "duet")
     released = checkpoints.read(tmp_path / "weights" / "duet")["state_dict"]
     decoder = checkpoints.read(recipe.last_checkpoint(tmp_path / "decoder"))["state_dict"]
