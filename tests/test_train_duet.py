@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 from pathlib import Path
 
@@ -165,7 +166,10 @@ def beginnings(folder: Path, frames: int = 300) -> Path:
 def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    small = ["--", "--data.batch_size=4", "--data.epoch_size=8", "--data.data.train_clips=15"]
+    couples = {"class_path": "CMU", "init_args": {"test_takes": [5, 10, 15], "val_takes": [3]}}
+    few = {"class_path": "Synthetic", "init_args": {"people": [2], "train_clips": 15}}  # else each takes minutes
+    data = ["--data.data", json.dumps([couples, few]), "--data.weights", "null"]
+    small = ["--", "--data.batch_size=4", "--data.epoch_size=8", *data]
     each = {stage: 1 for stage in recipe.STAGES}
     for steps in (each, each | {"long": 2}):
         recipe.main(["--out", str(tmp_path), "--steps", *(f"{name}={count}" for name, count in steps.items()), *small])
