@@ -237,7 +237,7 @@ def test_what_is_left_deep_in_a_finished_chunk_is_corrected_more_loosely(monkeyp
     assert torch.equal(made.T_world_root[1], once.T_world_root[1])  # other scenes stay as they were
     assert torch.equal(made.T_world_root[:, :, 1], running.T_world_root[:, :, 1])
     monkeypatch.setattr(settling, "TOO_DEEP", Apart(body=0.08, arms=0.08))
-    root[0, :, 0, 0, 3] = root[0, :, 1, 0, 3] + (torch.arange(40) - 20) / 30 * 2.5  # slower, for longer
+    root[0, :, 0, 0, 3] = root[0, :, 1, 0, 3] + (torch.arange(40) - 20) / 30 * 1.7  # slower, for longer
     walking = still.replace(T_world_root=root)
     monkeypatch.setattr(settling, "LOOSELY", LOOSELY[:1])
     less, _ = settled_chunk(walking, fixed, "firm", None)
