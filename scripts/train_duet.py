@@ -40,6 +40,7 @@ BEGINS: dict[str, Shares] = {
     "live": AGAIN,
     "clean": AGAIN,
     "first": AGAIN,
+    # The mean of what two cores made, `again` and its sisters.
     "wide": {"denoiser": 2, "on": 2, "again": 4, "live": 4, "clean": 4, "first": 4},
     "left": {"wide": 1},
     "right": {"wide": 1},
