@@ -81,8 +81,10 @@ def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
 def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
     """Direction over the ground, of unit length, in which one person can leave another.
 
-    It leads from pelvis to pelvis, smoothed over time. People who pass each other change sides from one frame to the
-    next: for a brief encounter the direction is its mean over all frames, and so they step aside.
+    It leads from pelvis to pelvis, smoothed over time, and turns slowly. People who pass each other change sides from
+    one frame to the next: for a brief encounter the direction is its mean over all frames; and where they end on the
+    other side from where they came, what of the mean is across their way. So they step aside or around each other, and
+    nobody is pushed through anybody.
 
     Args:
         one: (B, T, 22, 3) joints in the world.
@@ -93,22 +95,49 @@ def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
         (B, T, 2)
     """
     between = (one - other)[:, :, PELVIS, [0, 2]]
-    padded = F.pad(between.transpose(1, 2), (SMOOTHED, SMOOTHED), mode="replicate")
-    smooth = F.avg_pool1d(padded, 2 * SMOOTHED + 1, stride=1).transpose(1, 2)
-    begins = near & ~F.pad(near, (1, 0))[:, :-1]
+    smooth = turning_slowly(unit(averaged(between)))
+    begins, ends = near & ~F.pad(near, (1, 0))[:, :-1], near & ~F.pad(near, (0, 1))[:, 1:]
     encounter = (begins.cumsum(dim=1) * near)[..., None]  # its number, 0 outside
     most = int(encounter.max()) + 1
-    frames = (
-        torch.zeros_like(between[:, :1, :1]).expand(-1, most, 1).scatter_add(1, encounter, near[..., None].to(between))
-    )
-    total = torch.zeros_like(between[:, :1]).expand(-1, most, 2)
-    total = total.scatter_add(1, encounter.expand_as(between), between * near[..., None])
-    brief = (near[..., None] & (frames <= BRIEF)[:, :, 0].gather(1, encounter[..., 0])[..., None]).expand_as(between)
-    smooth = torch.where(brief, (total / frames.clamp_min(1)).gather(1, encounter.expand_as(between)), smooth)
-    length = smooth.norm(dim=-1, keepdim=True)
-    sideways = torch.zeros_like(smooth)
-    sideways[..., 0] = 1.0
-    return torch.where(length > 1e-6, smooth / length.clamp_min(1e-6), sideways)
+
+    def added(values: Tensor, frames: Tensor) -> Tensor:
+        """The sum of each encounter's values in some of its frames. (B, T, n), (B, T) bool -> (B, most, n)"""
+        empty = values.new_zeros(len(values), most, values.shape[-1])
+        return empty.scatter_add(1, encounter.expand_as(values), values * frames[..., None])
+
+    frames = added(torch.ones_like(between[..., :1]), near)
+    mean, first, last = added(between, near) / frames.clamp_min(1), added(between, begins), added(between, ends)
+    passes = (first * last).sum(dim=-1, keepdim=True) < 0
+    aside = torch.where(passes, across(mean, last - first), mean)
+    brief = near[..., None] & (frames <= BRIEF).gather(1, encounter)
+    return torch.where(brief, unit(aside).gather(1, encounter.expand_as(between)), smooth)
+
+
+def averaged(values: Tensor) -> Tensor:
+    """Values averaged over `SMOOTHED` frames before and after. (B, T, n) -> same"""
+    padded = F.pad(values.transpose(1, 2), (SMOOTHED, SMOOTHED), mode="replicate")
+    return F.avg_pool1d(padded, 2 * SMOOTHED + 1, stride=1).transpose(1, 2)
+
+
+def turning_slowly(away: Tensor) -> Tensor:
+    """Directions whose angle is averaged over time: who walks through another turns over at once. (B, T, 2) -> same"""
+    angle = torch.atan2(away[..., 1:], away[..., :1])
+    turn = torch.remainder(angle.diff(dim=1) + torch.pi, 2 * torch.pi) - torch.pi
+    angle = averaged(torch.cat([angle[:, :1], angle[:, :1] + turn.cumsum(dim=1)], dim=1))
+    return torch.cat([angle.cos(), angle.sin()], dim=-1)
+
+
+def across(vector: Tensor, way: Tensor) -> Tensor:
+    """What of a ground vector is across a way; where nothing is, the way's left. (..., 2) x 2 -> (..., 2)"""
+    left = unit(torch.stack([way[..., 1], -way[..., 0]], dim=-1))
+    share = (vector * left).sum(dim=-1, keepdim=True)
+    return left * torch.where(share.abs() > 1e-6, share, 1.0)
+
+
+def unit(ground: Tensor) -> Tensor:
+    """A ground vector with length 1; x where it has none. (..., 2) -> (..., 2)"""
+    length = ground.norm(dim=-1, keepdim=True)
+    return torch.where(length > 1e-6, ground / length.clamp_min(1e-6), ground.new_tensor([1.0, 0.0]))
 
 
 def distance_needed(one: Tensor, other: Tensor, away: Tensor, keep: Apart) -> Tensor:

@@ -30,10 +30,12 @@ FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.6
 those with mixed roles: with a past, where a partner is need not be told from the other's motion, as inpainting must."""
 
 ROLES = (0.45, 0.1, 0.37, 0.08)
-"""Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden."""
+"""Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden; one
+of the agents is generated whatever is drawn."""
 
 LIVE_ROLES = (0.45, 0.33, 0.22)
-"""Shares, in live scenes, of agents who are generated, given as far as the block reaches, and hidden from it on."""
+"""Shares, in live scenes, of agents who are generated, given as far as the block reaches, and hidden from it on; one
+is generated whatever is drawn."""
 
 UNKNOWN_AFTER = 3
 """Token steps of unknown future that live tasks show after a block at least (`magnet.sampling.schedule.AHEAD`); in
@@ -52,6 +54,7 @@ def draw_levels(
     shift: float = 1.0,
     faint: float = 0.0,
     live: float = 0.0,
+    present: Tensor | None = None,
 ) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
@@ -67,6 +70,7 @@ def draw_levels(
         shift: over 1 draws high levels more often, see `shifted`.
         faint: share of the roll-outs whose past is shown a little noisy.
         live: share of the roll-outs that are `live_levels`.
+        present: (B, P) bool: slots with somebody in them, of whom roll-outs generate one at least; None: all.
     """
     device = generator.device
 
@@ -85,10 +89,10 @@ def draw_levels(
     which = drawn_kinds(MIXTURE, (B, 1, 1), generator)
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    rolled = rollout_levels(B, N, P, generator, shift, faint)
+    rolled = rollout_levels(B, N, P, generator, shift, faint, present)
     if live:
         chosen = torch.rand(B, 1, 1, generator=generator, device=device) < live
-        rolled = torch.where(chosen, live_levels(B, N, P, generator, shift, faint), rolled)
+        rolled = torch.where(chosen, live_levels(B, N, P, generator, shift, faint, present), rolled)
     return torch.where(which == ROLLOUT, rolled, levels)
 
 
@@ -101,8 +105,25 @@ def drawn_kinds(shares: Sequence[float], shape: tuple[int, ...], generator: torc
     return kind
 
 
+def drawn_roles(
+    shares: Sequence[float], B: int, P: int, generator: torch.Generator, present: Tensor | None = None
+) -> Tensor:
+    """A role for each agent, and the first of them, generated, for one at least of those who are there. -> (B, 1, P)"""
+    role = drawn_kinds(shares, (B, 1, P), generator)
+    lot = torch.rand(B, 1, P, generator=generator, device=generator.device)
+    if present is not None:
+        lot = lot.where(present[:, None], -1.0)
+    return torch.where(lot == lot.amax(dim=2, keepdim=True), 0, role)
+
+
 def rollout_levels(
-    B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0
+    B: int,
+    N: int,
+    P: int,
+    generator: torch.Generator,
+    shift: float = 1.0,
+    faint: float = 0.0,
+    present: Tensor | None = None,
 ) -> Tensor:
     """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
@@ -142,14 +163,21 @@ def rollout_levels(
     generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
-    role = drawn_kinds(ROLES, (B, 1, P), generator)
-    role = torch.where(mixed, role, 0)
+    role = torch.where(mixed, drawn_roles(ROLES, B, P, generator, present), 0)
     levels = torch.where(role == 1, given, generated)
     levels = torch.where(role == 2, torch.zeros_like(levels), levels)
     return torch.where(role == 3, hidden, levels)
 
 
-def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float = 1.0, faint: float = 0.0) -> Tensor:
+def live_levels(
+    B: int,
+    N: int,
+    P: int,
+    generator: torch.Generator,
+    shift: float = 1.0,
+    faint: float = 0.0,
+    present: Tensor | None = None,
+) -> Tensor:
     """A past, one or two token steps at one level, and an unknown future: what live tasks ask. -> (B, N, P) int
 
     Each agent is generated, given as far as the block reaches (motion control, and whoever had the turn before), or
@@ -166,9 +194,7 @@ def live_levels(B: int, N: int, P: int, generator: torch.Generator, shift: float
     level = shifted(1 + (draw[2] * LEVELS).long().clamp_max(LEVELS - 1), shift)
     since = torch.where(draw[3] < 0.5, 0, draw[3] * past)
     behind = torch.where((draw[4] < faint) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0)
-    role = drawn_kinds(LIVE_ROLES, (B, 1, P), generator)
-    somebody = torch.randint(P, (B, 1, 1), generator=generator, device=device)
-    role = torch.where(torch.arange(P, device=device) == somebody, 0, role)
+    role = drawn_roles(LIVE_ROLES, B, P, generator, present)
     shown = torch.where(role == 1, 0, behind)
     block = torch.where(role == 0, level, torch.where(role == 1, 0, LEVELS))
     return torch.where(time < past, shown, torch.where(time < stop, block, LEVELS))

@@ -290,7 +290,8 @@ class Denoiser(TokenModel):
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             drawn = self.noise
-            levels = draw_levels(drawn.distribution, B, N, P, generator, drawn.shift, drawn.faint_past, drawn.live)
+            shares = drawn.shift, drawn.faint_past, drawn.live
+            levels = draw_levels(drawn.distribution, B, N, P, generator, *shares, scene.present)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import load_body
-from magnet.body.apart import APART, Apart, eased, excess_depth, kept_apart, lifted, nearest_points
+from magnet.body.apart import APART, Apart, direction, eased, excess_depth, kept_apart, lifted, nearest_points
 from magnet.datamodules.synthetic import Synthetic
 from magnet.metrics.body_depth import deepest
 from magnet.metrics.penetration import penetration_depth, segment_distance
@@ -74,6 +74,30 @@ def test_people_who_pass_step_aside(walker: Tensor) -> None:
     assert depth(joints) > 0.15 and depth(after(joints, offsets)) < 0.09
     assert float(30 * offsets.diff(dim=1).norm(dim=-1).max()) < 1.0
     assert torch.all(offsets[:, :10] == 0) and torch.all(offsets[:, -10:] == 0), "far from it nobody moves"
+
+
+def test_who_passes_and_stops_just_behind_is_not_pushed_through(walker: Tensor) -> None:
+    """Most of the encounter is behind the other: the way out of all of it together would lead through him."""
+    T = walker.shape[1]
+    x = torch.cat([torch.linspace(1.5, -0.3, T // 2), torch.full((T - T // 2,), -0.3)])
+    joints = torch.stack([shifted(walker, x, 0.04), walker], dim=2)
+    offsets = kept_apart(joints, EVERYBODY, torch.tensor([False, True]))
+    assert depth(after(joints, offsets)) < 0.09
+    moved = offsets[0, :, 0] + torch.stack([x, torch.full_like(x, 0.04)], dim=-1)
+    assert float(30 * moved.diff(dim=0).norm(dim=-1).max()) < 2.0, "he walks at 0.7 m/s"
+    assert float(offsets[0, :, 0, 1].max()) > 0.2, "he steps aside"
+
+
+def test_who_walks_slowly_through_another_is_led_around(walker: Tensor) -> None:
+    T = walker.shape[1]
+    x = torch.linspace(0.45, -0.45, T)
+    joints = torch.stack([shifted(walker, x, 0.02), walker], dim=2)
+    offsets = kept_apart(joints, EVERYBODY, torch.tensor([False, True]))
+    assert depth(after(joints, offsets)) < 0.09
+    assert float(30 * offsets.diff(dim=1).norm(dim=-1).max()) < 2.0
+    away = direction(joints[:, :, 0], joints[:, :, 1], torch.ones(1, T, dtype=torch.bool))
+    angle = torch.rad2deg(torch.acos((away[:, 1:] * away[:, :-1]).sum(dim=-1).clamp(-1, 1)))
+    assert float(angle.max()) < 10, "over a second from one side to the other"
 
 
 def test_whoever_is_in_nobodys_way_stays_bit_for_bit(walker: Tensor) -> None:

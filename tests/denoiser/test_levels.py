@@ -9,6 +9,7 @@ from magnet.denoiser.levels import (
     ROLES,
     UNKNOWN_AFTER,
     draw_levels,
+    drawn_roles,
     live_levels,
     rollout_levels,
 )
@@ -43,18 +44,33 @@ def test_a_roll_out_is_a_clean_past_a_block_and_an_unknown_future(generator):
 
 
 def test_more_roll_outs_begin_from_nothing_than_chance_gives(generator):
-    levels = rollout_levels(4000, 16, 1, generator)
+    levels = rollout_levels(4000, 16, 2, generator)
     alone, mixed = (share + (1 - share) / 16 for share in (FROM_NOTHING, FROM_NOTHING_MIXED))
-    given = ROLES[1] + ROLES[2]
+    given = (ROLES[1] + ROLES[2]) / 2  # in half of the scenes it is this one who is generated whatever is drawn
     expected = (1 - MIXED) * alone + MIXED * (1 - given) * mixed
     assert (levels[:, 0] > 0).double().mean() == pytest.approx(expected, abs=0.02)
 
 
 def test_a_partner_from_nothing_is_trained_as_often_as_inpainting_needs(generator):
-    """One in eight roll-outs of two people gives one of them wholly and nothing of the other."""
-    levels = rollout_levels(8000, 16, 2, generator)
-    given, lacking = (levels == 0).all(dim=1), (levels > 0).all(dim=1)
-    assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 9
+    """One in seven roll-outs of two people gives one of them wholly and nothing of the other, in four slots too."""
+    for slots in (2, 4):
+        present = torch.arange(slots).expand(8000, slots) < 2
+        levels = rollout_levels(8000, 16, slots, generator, present=present)[..., :2]
+        given, lacking = (levels == 0).all(dim=1), (levels > 0).all(dim=1)
+        assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 8
+
+
+@pytest.mark.parametrize("draw", [rollout_levels, live_levels])
+def test_in_every_roll_out_somebody_who_is_there_is_generated(draw, generator):
+    """Of two people in five slots, in any two of them."""
+    present = torch.rand(4000, 5, generator=generator).argsort(dim=1) < 2
+    levels = draw(4000, 16, 5, generator, present=present)
+    generated = ((levels > 0) & (levels < LEVELS)).any(dim=1) & present
+    assert generated.any(dim=1).double().mean() > 0.97  # level K, unknown as what follows it, is drawn once in a while
+    roles = drawn_roles((0.1, 0.9), 4000, 5, generator, present)[:, 0]
+    assert ((roles == 0) & present).any(dim=1).all()
+    assert float((roles[~present] == 0).double().mean()) == pytest.approx(0.1, abs=0.02)
+    assert float((roles[present] == 0).double().mean()) == pytest.approx(0.55, abs=0.02)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -81,9 +97,13 @@ def test_a_faint_past_is_at_one_level_up_to_the_faintest_and_those_who_are_given
 def test_without_a_faint_past_levels_are_as_they_were(generator):
     plain, off = (rollout_levels(50, 16, 2, torch.Generator().manual_seed(3), 2.0, *faint) for faint in ((), (0.0,)))
     assert torch.equal(plain, off)
-    half = rollout_levels(4000, 16, 1, generator, faint=0.5)[:, :, 0]
-    shown = (half > 0) & (half <= FAINT)
-    assert 0.2 < float(shown.any(dim=1).double().mean()) < 0.6
+    shares = []
+    for faint in (0.0, 0.5, 1.0):
+        levels = rollout_levels(20_000, 16, 2, generator, faint=faint)[:, :, 0]
+        shares.append(float(((levels > 0) & (levels <= FAINT)).any(dim=1).double().mean()))
+    never, half, always = shares
+    assert always - never > 0.1
+    assert half - never == pytest.approx((always - never) / 2, abs=0.015)
 
 
 def test_live_levels_are_a_past_one_or_two_tokens_and_an_unknown_future(generator):
