@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from magnet.denoiser.options import Distribution
+from magnet.denoiser.options import NoiseOptions
 from magnet.sampling.noise import LEVELS, shifted
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
@@ -25,9 +25,9 @@ IN_FLIGHT = 3.0, 12.0
 MIXED = 0.6
 """Share of roll-outs in which agents have roles of their own; in the others everybody is generated."""
 
-FROM_NOTHING, FROM_NOTHING_MIXED = 0.2, 0.6
-"""Share of roll-outs without any past: chance alone would start one in N there, and every generation does. More of
-those with mixed roles: with a past, where a partner is need not be told from the other's motion, as inpainting must."""
+FROM_NOTHING_MIXED = 0.6
+"""Share of roll-outs with mixed roles without any past: with one, where a partner is need not be told from the other's
+motion, as inpainting must. Where everybody is generated it is `NoiseOptions.from_nothing`."""
 
 ROLES = (0.45, 0.1, 0.37, 0.08)
 """Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden; one
@@ -46,15 +46,7 @@ FAINT = 300
 
 
 def draw_levels(
-    kind: Distribution,
-    B: int,
-    N: int,
-    P: int,
-    generator: torch.Generator,
-    shift: float = 1.0,
-    faint: float = 0.0,
-    live: float = 0.0,
-    present: Tensor | None = None,
+    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
     """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
 
@@ -64,35 +56,31 @@ def draw_levels(
     are.
 
     Args:
-        kind: see above.
+        noise: how they are drawn.
         B, N, P: scenes, token steps, agents.
         generator: source of all randomness.
-        shift: over 1 draws high levels more often, see `shifted`.
-        faint: share of the roll-outs whose past is shown a little noisy.
-        live: share of the roll-outs that are `live_levels`.
         present: (B, P) bool: slots with somebody in them, of whom roll-outs generate one at least; None: all.
     """
     device = generator.device
 
     def uniform(*shape: int) -> Tensor:
         levels = torch.randint(LEVELS + 1, shape, generator=generator, device=device)
-        return shifted(levels, shift).expand(B, N, P)
+        return shifted(levels, noise.shift).expand(B, N, P)
 
+    kind = noise.distribution
     if kind == "per_token":
         return uniform(B, N, P)
     if kind == "per_timestep":
         return uniform(B, N, 1)
     if kind == "per_sequence":
         return uniform(B, 1, 1)
-    if kind != "mixture":
-        raise ValueError(f"noise.distribution: got {kind!r}, expected per_token, per_timestep, per_sequence or mixture")
     which = drawn_kinds(MIXTURE, (B, 1, 1), generator)
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    rolled = rollout_levels(B, N, P, generator, shift, faint, present)
-    if live:
-        chosen = torch.rand(B, 1, 1, generator=generator, device=device) < live
-        rolled = torch.where(chosen, live_levels(B, N, P, generator, shift, faint, present), rolled)
+    rolled = rollout_levels(noise, B, N, P, generator, present)
+    if noise.live:
+        chosen = torch.rand(B, 1, 1, generator=generator, device=device) < noise.live
+        rolled = torch.where(chosen, live_levels(noise, B, N, P, generator, present), rolled)
     return torch.where(which == ROLLOUT, rolled, levels)
 
 
@@ -117,13 +105,7 @@ def drawn_roles(
 
 
 def rollout_levels(
-    B: int,
-    N: int,
-    P: int,
-    generator: torch.Generator,
-    shift: float = 1.0,
-    faint: float = 0.0,
-    present: Tensor | None = None,
+    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
     """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
@@ -131,8 +113,8 @@ def rollout_levels(
     the end of the block (motion control), given to the end (inpainting), or unknown from the block on (partner
     prediction).
 
-    In a share `faint` of the scenes the past of those who are generated or hidden is at one level up to `FAINT`, in
-    half of these from a random token on: as samplers show what was made some seconds ago (`stabilization_level`).
+    In a share `faint_past` of the scenes the past of those who are generated or hidden is at one level up to `FAINT`,
+    in half of these from a random token on: as samplers show what was made some seconds ago (`stabilization_level`).
     """
     device = generator.device
 
@@ -144,22 +126,22 @@ def rollout_levels(
     zero = torch.zeros(B, 1, 1, dtype=torch.long, device=device)
     past = integers(zero, zero + N - 1)
     mixed = torch.rand(B, 1, 1, generator=generator, device=device) < MIXED
-    nothing = torch.where(mixed, FROM_NOTHING_MIXED, FROM_NOTHING)
+    nothing = torch.where(mixed, FROM_NOTHING_MIXED, noise.from_nothing)
     past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < nothing, 0, past)
     stop = integers(past + 1, zero + N)
-    level = shifted(integers(zero + 1, zero + LEVELS), shift)
+    level = shifted(integers(zero + 1, zero + LEVELS), noise.shift)
     time = torch.arange(N, device=device)[None, :, None]
     ramped = torch.rand(B, 1, 1, generator=generator, device=device) < RAMPED
     in_flight, begun = torch.rand(2, B, 1, 1, generator=generator, device=device)
     in_flight = IN_FLIGHT[0] + (IN_FLIGHT[1] - IN_FLIGHT[0]) * in_flight
     ramp = ((time - past + begun) / in_flight).clamp(0, 1) * LEVELS
-    level = torch.where(ramped, shifted(ramp.long().clamp_min(1), shift), level)
+    level = torch.where(ramped, shifted(ramp.long().clamp_min(1), noise.shift), level)
     stop = torch.where(ramped, past + in_flight.long().clamp_min(1), stop).clamp_max(N)
     behind = zero
-    if faint:
+    if noise.faint_past:
         shown, whole, since = torch.rand(3, B, 1, 1, generator=generator, device=device)
         since = torch.where(whole < 0.5, 0, since * past)
-        behind = torch.where((shown < faint) & (time >= since), integers(zero + 1, zero + FAINT), 0)
+        behind = torch.where((shown < noise.faint_past) & (time >= since), integers(zero + 1, zero + FAINT), 0)
     generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
@@ -170,13 +152,7 @@ def rollout_levels(
 
 
 def live_levels(
-    B: int,
-    N: int,
-    P: int,
-    generator: torch.Generator,
-    shift: float = 1.0,
-    faint: float = 0.0,
-    present: Tensor | None = None,
+    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
     """A past, one or two token steps at one level, and an unknown future: what live tasks ask. -> (B, N, P) int
 
@@ -191,9 +167,11 @@ def live_levels(
     latest = max(N - 1 - UNKNOWN_AFTER, 1)
     past = (1 + draw[0] * 2 * latest).long().clamp_max(latest)
     stop = past + 1 + (draw[1] < 0.2)
-    level = shifted(1 + (draw[2] * LEVELS).long().clamp_max(LEVELS - 1), shift)
+    level = shifted(1 + (draw[2] * LEVELS).long().clamp_max(LEVELS - 1), noise.shift)
     since = torch.where(draw[3] < 0.5, 0, draw[3] * past)
-    behind = torch.where((draw[4] < faint) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0)
+    behind = torch.where(
+        (draw[4] < noise.faint_past) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0
+    )
     role = drawn_roles(LIVE_ROLES, B, P, generator, present)
     shown = torch.where(role == 1, 0, behind)
     block = torch.where(role == 0, level, torch.where(role == 1, 0, LEVELS))

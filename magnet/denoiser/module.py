@@ -289,9 +289,7 @@ class Denoiser(TokenModel):
             scene = scene.pad_agents(layout.agents).replace(names=())  # by which a GPU would be waited for
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
-            drawn = self.noise
-            shares = drawn.shift, drawn.faint_past, drawn.live
-            levels = draw_levels(drawn.distribution, B, N, P, generator, *shares, scene.present)
+            levels = draw_levels(self.noise, B, N, P, generator, scene.present)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)

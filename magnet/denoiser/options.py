@@ -85,6 +85,8 @@ class NoiseOptions:
             made some seconds ago (ours); see `magnet.denoiser.levels.rollout_levels`.
         live: share of the roll-outs in `mixture` as tasks that go on live ask about: some agents' next tokens, the
             others' given so far or hidden (ours); see `magnet.denoiser.levels.live_levels`.
+        from_nothing: share of the roll-outs in `mixture` without any past, of those in which everybody is generated
+            (ours).
     """
 
     distribution: Distribution = "per_token"
@@ -93,13 +95,14 @@ class NoiseOptions:
     pairwise_metres: float = 0.0
     faint_past: float = 0.0
     live: float = 0.0
+    from_nothing: float = 0.2
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
-        for name in ("faint_past", "live"):
+        for name in ("faint_past", "live", "from_nothing"):
             require_number(name, getattr(self, name), 0, 1)
 
 

@@ -72,6 +72,11 @@ def test_checkpoints_of_before_are_as_they_were(tmp_path):
     ("field", "message"),
     [
         ({"target": "both"}, "target: got 'both', expected quantized or continuous"),
+        (
+            {"noise": {"distribution": "moon"}},
+            "distribution: got 'moon', expected per_token, per_timestep, per_sequence",
+        ),
+        ({"noise": {"from_nothing": 2.0}}, "from_nothing: got 2"),
         ({"loss": {"weighting": "max"}}, "weighting: got 'max', expected uniform or min_snr"),
         ({"loss": {"snr_gamma": 0.0}}, "snr_gamma: got 0, expected over 0"),
         ({"loss": {"snr_game": 0.0}}, "no option snr_game; did you mean snr_gamma?"),
