@@ -74,7 +74,7 @@ def test_checkpoints_of_before_are_as_they_were(tmp_path):
         ({"target": "both"}, "target: got 'both', expected quantized or continuous"),
         (
             {"noise": {"distribution": "moon"}},
-            "distribution: got 'moon', expected per_token, per_timestep, per_sequence",
+            "distribution: got 'moon', expected per_token",
         ),
         ({"noise": {"from_nothing": 2.0}}, "from_nothing: got 2"),
         ({"loss": {"weighting": "max"}}, "weighting: got 'max', expected uniform or min_snr"),
