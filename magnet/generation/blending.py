@@ -21,14 +21,14 @@ GAINS = 2.0
 """Frames within which people who go on stop to gain or lose speed as they did (docs/experiments_sampling.md)."""
 
 GOES_ON = 18
-"""Frames in which people who were given come from the speed they had to the one predicted
-(docs/experiments_sampling.md)."""
+"""Frames in which people who were given come from the speed they had to the one predicted, and before a keyframe to
+that of the keyframe (docs/experiments_sampling.md)."""
 
 EASES_IN = 4
 """Frames in which a token made live comes from the speed of the one before to its own
 (docs/experiments_sampling.md, "Where one live token meets the next")."""
 
-QUICK = 0.03
+QUICK = 0.08
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
 
 
@@ -42,18 +42,21 @@ def delta_between(T_world_can: Tensor, key_delta: Tensor) -> Tensor:
     return from_planar((yaw + key_yaw) / 2, (ground + key_ground) / 2)
 
 
-def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_delta: Tensor) -> Tensor:
+def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_delta: Tensor, arrives: int = 0) -> Tensor:
     """Bend a path so that it leads to a known frame: headings first, then positions, with deltas of the same length.
 
     Args:
         T_world_can: (B, F, 4, 4) canonical frames up to the one before the known one; the first stays.
         T_world_key: (B, 4, 4) the known frame.
         key_delta: (B, 4, 4) the delta from there.
+        arrives: in so many frames before it the speed becomes the known one.
 
     Returns:
         (B, F, 4, 4). What is added grows as a smoothstep, so that it adds no speed at either end.
     """
     path, T_world_key = T_world_can.double(), T_world_key.double()
+    if arrives:
+        path = arriving(path, key_delta.double(), arrives)
     yaw, ground = to_planar(path)
     _, delta = to_planar(inverse(path[:, :-1]) @ path[:, 1:])
     last_yaw, last_step = to_planar(delta_between(path, key_delta.double()))
@@ -65,6 +68,20 @@ def warp_to_keyframe(T_world_can: Tensor, T_world_key: Tensor, key_delta: Tensor
     ground = torch.cat([ground[:, :1], ground[:, :1] + rotate_ground(yaw[:, :-1], delta).cumsum(dim=1)], dim=1)
     away = key_ground - ground[:, -1] - rotate_ground(yaw[:, -1], last_step)
     return from_planar(yaw, ground + ramp[:, None] * away[:, None]).to(T_world_can)
+
+
+def arriving(path: Tensor, key_delta: Tensor, frames: int) -> Tensor:
+    """A path whose last deltas turn into a known one. (B, F, 4, 4), (B, 4, 4) -> (B, F, 4, 4); the first frame stays"""
+    turn, step = to_planar(inverse(path[:, :-1]) @ path[:, 1:])
+    key_turn, key_step = to_planar(key_delta)
+    until = torch.arange(path.shape[1] - 1, 0, -1, device=path.device, dtype=path.dtype)
+    share = (1 - until / frames).clamp_min(0) ** 2
+    off = key_turn[:, None] - turn
+    turn = turn + share * torch.atan2(off.sin(), off.cos())
+    step = step + share[:, None] * (key_step[:, None] - step)
+    yaw, ground = to_planar(path[:, :1])
+    yaw = torch.cat([yaw, yaw + turn.cumsum(dim=1)], dim=1)
+    return from_planar(yaw, torch.cat([ground, ground + rotate_ground(yaw[:, :-1], step).cumsum(dim=1)], dim=1))
 
 
 def last_known(keep: Tensor) -> Tensor:
@@ -114,11 +131,11 @@ def crossfade_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Ten
         blend: frames over which a seam fades out.
     """
 
-    weights, ahead = seam_weights(keep, blend), seam_weights(keep.flip(0), blend)[0]
+    weights, ahead = seam_weights(keep, blend), seam_weights(keep.flip(0), blend)
     last, next_one = last_known(keep), last_known(keep.flip(0))
 
     def left(difference: Tensor) -> Tensor:
-        to_come = remainder(difference.flip(1), next_one, ahead, None).flip(1)
+        to_come = remainder(difference.flip(1), next_one, *ahead, QUICK).flip(1)
         return remainder(difference, last, *weights, QUICK) + to_come
 
     return joined(decoded, given, T_world_can, keep, left)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from magnet.denoiser.module import Denoiser
 from magnet.generation.blending import (
+    GOES_ON,
     crossfade_given,
     delta_between,
     eased_in,
@@ -281,18 +282,15 @@ class WorldState:
             anchor=first_of(there),
             partner=self.model.layout.partners(deltas.device),
         )
-        placed = self._gone_on(placed, first, stop)
+        placed = self._gone_on(placed, first)
         frames = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
-    def _gone_on(self, placed: Tensor, first: int, stop: int) -> Tensor:
-        """Paths of rows [first, stop), of which those that follow known rows go on as fast. (B, T, P, 4, 4) -> same
-
-        Whoever is on the way to a keyframe is left alone: that bends the path as well.
-        """
-        if not first or not self.options.smooth_path or not bool(self.known[first - 1].any()):
+    def _gone_on(self, placed: Tensor, first: int) -> Tensor:
+        """Paths from row `first` on, of which those that follow known rows go on as fast. (B, T, P, 4, 4) -> same"""
+        onward = self.known[first - 1]
+        if not first or not self.options.smooth_path or not bool(onward.any()):
             return placed
-        onward = self.known[first - 1] & ~self.known[stop] if stop < len(self.known) else self.known[first - 1]
         before = self.T_world_can[:, (first - 1) * TOKEN_FRAMES : first * TOKEN_FRAMES]
         return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed), placed)
 
@@ -326,9 +324,9 @@ class WorldState:
             start = int(outside[-1]) + 1 if len(outside) else 0
             left = int(start > 0 and bool(self.placed[start - 1, agent]))
             path = self.T_world_can[:, start * TOKEN_FRAMES - left : key, agent]
-            self.T_world_can[:, start * TOKEN_FRAMES : key, agent] = warp_to_keyframe(path, T_world_key, key_delta)[
-                :, left:
-            ]
+            arrives = GOES_ON if self.options.smooth_path else 0
+            path = warp_to_keyframe(path, T_world_key, key_delta, arrives)
+            self.T_world_can[:, start * TOKEN_FRAMES : key, agent] = path[:, left:]
             moved[start:row, agent] = True
         return moved
 

@@ -115,6 +115,22 @@ def test_generated_poses_leave_given_ones_as_fast_as_these_turn(pair):
     assert torch.allclose(step[:, 21:], torch.tensor(-0.01), atol=1e-5)  # twelve frames on nothing is left
 
 
+def test_generated_poses_come_to_given_ones_as_fast_as_these_turn(pair):
+    given, _, T_world_can = pair
+    time = torch.arange(24)[None, :, None, None, None] / 30
+    axis = torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3, 21, 3)
+    first = roma.rotvec_to_rotmat(axis * (0.2 + 0.6 * time))
+    second = roma.rotvec_to_rotmat(axis * (0.7 - 0.3 * time))
+    keep = torch.zeros(24, 3, dtype=torch.bool)
+    keep[14:] = True
+    given, decoded = given.replace(body_rot=first), given.replace(body_rot=second)
+    made = crossfade_given(decoded, given, T_world_can, keep, 12)
+    step = roma.rotmat_to_rotvec(made.body_rot)[..., 2].diff(dim=1)
+    assert torch.allclose(step[:, 14:], torch.tensor(0.02), atol=1e-5)
+    assert (step[:, 13] - step[:, 14]).abs().max() < 0.015
+    assert torch.allclose(step[:, :2], torch.tensor(-0.01), atol=1e-5)  # twelve frames before nothing is changed
+
+
 def test_people_go_on_as_they_went_until_they_go_as_predicted():
     """Known: 5 cm and 0.03 rad a frame, the yaw through a half turn; predicted: standing. What they went by stays."""
     time = torch.arange(4.0)

@@ -29,6 +29,10 @@ FAST = {
 }
 
 
+KEY = torch.tensor([[0.03, 0.025]])
+"""Metres forward and aside from a known frame to the next."""
+
+
 @pytest.fixture(params=FAST)
 def options(request) -> SamplerOptions:
     return FAST[request.param]
@@ -253,6 +257,23 @@ def test_a_path_that_misses_is_bent_and_adds_no_speed_at_its_ends(generator):
     assert yaw_steps[:, [0, -1]].abs().max() < 0.2 * yaw_steps.abs().max()
     way = to_planar(inverse(bent[:, :-1]) @ bent[:, 1:])[1].norm(dim=-1)
     assert (way[:, -1] < 1.05 * way.max(dim=1).values).all()
+
+
+def test_a_path_arrives_as_fast_as_it_goes_on(generator):
+    """Predicted: half as fast, straight on, past the known frame; known: four centimetres and a tenth of a turn."""
+    time = torch.arange(40.0)
+    slow = from_planar(torch.zeros(40), torch.stack([0.02 * time, torch.zeros(40)], dim=-1))[None].double()
+    key, step = from_planar(torch.tensor([0.5]), torch.tensor([[0.8, 0.3]])), from_planar(torch.tensor([0.03]), KEY)
+    key, step = key.double(), step.double()
+
+    def last_steps(arrives: int):
+        bent = torch.cat([warp_to_keyframe(slow, key, step, arrives), key[:, None], (key @ step)[:, None]], dim=1)
+        assert torch.allclose(bent[:, 0], slow[:, 0])
+        turn, way = to_planar(inverse(bent[:, :-1]) @ bent[:, 1:])
+        return turn[0, -4:].diff().abs().max(), way[0, -4:].diff(dim=0).norm(dim=-1).max()
+
+    before, after = last_steps(0), last_steps(18)
+    assert after[0] < before[0] / 4 and after[1] < before[1] / 4
 
 
 def test_seams_fade_on_both_sides_and_share_a_short_gap():
