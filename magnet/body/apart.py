@@ -100,10 +100,10 @@ def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:
     encounter = (begins.cumsum(dim=1) * near)[..., None]  # its number, 0 outside
     most = int(encounter.max()) + 1
 
-    def added(values: Tensor, frames: Tensor) -> Tensor:
+    def added(values: Tensor, where: Tensor) -> Tensor:
         """The sum of each encounter's values in some of its frames. (B, T, n), (B, T) bool -> (B, most, n)"""
         empty = values.new_zeros(len(values), most, values.shape[-1])
-        return empty.scatter_add(1, encounter.expand_as(values), values * frames[..., None])
+        return empty.scatter_add(1, encounter.expand_as(values), values * where[..., None])
 
     frames = added(torch.ones_like(between[..., :1]), near)
     mean, first, last = added(between, near) / frames.clamp_min(1), added(between, begins), added(between, ends)

@@ -166,9 +166,7 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
     return joined(decoded, given, T_world_can, keep, lambda difference: remainder(difference, last, *weights))
 
 
-def remainder(
-    difference: Tensor, last: Tensor, stays: Tensor, grows: Tensor | None, most: float | None = None
-) -> Tensor:
+def remainder(difference: Tensor, last: Tensor, stays: Tensor, grows: Tensor, most: float | None = None) -> Tensor:
     """What is left of a difference at the last known frame, and of its change into it. (B, T, P, ...) -> same
 
     last (T, P) int, of `last_known`; the weights (T, P). No change counts as more than `most`.
@@ -176,11 +174,8 @@ def remainder(
     agents = torch.arange(last.shape[1], device=last.device)
     shape = (*last.shape, *[1] * (difference.dim() - 3))
     at = difference[:, last, agents]
-    left = stays.view(shape) * at
-    if grows is None:
-        return left
     change = at - difference[:, (last - 1).clamp_min(0), agents]
-    return left + grows.view(shape) * (change if most is None else change.clamp(-most, most))
+    return stays.view(shape) * at + grows.view(shape) * (change if most is None else change.clamp(-most, most))
 
 
 def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left: Callable[[Tensor], Tensor]) -> Scene:

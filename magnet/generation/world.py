@@ -288,11 +288,11 @@ class WorldState:
 
     def _gone_on(self, placed: Tensor, first: int) -> Tensor:
         """Paths from row `first` on, of which those that follow known rows go on as fast. (B, T, P, 4, 4) -> same"""
-        onward = self.known[first - 1]
-        if not first or not self.options.smooth_path or not bool(onward.any()):
+        if not first or not self.options.smooth_path or not bool(self.known[first - 1].any()):
             return placed
         before = self.T_world_can[:, (first - 1) * TOKEN_FRAMES : first * TOKEN_FRAMES]
-        return torch.where(onward.to(placed.device)[:, None, None], gone_on(before, placed), placed)
+        goes_on = self.known[first - 1].to(placed.device)[:, None, None]
+        return torch.where(goes_on, gone_on(before, placed), placed)
 
     def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`; see `magnet.generation.entering.starts`."""
