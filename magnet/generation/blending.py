@@ -28,7 +28,7 @@ EASES_IN = 4
 """Frames in which a token made live comes from the speed of the one before to its own
 (docs/experiments_sampling.md, "Where one live token meets the next")."""
 
-QUICK = 0.08
+QUICK = 0.06
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
 
 
@@ -169,13 +169,17 @@ def spring_from_given(decoded: Scene, given: Scene, T_world_can: Tensor, keep: T
 def remainder(difference: Tensor, last: Tensor, stays: Tensor, grows: Tensor, most: float | None = None) -> Tensor:
     """What is left of a difference at the last known frame, and of its change into it. (B, T, P, ...) -> same
 
-    last (T, P) int, of `last_known`; the weights (T, P). No change counts as more than `most`.
+    last (T, P) int, of `last_known`; the weights (T, P). With `most` no change counts as more, and none that the frame
+    before does not share: it is noise.
     """
     agents = torch.arange(last.shape[1], device=last.device)
     shape = (*last.shape, *[1] * (difference.dim() - 3))
     at = difference[:, last, agents]
     change = at - difference[:, (last - 1).clamp_min(0), agents]
-    return stays.view(shape) * at + grows.view(shape) * (change if most is None else change.clamp(-most, most))
+    if most is not None:
+        before = difference[:, (last - 1).clamp_min(0), agents] - difference[:, (last - 2).clamp_min(0), agents]
+        change = torch.where(change * before > 0, change.clamp(-most, most), 0.0)
+    return stays.view(shape) * at + grows.view(shape) * change
 
 
 def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left: Callable[[Tensor], Tensor]) -> Scene:
