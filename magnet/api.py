@@ -17,7 +17,7 @@ from torch import Tensor
 
 from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole, require_wholes
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats
 from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
@@ -64,7 +64,7 @@ def load(
         options = dataclasses.replace(sampler, **said)
     else:
         options = SamplerOptions.preset(sampler, **said)
-    return Model(Denoiser.load(name_or_path).to(place), options)
+    return Model(DenoiserCore.load(name_or_path).to(place), options)
 
 
 def read(
@@ -209,11 +209,11 @@ class Model:
     with conditions, as in `magnet.generation.rollout.generate`; `sampler.guidance.cond_weight` is its weight.
     """
 
-    denoiser: Denoiser
+    denoiser: DenoiserCore
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __post_init__(self) -> None:
-        for name, kind in (("denoiser", Denoiser), ("sampler", SamplerOptions)):
+        for name, kind in (("denoiser", DenoiserCore), ("sampler", SamplerOptions)):
             if not isinstance(getattr(self, name), kind):
                 got = type(getattr(self, name)).__name__
                 raise ValueError(f"{name}: got {got}, expected {kind.__name__}; magnet.load() makes both")

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -284,22 +283,3 @@ def requeued(folder: Path) -> Path | None:
     names = {path: NUMBERED.fullmatch(path.name) for path in folder.glob(f"{REQUEUED}*")}
     found = {int(match[1]): path for path, match in names.items() if match}
     return found[max(found)] if found else None
-
-
-class CheckpointIO(TorchCheckpointIO):
-    """Lets Lightning load released folders like its own checkpoints, and writes a checksum beside each checkpoint."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        # Elsewhere than on a disk; or for SLURM to start again with: Lightning counts files of such names.
-        if storage_options is not None or "://" in str(path) or Path(path).name.startswith(REQUEUED):
-            super().save_checkpoint(checkpoint, path, storage_options)
-        else:
-            save(checkpoint, Path(path))
-
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read(path)
-
-    def remove_checkpoint(self, path: Any) -> None:
-        super().remove_checkpoint(path)
-        if "://" not in str(path):
-            checksum_file(Path(path)).unlink(missing_ok=True)

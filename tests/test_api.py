@@ -42,6 +42,25 @@ def test_importing_the_package_loads_neither_torch_nor_the_api():
     assert {"load", "read", "Model", "Motion"} <= set(dir(magnet))
 
 
+def test_sampling_needs_nothing_that_only_training_needs(tmp_path: Path) -> None:
+    """Lightning takes longer to import than the model to load, and with what it imports 180 MiB."""
+    code = f"""
+import sys, magnet
+from magnet.cli import main
+model = magnet.load("duet", steps=1)
+made = model.generate(people=2, frames=8, seed=0)
+made.save({str(tmp_path / "given.npz")!r})
+made.save({str(tmp_path / "given.glb")!r})
+model.partner(made).answer(made.slice(4, 8))
+magnet.load("duet", steps=1, sampler="plain").continue_(made, frames=8)
+assert main(["predict", {str(tmp_path / "given.npz")!r}, "--frames", "4", "--out", {str(tmp_path / "out.npz")!r}]) == 0
+print("#", *({{"lightning", "torchmetrics", "scipy", "matplotlib", "sympy", "torch._dynamo"}} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].strip() == "#"
+
+
 def test_scenes_from_nothing_have_the_people_and_frames_asked_for(model: Model):
     motion = model.generate(people=3, frames=30, seed=1, samples=2)
     assert (motion.scenes, motion.frames, motion.agents) == (2, 30, 3)

@@ -20,9 +20,10 @@ from magnet import checkpoints, files
 from magnet.cli import checkpoint_config
 from magnet.cli.errors import CommandError
 from magnet.tokenizer.checkpoint import read_checkpoint
+from magnet.training.checkpoint_io import CheckpointIO
 from tests.toys import ToyData, ToyModel
 
-IO = checkpoints.CheckpointIO()
+IO = CheckpointIO()
 
 
 @pytest.fixture
@@ -79,7 +80,7 @@ def test_a_checkpoint_without_a_checksum_loads_unless_its_weights_are_flipped(sa
 
 
 def test_what_lightning_itself_wrote_loads(checkpoint: dict[str, Any], tmp_path: Path) -> None:
-    super(checkpoints.CheckpointIO, IO).save_checkpoint(checkpoint, tmp_path / "a.ckpt")
+    super(CheckpointIO, IO).save_checkpoint(checkpoint, tmp_path / "a.ckpt")
     torch.save(checkpoint, tmp_path / "b.ckpt")
     assert all(checkpoints.read(tmp_path / name)["global_step"] == 12 for name in ("a.ckpt", "b.ckpt"))
 
@@ -141,7 +142,7 @@ def test_a_training_run_keeps_a_checksum_of_every_checkpoint_and_goes_on_from_it
     def fitted(epochs: int, checkpoint: Path | None) -> None:
         keep = ModelCheckpoint(tmp_path, "{epoch}", save_last=True, save_top_k=1, monitor="epoch", mode="max")
         words = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-        trainer = Trainer(max_epochs=epochs, plugins=[checkpoints.CheckpointIO()], callbacks=[keep], **words)
+        trainer = Trainer(max_epochs=epochs, plugins=[CheckpointIO()], callbacks=[keep], **words)
         trainer.fit(ToyModel(), ToyData(), ckpt_path=None if checkpoint is None else str(checkpoint), weights_only=True)
 
     fitted(2, None)

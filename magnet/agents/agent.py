@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from magnet.agents.message import JOINTS, LONGEST, POSE, TOKEN, Message
 from magnet.agents.rollout import OwnRollout
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene, cat_time, require_one, require_rate
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import step_generator
@@ -36,7 +36,7 @@ class Piece:
     token: np.ndarray | None = None
 
 
-def fingerprint(model: Denoiser) -> str:
+def fingerprint(model: DenoiserCore) -> str:
     """Names a model's weights: tokens are understood by who has the same."""
     digest = hashlib.sha256()
     for name, value in model.state_dict().items():
@@ -47,7 +47,7 @@ def fingerprint(model: Denoiser) -> str:
 def poses_of(motion: Scene) -> np.ndarray:
     """One person's frames as a message has them. (1, T, 1) -> (T, 91)"""
     root, body = motion.T_world_root[0, :, 0].cpu(), motion.body_rot[0, :, 0].cpu()
-    units = roma.rotmat_to_unitquat(torch.cat([root[:, None, :3, :3], body], dim=1))
+    units = to_quat(torch.cat([root[:, None, :3, :3], body], dim=1))
     return torch.cat([root[:, :3, 3], units.flatten(1)], dim=1).float().numpy()
 
 
@@ -55,7 +55,7 @@ def motion_of(poses: np.ndarray, betas: Sequence[float]) -> Scene:
     """One person's frames. (T, 91) -> (1, T, 1)"""
     numbers = torch.from_numpy(np.array(poses, dtype=np.float32))
     units = torch.nn.functional.normalize(numbers[:, 3:].unflatten(1, (1 + JOINTS, 4)), dim=-1)
-    rotations = roma.unitquat_to_rotmat(units)
+    rotations = from_quat(units)
     T_world_root = rigid(rotations[:, 0], numbers[:, :3])[None, :, None]
     shape = torch.tensor([[list(betas)]], dtype=torch.float32)
     return Scene(rotations[None, :, None, 1:], T_world_root, shape, torch.ones(1, 1, dtype=torch.bool))
@@ -161,7 +161,7 @@ class Agent(Notebook):
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         start: Scene,
         names: Sequence[str],
         me: str,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.settling import PACE, carried_on
@@ -61,7 +61,7 @@ class OwnRollout(Rollout):
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         past: Scene,
         agent: int,
         task: AgenticAsync | AgenticSync,

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.rollout import stream
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import from_planar
@@ -23,7 +23,7 @@ from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
-from magnet.tokenizer.module import Tokenizer
+from magnet.tokenizer.core import TokenizerCore
 
 Clock = Callable[[], float]
 """Seconds: `time.perf_counter`, or `time.process_time`, which others on the machine disturb less."""
@@ -122,11 +122,11 @@ class Speed:
     memory_mib: float | None
 
 
-def paper_model(max_agents: int = 4, seed: int = 0) -> Denoiser:
+def paper_model(max_agents: int = 4, seed: int = 0) -> DenoiserCore:
     """An untrained denoiser and tokenizer at the paper's sizes: as fast as trained ones, and as good as noise."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        tokenizer, model = Tokenizer(), Denoiser(max_agents=max_agents)
+        tokenizer, model = TokenizerCore(), DenoiserCore(max_agents=max_agents)
         for part in (tokenizer.vqvae.pose, tokenizer.vqvae.deltas, tokenizer.vqvae.betas):
             part.set(torch.zeros_like(part.mean), torch.ones_like(part.std))
         tokenizer.get_buffer("quantizer.codes").normal_()
@@ -150,7 +150,7 @@ def standing(batch: int, frames: int, people: int, device: torch.device) -> Scen
 
 
 def measure(
-    model: Denoiser,
+    model: DenoiserCore,
     case: Case,
     options: SamplerOptions,
     frames: int = 64,
@@ -219,7 +219,7 @@ FROM_NOTHING = ("generation",)
 class Watch:
     """What the network was asked: how often, how long it took, and the last question."""
 
-    def __init__(self, model: Denoiser, clock: Clock) -> None:
+    def __init__(self, model: DenoiserCore, clock: Clock) -> None:
         self.ask, self.clock = model.denoise, clock
         self.calls, self.seconds = 0, 0.0
         self._last: tuple[Any, ...] = ()
@@ -241,7 +241,7 @@ class Watch:
 
 
 @contextlib.contextmanager
-def watched(model: Denoiser, clock: Clock) -> Iterator[Watch]:
+def watched(model: DenoiserCore, clock: Clock) -> Iterator[Watch]:
     """Within it, a watch looks at every evaluation of a model."""
     watch = Watch(model, clock)
     object.__setattr__(model, "denoise", watch.denoise)
@@ -278,7 +278,7 @@ ALONE = ("joint_future", "generation", "inbetweening", "agentic_sync", "agentic_
 """Tasks that one person alone can be sampled by."""
 
 
-def live_latency(model: Denoiser, options: SamplerOptions, seconds: float, people: int = 2) -> dict[str, Any]:
+def live_latency(model: DenoiserCore, options: SamplerOptions, seconds: float, people: int = 2) -> dict[str, Any]:
     """Latency of a partner who answers each token as it happens, against the clock of the motion.
 
     The frames of a token are there when the last of them has happened. An answer is late where the next token is there

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.body.base import Body
 from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, WRISTS
+from magnet.motion.rotations import from_rotvec
 
 LIMBS: dict[str, tuple[int, int, int]] = {
     "left hand": (SHOULDERS[0], ELBOWS[0], WRISTS[0]),
@@ -60,7 +60,7 @@ def reach(body: Body, body_rot: Tensor, T_world_root: Tensor, betas: Tensor, lim
     straight = axis.norm(dim=-1, keepdim=True) < STRAIGHT * (a * b)[..., None]
     axis = torch.where(straight, hinge, F.normalize(axis, dim=-1))
     bend = ((far**2 - a**2 - b**2) / (2 * a * b)).clamp(-1, 1).acos() - _angle(upper, lower, axis)
-    folded = roma.rotvec_to_rotmat(bend[..., None] * axis)
+    folded = from_rotvec(bend[..., None] * axis)
     whole = _arc(upper + (folded @ lower[..., None])[..., 0], way, axis)
 
     R_first, R_middle = whole @ R[..., first, :, :], whole @ folded @ R[..., middle, :, :]
@@ -82,4 +82,4 @@ def _arc(one: Tensor, other: Tensor, otherwise: Tensor) -> Tensor:
     across = torch.linalg.cross(one, other, dim=-1)
     length = across.norm(dim=-1, keepdim=True)
     axis = torch.where(length > 1e-9, across / length.clamp_min(1e-9), otherwise)
-    return roma.rotvec_to_rotmat(_angle(one, other, axis)[..., None] * axis)
+    return from_rotvec(_angle(one, other, axis)[..., None] * axis)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from torch import Tensor
 
@@ -18,6 +17,7 @@ from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, 
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MOVED: tuple[int, ...] = (0, SPINE2, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
@@ -101,7 +101,7 @@ def corrected(scene: Scene, offset: Tensor) -> Scene:
 
     Turns are in the frame of each joint's parent before the correction, those of the pelvis in the world.
     """
-    turns = roma.rotvec_to_rotmat(offset[..., 3:].unflatten(-1, (len(MOVED), 3)))
+    turns = from_rotvec(offset[..., 3:].unflatten(-1, (len(MOVED), 3)))
     body_rot = scene.body_rot.clone()
     limbs = [joint - 1 for joint in MOVED[1:]]
     body_rot[..., limbs, :, :] = turns[..., 1:, :, :] @ scene.body_rot[..., limbs, :, :]

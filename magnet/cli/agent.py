@@ -136,7 +136,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
 
     from magnet.agents.agent import Agent, Player
     from magnet.api import read
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
     from magnet.sampling.options import SamplerOptions
     from magnet.tasks.agentic import AgenticAsync, AgenticSync
 
@@ -148,7 +148,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
     asked = {name: value for name in ("precision", "settle") if (value := getattr(given, name)) is not None}
     options = SamplerOptions(steps=given.steps, **asked)
     task = AgenticSync() if given.task == "agentic_sync" else AgenticAsync()
-    return Agent(Denoiser.load(given.model), start, names, given.name, task, options, given.seed)
+    return Agent(DenoiserCore.load(given.model), start, names, given.name, task, options, given.seed)
 
 
 def take_part(given: argparse.Namespace, member: Member, link: Link, others: set[str]) -> None:

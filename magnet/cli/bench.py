@@ -14,7 +14,7 @@ from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser, taken_out
 
 if TYPE_CHECKING:
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
 
 EPILOG = """\
 ms/eval is one run of the network on the whole batch. "floor" is its matrix products alone, timed in the same round;
@@ -191,12 +191,12 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     return {**found, **about, "sampler": dataclasses.asdict(options), "machine": machine(), **provenance()}
 
 
-def load(name: str | None) -> Denoiser:
+def load(name: str | None) -> DenoiserCore:
     """The model that is measured."""
     from magnet.bench.speed import paper_model
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
 
-    return paper_model() if name == "paper" else Denoiser.load(name)
+    return paper_model() if name == "paper" else DenoiserCore.load(name)
 
 
 def compared(then: dict[str, Any], now: dict[str, Any]) -> str:

@@ -39,11 +39,11 @@ def main(arguments: Sequence[str] = ()) -> int:
 
     require_place(out)
     from magnet import checkpoints
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
     from magnet.denoiser.portable import OPSET, save_onnx
 
     path = checkpoints.resolve(options.ckpt_path)
-    model = Denoiser.load(path)
+    model = DenoiserCore.load(path)
     if options.without_posterior:
         model.posterior = None
     for file, off in save_onnx(model, out, path.stem).items():

@@ -115,7 +115,7 @@ def main(arguments: Sequence[str]) -> int:
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     from magnet.api import Model
     from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
     if options.spacing is not None:
@@ -126,7 +126,7 @@ def main(arguments: Sequence[str]) -> int:
         scene_files.require_unread(out, options.inputs, people)
     if options.task not in (None, "generation"):  # of a crowd these are said later: it may change the task
         task_of(options, groups["task"], ())
-    model = Model(Denoiser.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
+    model = Model(DenoiserCore.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
     context, frames = lengths(options, task, scene, added, model)

@@ -37,6 +37,7 @@ from magnet.precision import quick_precision
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
+from magnet.training.checkpoint_io import CheckpointIO
 from magnet.training.duration import Duration
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
@@ -266,7 +267,7 @@ class MagnetCLI(LightningCLI):
         self.record = self._record()
         callbacks.append(self.record)
         plugins = config.get("plugins") or []
-        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), checkpoints.CheckpointIO()]
+        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), CheckpointIO()]
         changes = {
             "callbacks": callbacks,
             "logger": logger or False,

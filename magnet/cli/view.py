@@ -179,7 +179,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
     import torch
 
     from magnet.cli import checkpoint_config
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
     from magnet.generation.trace import record
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
@@ -191,7 +191,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
         task.schedule(Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
     except ValueError as error:
         raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
-    model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    model = DenoiserCore.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
     generator = torch.Generator().manual_seed(options.seed)
     sampler = sampler_options(options)
     recording = record(model, scene, task, options.context, options.frames, sampler, generator)
@@ -219,7 +219,7 @@ def _live(options: argparse.Namespace) -> Any:
     from magnet import checkpoints
     from magnet.body.base import load_body
     from magnet.cli import checkpoint_config
-    from magnet.denoiser.module import Denoiser
+    from magnet.denoiser.core import DenoiserCore
     from magnet.generation.live import Live
     from magnet.motion.scene import Scene
     from magnet.tasks import registry
@@ -236,7 +236,7 @@ def _live(options: argparse.Namespace) -> Any:
         start = takes[0].scene
     elif options.people is None:
         start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
-    model = Denoiser.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    model = DenoiserCore.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
     live = Live(
         model,
         2 if options.people is None else options.people,

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
@@ -24,6 +23,7 @@ from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood
 from magnet.motion.resample import resample_points, resample_rotations
+from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm", "mm", "inch", "foot"]
@@ -59,8 +59,8 @@ class BvhTrack:
         """Rotations relative to the parent by slerp, positions by straight lines."""
         if self.fps == fps:
             return self
-        quat = roma.rotmat_to_unitquat(torch.from_numpy(self.file.local))
-        local = roma.unitquat_to_rotmat(resample_rotations(quat, self.fps, fps)).numpy()
+        quat = to_quat(torch.from_numpy(self.file.local))
+        local = from_quat(resample_rotations(quat, self.fps, fps)).numpy()
         place = resample_points(torch.from_numpy(self.file.place), self.fps, fps).numpy()
         return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-import roma
 import torch
 
 from magnet.datamodules.clip import Split
@@ -16,6 +15,7 @@ from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_spl
 from magnet.datamodules.reading.fields import listing, mapping, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
+from magnet.motion.rotations import to_rotvec
 
 SHAPES = {"transl": (3,), "global_orient": (1, 3, 3), "body_pose": (21, 3, 3), "betas": (10,)}
 """Of each key, after (2, T)."""
@@ -98,7 +98,7 @@ def axis_angle(where: object, matrices: Doubles) -> Doubles:
             f"{where}: {int(wrong.sum())} of {wrong.size} matrices are no rotations (off by up to {off.max():.2g}); "
             f"expected orthonormal right-handed 3 x 3 matrices; {AGAIN}"
         )
-    return roma.rotmat_to_rotvec(torch.from_numpy(matrices)).numpy()
+    return to_rotvec(torch.from_numpy(matrices)).numpy()
 
 
 @register_data()

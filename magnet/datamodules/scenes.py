@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.registry import register_reader
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
+from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec, to_rotvec
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
 
@@ -65,12 +65,12 @@ class PosedTrack:
     def resampled(self, fps: float) -> PosedTrack:
         if fps == self.fps:
             return self
-        quat = resample_rotations(roma.rotvec_to_unitquat(torch.from_numpy(self.poses)), self.fps, fps)
+        quat = resample_rotations(quat_from_rotvec(torch.from_numpy(self.poses)), self.fps, fps)
         return replace(
             self,
             fps=fps,
             said_fps=self.said_fps or self.fps,
-            poses=roma.unitquat_to_rotvec(quat).numpy(),
+            poses=quat_to_rotvec(quat).numpy(),
             place=resample_points(torch.from_numpy(self.place), self.fps, fps).numpy(),
             valid=resample_valid(self.valid[:, None], self.fps, fps)[:, 0],
         )
@@ -255,7 +255,7 @@ def _ours(path: Path) -> list[PosedTrack]:
         tracks.append(
             PosedTrack(
                 fps=scene.fps,
-                poses=roma.rotmat_to_rotvec(rotations).numpy(),
+                poses=to_rotvec(rotations).numpy(),
                 place=scene.T_world_root[0, :, p, :3, 3].double().numpy(),
                 betas=scene.betas[0, p].double().numpy(),
                 valid=valid,
@@ -354,7 +354,7 @@ def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doub
         square = np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2)
         if not square or (np.linalg.det(array) < 0).any():
             raise DataError(f"{where}: matrices that are no rotations; {AGAIN}")
-        array = roma.rotmat_to_rotvec(torch.from_numpy(array)).numpy()
+        array = to_rotvec(torch.from_numpy(array)).numpy()
     if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):
         array = array.reshape(*array.shape[:-2], -1)
     if array.ndim not in (2, 3) or array.shape[-1] < least or 0 in array.shape:
@@ -379,6 +379,6 @@ def _one_of(value: Any, person: int) -> Any:
 
 def _standing(root: Doubles) -> Axis:
     """The up axis of a file, found from the pelvises' rotations. (T, P, 3) axis-angle -> +x ... -z"""
-    up = roma.rotvec_to_rotmat(torch.from_numpy(root))[..., 1].mean(dim=(0, 1))
+    up = from_rotvec(torch.from_numpy(root))[..., 1].mean(dim=(0, 1))
     axis = int(up.abs().argmax())
     return ("-" if up[axis] < 0 else "+") + "xyz"[axis]  # type: ignore[return-value]

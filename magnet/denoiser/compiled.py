@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch._dynamo.exc import TorchDynamoException
 
 from magnet.cuda_graphs import CudaGraph, replayed
 from magnet.denoiser.transformer import is_sharded
@@ -67,6 +66,8 @@ class Compiled:
             if self.refused is not None:
                 return self._as_written(self.refused)(*given)
             self._chosen = torch.compile(self.run, dynamic=True)
+        from torch._dynamo.exc import TorchDynamoException  # two seconds, and only who compiles needs it
+
         try:
             return self._chosen(*given)
         except TorchDynamoException as error:  # what torch raises of a missing C++ compiler, too

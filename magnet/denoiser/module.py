@@ -1,177 +1,40 @@
-"""`Denoiser`: the diffusion forcing transformer and its training."""
+"""`Denoiser`: training the diffusion forcing transformer (paper 3.2, A.3)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from magnet import checkpoints
-from magnet.checks import require_choice
 from magnet.cuda_graphs import GraphedStep
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
+from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.levels import FAINT, draw_levels
 from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
-from magnet.denoiser.options import DenoiserLoss, NoiseOptions, Sampling, SelfForcing, TransformerOptions
-from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.token_model import TokenModel
-from magnet.denoiser.transformer import Transformer, is_sharded, skipped
+from magnet.denoiser.transformer import is_sharded
 from magnet.motion.scene import Scene, all_valid
-from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
-from magnet.precision import dtype_of
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
-from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.optim import warmup_cosine
-from magnet.training.options import OptimizerOptions, group_of, plain
-from magnet.waiting import constant
 
 Target = Literal["quantized", "continuous"]
 
 
-class Denoiser(TokenModel):
-    """Diffusion forcing transformer over the motion tokens of all agents (paper 3.2).
+class Denoiser(DenoiserCore, TokenModel):
+    """Diffusion forcing transformer over all agents' motion tokens (paper 3.2), and its training.
 
-    Holds the frozen tokenizer it was trained with, so one checkpoint is all that a user needs.
-
-    Args:
-        tokenizer: checkpoint of a trained tokenizer, or of a denoiser with one, or the name of a shipped model such as
-            `duet`. `raw` uses plain poses instead (ablation, paper Table 5). A checkpoint of this module brings its
-            own, and this is then not read.
-        max_agents: agent slots P; smaller scenes leave slots empty. Linked to the data's.
-        window: token steps that the model sees at once; 16 are 64 frames. Linked to the data's.
-        target: what of the pose is generated: `quantized`, the tokenizer's codes, as in the paper, or `continuous`,
-            its encoder's latents before they are rounded to codes (ours); sampling follows.
-        start_from: checkpoint of a denoiser, or the name of a shipped model such as `duet`, whose weights training
-            starts from. Without a `tokenizer` its own is kept, frozen, and with it how tokens are normalized.
-        network: the transformer.
-        noise: noise levels in training.
-        loss: weights of the terms.
-        self_forcing: training on a past that the model has made itself.
-        optimizer: AdamW, or Muon for matrices.
-        sampling: how the trained model is best sampled, where a sampler leaves it open.
-        compile: compile the blocks for training; worth it on a GPU, not on a CPU.
-        cuda_graph: train by replaying forward and backward as one CUDA graph, so that a GPU does not wait for its host;
-            on other devices nothing changes.
-        seed: all training noise follows from it.
+    Options are those of `DenoiserCore`.
     """
 
-    def __init__(
-        self,
-        tokenizer: str | None = None,
-        max_agents: int = 2,
-        window: int = 16,
-        target: Target = "quantized",
-        start_from: str | None = None,
-        network: TransformerOptions = TransformerOptions(),
-        noise: NoiseOptions = NoiseOptions(),
-        loss: DenoiserLoss = DenoiserLoss(),
-        self_forcing: SelfForcing = SelfForcing(),
-        optimizer: OptimizerOptions = OptimizerOptions(warmup_steps=1000),
-        sampling: Sampling = Sampling(),
-        compile: bool = False,
-        cuda_graph: bool = False,
-        seed: int = 1111,
-    ) -> None:
-        super().__init__()
-        require_choice("target", target, Target)
-        self.network, self.noise = group_of(TransformerOptions, network), group_of(NoiseOptions, noise)
-        self.loss, self.self_forcing = group_of(DenoiserLoss, loss), group_of(SelfForcing, self_forcing)
-        self.optimizer, self.sampling = group_of(OptimizerOptions, optimizer), group_of(Sampling, sampling)
-        groups = {"network": self.network, "noise": self.noise, "loss": self.loss, "self_forcing": self.self_forcing}
-        sizes = {"tokenizer": tokenizer, "max_agents": max_agents, "window": window, "target": target}
-        rest = {"start_from": start_from, "compile": compile, "cuda_graph": cuda_graph, "seed": seed}
-        groups |= {"optimizer": self.optimizer, "sampling": self.sampling}
-        self.save_hyperparameters(plain({**sizes, **groups, **rest}))
-        self.window = window
-        self.made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
-        self.graphed: GraphedStep | None = None  # of the training that is going on
-        self.build_named(tokenizer)
-        if tokenizer is None and start_from is not None and checkpoints.named(start_from).exists():
-            self.build(starting.tokenizer_of(start_from))
-
-    # -- parts ---------------------------------------------------------------------------------
-
-    def build(self, tokenizer: PoseTokenizer) -> None:
-        """Make the parts whose sizes depend on the tokenizer, any `PoseTokenizer`."""
-        agents, pairwise = self.hparams["max_agents"], self.network.pairwise
-        self.hold(tokenizer, TokenLayout(tokenizer.codebook_dim, agents, pairwise, self.noise.pairwise))
-        self.transformer = Transformer(self.layout, self.network)
-        posterior = self.network.pairwise_posterior and self.layout.slots
-        self.posterior = PairwisePosterior(self.layout) if posterior else None
-
-    @property
-    def quantized(self) -> bool:
-        return bool(self.hparams["target"] == "quantized")
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """As `TokenModel`; a posterior that the checkpoint is older than starts as it is."""
-        super().on_load_checkpoint(checkpoint)
-        if self.posterior is not None:
-            for name, value in self.posterior.state_dict().items():
-                checkpoint["state_dict"].setdefault(f"posterior.{name}", value)
-
-    # -- what the model does -------------------------------------------------------------------
-
-    def condition(self, scene: Scene) -> Tensor | None:
-        """What scenes are conditioned on, (B, C) or (B, N, C); None: nothing, as in the paper.
-
-        The place for text, music or a goal: a subclass embeds them here, C is `network.cond_dim`. Training and testing
-        ask for it; who samples gives it to `generate` as `cond`. It must tell nothing that a user would not know.
-        """
-        return None
-
-    def denoise(
-        self,
-        noisy: Tensor,
-        levels: Tensor,
-        present: Tensor,
-        cond: Tensor | None = None,
-        network: Callable[..., Tensor] | None = None,
-    ) -> Tensor:
-        """Predict clean tokens. noisy (B, N, P, D) normalized, levels (B, N, P) int, present (B, P) -> (B, N, P, D)
-
-        `cond` is that of `Transformer.forward`; `network` runs in its place, such as a `LeanTransformer` of it.
-
-        A window does not know what came before it: its first step is always shown as standing still, in
-        training as in sampling.
-        """
-        clean = self.predict_tokens(noisy, levels, present, cond, network)
-        return self.fused(clean, noisy, levels, present)
-
-    def predict_tokens(
-        self,
-        noisy: Tensor,
-        levels: Tensor,
-        present: Tensor,
-        cond: Tensor | None = None,
-        network: Callable[..., Tensor] | None = None,
-    ) -> Tensor:
-        """What the transformer itself predicts, before `fused`; as `denoise`."""
-        shown = self._without_lead(noisy).to(dtype_of(self.transformer))
-        made = (network or self.transformer)(shown, levels, present, cond)
-        return skipped(made, shown, levels, self.layout) if self.network.skip else made
-
-    def fused(self, clean: Tensor, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
-        """Predicted tokens with their deltas and pairwise transforms as one posterior, if the model has one."""
-        if self.posterior is None:
-            return clean
-        with torch.autocast(noisy.device.type, enabled=False):  # half precision would blur the transforms
-            return self.posterior(clean.float(), noisy.float(), levels, present, self.normalizer)
-
-    def _without_lead(self, tokens: Tensor) -> Tensor:
-        lead = slice(self.layout.latent, self.layout.latent + 9)
-        mean, std = self.normalizer.mean, self.normalizer.std
-        still = (constant((1, 0, 0, 0, 1, 0, 0, 0, 0), mean) - mean[lead]) / std[lead]
-        tokens = tokens.clone()
-        tokens[:, 0, :, lead] = still.to(tokens.dtype)
-        return tokens
+    made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
+    graphed: GraphedStep | None = None  # of the training that is going on
 
     # -- training ------------------------------------------------------------------------------
 
@@ -216,7 +79,7 @@ class Denoiser(TokenModel):
             why = "weights in shards cannot be recorded; use another strategy"
         if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
             why = "gradients of 16-mixed would vanish before they are scaled; take --trainer.precision bf16-mixed"
-        if type(self).condition is not Denoiser.condition:
+        if type(self).condition is not DenoiserCore.condition:
             why = "conditions are not recorded"
         if why:
             raise ValueError(f"cuda_graph: {why}, or leave out --model.cuda_graph")

@@ -26,12 +26,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.files import write_whole
 from magnet.motion.scene import FPS
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
-from magnet.tokenizer.module import Tokenizer
+from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.quantizer import ResidualVQ
 from magnet.version import __version__
 
@@ -49,7 +49,7 @@ class PortableDenoiser(nn.Module):
         ValueError: a model with a part that ONNX has no operator for.
     """
 
-    def __init__(self, denoiser: Denoiser) -> None:
+    def __init__(self, denoiser: DenoiserCore) -> None:
         super().__init__()
         if denoiser.posterior is not None:
             raise ValueError(
@@ -72,7 +72,7 @@ class PortableDenoiser(nn.Module):
 class PortableDecoder(nn.Module):
     """Normalized tokens to poses and transforms in real units."""
 
-    def __init__(self, denoiser: Denoiser) -> None:
+    def __init__(self, denoiser: DenoiserCore) -> None:
         super().__init__()
         self.layout, self.normalizer, self.tokenizer = denoiser.layout, denoiser.normalizer, denoiser.tokenizer
 
@@ -84,9 +84,9 @@ class PortableDecoder(nn.Module):
 class PortableEncoder(nn.Module):
     """Inverse of `PortableDecoder`; first and last poses are held for a token each, as in `Denoiser.encode`."""
 
-    def __init__(self, denoiser: Denoiser) -> None:
+    def __init__(self, denoiser: DenoiserCore) -> None:
         super().__init__()
-        if not isinstance(denoiser.tokenizer, Tokenizer):
+        if not isinstance(denoiser.tokenizer, TokenizerCore):
             raise ValueError(f"tokenizer: got {type(denoiser.tokenizer).__name__}, expected Tokenizer")
         self.layout, self.normalizer = denoiser.layout, denoiser.normalizer
         self.tokenizer = copy.deepcopy(denoiser.tokenizer)
@@ -110,7 +110,7 @@ class PortableEncoder(nn.Module):
         return self.normalizer.normalize(tokens)
 
 
-def save_onnx(denoiser: Denoiser, path: str | Path, name: str = "") -> dict[Path, float]:
+def save_onnx(denoiser: DenoiserCore, path: str | Path, name: str = "") -> dict[Path, float]:
     """Write a denoiser and its tokenizer as three ONNX files; see this module for what they take and give.
 
     Args:

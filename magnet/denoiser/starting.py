@@ -14,11 +14,12 @@ from magnet.denoiser.statistics import with_pairwise_metres
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.tokenizer.module import RawPose, Tokenizer
+from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.normalizer import Normalizer
+from magnet.tokenizer.raw import RawPose
 
 
-def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
+def tokenizer_of(path: str | Path) -> TokenizerCore | RawPose:
     """The tokenizer inside a denoiser's checkpoint, or inside a shipped model by name.
 
     Raises:
@@ -26,7 +27,7 @@ def tokenizer_of(path: str | Path) -> Tokenizer | RawPose:
     """
     checkpoint = denoiser_of(path)
     if checkpoint["tokenizer_hyper_parameters"] is not None:
-        return Tokenizer.load(path)
+        return TokenizerCore.load(path)
     raw = RawPose()
     raw.load_state_dict(_part(checkpoint["state_dict"], "tokenizer."))
     return raw

@@ -12,8 +12,8 @@ from torch import Tensor
 from magnet.baselines.predictor import Generators, joints_of
 from magnet.checks import require_whole
 from magnet.datamodules.base import MotionDataModule
-from magnet.denoiser.module import Denoiser
-from magnet.denoiser.token_model import TokenModel
+from magnet.denoiser.core import DenoiserCore
+from magnet.denoiser.token_core import TokenModelCore
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import (
     CONFIDENCE,
@@ -73,7 +73,7 @@ class Evaluator(L.LightningModule):
 
     def __init__(
         self,
-        denoiser: TokenModel,
+        denoiser: TokenModelCore,
         task: Task | None = None,
         sampler: SamplerOptions | None = None,
         samples: int = 10,
@@ -188,7 +188,7 @@ class Evaluator(L.LightningModule):
         if isinstance(self.denoiser, Peer):
             known = self.denoiser.known_by(self.task, self.context, self.horizon)
             return self.denoiser.sample(scene, known, self.context + self.horizon, samples, generators)
-        assert isinstance(self.denoiser, Denoiser)
+        assert isinstance(self.denoiser, DenoiserCore)
         return generate(
             self.denoiser,
             in_slots(scene, min(scene.agents, max(occupied(scene), self.denoiser.layout.agents))),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from magnet.baselines.predictor import Predictor
 from magnet.datamodules.base import MotionDataModule
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.evaluation.evaluator import Evaluator
 from magnet.evaluation.scoring import Scoring, Sight, planned
 from magnet.sampling.options import SamplerOptions
@@ -34,7 +34,11 @@ def baseline(name: str, task: Task, datamodule: MotionDataModule) -> Predictor:
 
 
 def model(
-    denoiser: Denoiser, task: Task, datamodule: MotionDataModule, samples: int, sampler: SamplerOptions | None = None
+    denoiser: DenoiserCore,
+    task: Task,
+    datamodule: MotionDataModule,
+    samples: int,
+    sampler: SamplerOptions | None = None,
 ) -> Predictor:
     """A denoiser that samples a task, so many futures of each scene."""
     evaluator = Evaluator(denoiser, task, sampler, samples, baselines=False)

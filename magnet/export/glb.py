@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -18,6 +17,7 @@ from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.motion.frames import canonical_frame, inverse
+from magnet.motion.rotations import to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 from magnet.version import __version__
 
@@ -227,7 +227,7 @@ class _Gltf:
 
     def animate(self, animation: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
         """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""
-        quaternions = unbroken(roma.rotmat_to_unitquat(local.double()))
+        quaternions = unbroken(to_quat(local.double()))
         tracks = [("translation", first, self.accessor(place.numpy(), FLOAT, "VEC3"))]
         for j in range(local.shape[1]):
             tracks.append(("rotation", first + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
@@ -15,6 +14,7 @@ from magnet.body import Body
 from magnet.export.rig import UP
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
 
 SMPLX_JOINTS = 55
@@ -45,7 +45,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
     rotations = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
     poses = torch.zeros(*rotations.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)
-    poses[..., : 3 * BODY_JOINTS] = roma.rotmat_to_rotvec(rotations).flatten(-2).cpu()
+    poses[..., : 3 * BODY_JOINTS] = to_rotvec(rotations).flatten(-2).cpu()
     rest_pelvis = body.rest_joints(scene.betas[0])[:, 0].double()
     transl = (T_world_root[..., :3, 3] - rest_pelvis[:, None]).cpu().numpy()
     arrays = {"poses": poses.numpy(), "transl": transl, "trans": transl, "betas": scene.betas[0].cpu().numpy()}
@@ -109,7 +109,7 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Sce
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
     if written_for is None and body.id.startswith("open"):
         betas = torch.zeros_like(betas)
-    rotations = roma.rotvec_to_rotmat(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
+    rotations = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
     pelvis = transl + body.rest_joints(betas.float())[:, 0].double()[:, None]
     T_world_root = rigid(rotations[:, :, 0], pelvis)
     if up is None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -27,6 +26,7 @@ from magnet.export.glb import (
     unbroken,
 )
 from magnet.motion.frames import canonical_frame, inverse
+from magnet.motion.rotations import to_quat
 from magnet.motion.scene import Scene
 
 NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
@@ -100,7 +100,7 @@ def _moved(scene: Scene, slot: int, bones: BoneOptions) -> tuple[Tensor, Tensor]
         above = [T_world_floor]
     frames = torch.stack([*above, T_above_pelvis], dim=1)
     local = torch.cat([frames[..., :3, :3], scene.body_rot[0, :, slot].detach().cpu().double()], dim=1)
-    return frames[..., :3, 3], unbroken(roma.rotmat_to_unitquat(local))
+    return frames[..., :3, 3], unbroken(to_quat(local))
 
 
 def _skeleton(stage: Any, root: Any, rest: Tensor, bones: BoneOptions, place: Tensor, turns: Tensor) -> None:

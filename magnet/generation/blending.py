@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import roma
 import torch
 from torch import Tensor
 
 from magnet.motion.frames import from_planar, inverse, rigid, to_planar
 from magnet.motion.planar import rotate_ground
 from magnet.motion.resample import smoothstep
+from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import Scene, cat_time
 
 SPRING = 5.0
@@ -192,8 +192,8 @@ def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left
         torch.cat([root[..., None, :3, :3], scene.body_rot], dim=3)
         for root, scene in ((decoded_can_root, decoded), (given_can_root, given))
     )
-    bends = roma.rotmat_to_rotvec(goals @ turns.transpose(-1, -2))
-    turned = roma.rotvec_to_rotmat(left(bends)) @ turns
+    bends = to_rotvec(goals @ turns.transpose(-1, -2))
+    turned = from_rotvec(left(bends)) @ turns
     moved = lift + left(given_can_root[..., :3, 3] - lift)
     body_rot, can_root = turned[..., 1:, :, :], rigid(turned[..., 0, :, :], moved)
     there = decoded.present[:, None, :, None, None]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.settling import PACE, Corrected, settled_on
@@ -33,7 +33,7 @@ RECALLED = 30
 class World(Protocol):
     """What bodies are made from: where everybody has been placed so far, see `WorldState`."""
 
-    model: Denoiser
+    model: DenoiserCore
     options: SamplerOptions
     given: Scene
     known: Tensor

@@ -8,7 +8,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to_9d
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
@@ -50,7 +50,7 @@ def label(scene: Scene, number: int) -> str:
     return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
 
 
-def receptive_field(model: Denoiser) -> tuple[int, int]:
+def receptive_field(model: DenoiserCore) -> tuple[int, int]:
     """Tokens before and after that a code or a decoded frame depends on, the same for encoder and decoder."""
     return model.tokenizer.receptive_field
 
@@ -126,7 +126,7 @@ Encoders = dict[tuple[int, ...], Carried]
 
 
 def known_tokens(
-    model: Denoiser,
+    model: DenoiserCore,
     given: Scene,
     known: Tensor,
     related: Scene | None = None,

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.crowd_room import SMOOTHED, room_made
 from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settled_groups, settled_moments
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
@@ -47,7 +47,7 @@ PAIR = 9 * TOKEN_FRAMES
 
 
 def generate_crowd(
-    model: Denoiser,
+    model: DenoiserCore,
     scene: Scene,
     task: Task,
     context: int,
@@ -100,7 +100,7 @@ class CrowdRollout(Rollout):
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         scene: Scene,
         task: Task,
         context: int,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_number, require_whole
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_agents, empty_scene
@@ -31,7 +31,7 @@ SHAPES = 0.7
 
 
 def start_crowd(
-    model: Denoiser,
+    model: DenoiserCore,
     people: int,
     options: SamplerOptions | None = None,
     generator: torch.Generator | None = None,
@@ -90,7 +90,7 @@ def crowd_from_nothing(people: int, generator: torch.Generator | None = None) ->
 
 
 def start_from_nothing(
-    model: Denoiser, scene: Scene, options: SamplerOptions | None, generator: torch.Generator | None
+    model: DenoiserCore, scene: Scene, options: SamplerOptions | None, generator: torch.Generator | None
 ) -> Scene:
     """How a crowd begins of which nothing is known: couples of those who are there, in their slots and of their shapes.
 
@@ -147,7 +147,7 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
     return cat_agents(placed)
 
 
-def require_crowd(model: Denoiser, scene: Scene, context: int, options: SamplerOptions) -> None:
+def require_crowd(model: DenoiserCore, scene: Scene, context: int, options: SamplerOptions) -> None:
     """Check that a crowd can go on from a scene so.
 
     Raises:

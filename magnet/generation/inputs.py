@@ -7,7 +7,7 @@ from torch import Tensor
 
 from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import label
 from magnet.motion.scene import Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -17,7 +17,7 @@ ROUNDED = 0.05
 
 
 def check_request(
-    model: Denoiser, scene: Scene, context: int, frames: int | None, samples: int, task: object = None
+    model: DenoiserCore, scene: Scene, context: int, frames: int | None, samples: int, task: object = None
 ) -> None:
     """Refuse what cannot be sampled whatever the task, and a task's name or class in its place.
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
 from magnet.generation.partner import Partner
@@ -96,7 +96,7 @@ class Live:
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         people: int = 2,
         start: Scene | None = None,
         partner: Scene | None = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.options import Sampling
 from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
@@ -37,7 +37,7 @@ class OnlineRollout(Rollout):
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         past: Scene,
         task: Task,
         options: SamplerOptions | None = None,

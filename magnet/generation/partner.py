@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_request
 from magnet.generation.online import OnlineRollout
 from magnet.motion.scene import Scene, cat_time, require_rate
@@ -50,7 +50,7 @@ class Partner:
 
     def __init__(
         self,
-        denoiser: Denoiser,
+        denoiser: DenoiserCore,
         past: Scene,
         agents: Sequence[int] = (0,),
         options: SamplerOptions | None = None,

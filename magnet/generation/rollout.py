@@ -11,8 +11,8 @@ from torch import Tensor
 
 from magnet.checks import require_whole
 from magnet.denoiser.compiled import answered
+from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.lean import LeanTransformer, Memory, lean
-from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
@@ -50,7 +50,7 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
 def generate(
-    model: Denoiser,
+    model: DenoiserCore,
     scene: Scene,
     task: Task,
     context: int,
@@ -91,7 +91,7 @@ def generate(
 
 
 def stream(
-    model: Denoiser,
+    model: DenoiserCore,
     scene: Scene,
     task: Task,
     context: int,
@@ -139,7 +139,7 @@ class Rollout:
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         scene: Scene,
         task: Task,
         context: int,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_whole
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.export.trace import DenoisingTrace
 from magnet.generation.causal_bodies import own_view
 from magnet.generation.rollout import Rollout
@@ -22,7 +22,7 @@ from magnet.tasks.base import Task
 
 
 def record(
-    model: Denoiser,
+    model: DenoiserCore,
     scene: Scene,
     task: Task,
     context: int,
@@ -66,7 +66,7 @@ class TracedRollout(Rollout):
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         scene: Scene,
         task: Task,
         context: int,

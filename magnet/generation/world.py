@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import (
     GOES_ON,
     crossfade_given,
@@ -60,7 +60,7 @@ class WorldState:
 
     def __init__(
         self,
-        model: Denoiser,
+        model: DenoiserCore,
         given: Scene,
         schedule: MaskSchedule,
         options: SamplerOptions,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_inverse, quat_product, quat_to_rotvec, to_rotvec
 from magnet.motion.scene import FPS, Scene
 
 
@@ -27,14 +27,14 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
         second: (..., 3, 3)
         share: how far on, from 0 to 1; broadcasts against (...).
     """
-    turn = roma.rotmat_to_rotvec(first.transpose(-1, -2) @ second)
-    return first @ roma.rotvec_to_rotmat(turn * share[..., None])
+    turn = to_rotvec(first.transpose(-1, -2) @ second)
+    return first @ from_rotvec(turn * share[..., None])
 
 
 def slerp_quat(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     """`slerp` of unit quaternions (..., 4)."""
-    turn = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(first), second))
-    return roma.quat_product(first, roma.rotvec_to_unitquat(turn * share[..., None]))
+    turn = quat_to_rotvec(quat_product(quat_inverse(first), second))
+    return quat_product(first, quat_from_rotvec(turn * share[..., None]))
 
 
 def times(frames: int, fps: float, target: float = FPS) -> tuple[Tensor, Tensor, Tensor]:

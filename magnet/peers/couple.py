@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from magnet.denoiser.token_model import TokenModel
+from magnet.denoiser.token_core import TokenModelCore
 from magnet.generation.blending import spring_from_given
 from magnet.motion.frames import canonical_deltas, canonical_frame, from_9d, inverse, posed, project_se2, to_9d
 from magnet.motion.placement import place
@@ -34,7 +34,7 @@ class Couple:
         ValueError: something is known after a gap, or somebody is missing.
     """
 
-    def __init__(self, model: TokenModel, scene: Scene, known: Tensor, online: bool = False) -> None:
+    def __init__(self, model: TokenModelCore, scene: Scene, known: Tensor, online: bool = False) -> None:
         if scene.agents != 2 or not bool(scene.present.all()):
             raise ValueError(f"got scenes of {scene.present.sum(1).tolist()} people, expected two in each")
         self.begins: list[int] = known.sum(dim=0).tolist()

@@ -14,8 +14,8 @@ from magnet.peers.couple import Couple
 from magnet.peers.network import PartnerTransformer, up_to
 from magnet.peers.peer import Peer
 from magnet.peers.remos import require_partner
+from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.losses import masked_mean
-from magnet.tokenizer.module import Tokenizer
 from magnet.tokenizer.quantizer import ResidualVQ
 
 LOOKAHEAD = 4
@@ -34,7 +34,7 @@ class Duolando(Peer):
         return not self.training
 
     def build_network(self) -> None:
-        quantizer = self.tokenizer.quantizer if isinstance(self.tokenizer, Tokenizer) else None
+        quantizer = self.tokenizer.quantizer if isinstance(self.tokenizer, TokenizerCore) else None
         if not isinstance(quantizer, ResidualVQ):
             raise ValueError("tokenizer: a GPT over codes needs a tokenizer with codebooks, kind residual_vq")
         width = self.network.width
@@ -47,7 +47,7 @@ class Duolando(Peer):
 
     @property
     def quantizer(self) -> ResidualVQ:
-        assert isinstance(self.tokenizer, Tokenizer) and isinstance(self.tokenizer.quantizer, ResidualVQ)
+        assert isinstance(self.tokenizer, TokenizerCore) and isinstance(self.tokenizer.quantizer, ResidualVQ)
         return self.tokenizer.quantizer
 
     @property

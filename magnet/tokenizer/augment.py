@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
+from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import FPS, Scene
 
 LIMBS = {
@@ -49,9 +49,9 @@ def joint_noise(scene: Scene, angle: float, generator: torch.Generator) -> Scene
     """
     B, P = scene.present.shape
     draws = torch.randn(B, 1, P, 22, 3, generator=generator, device=generator.device).to(scene.body_rot)
-    turns = roma.rotvec_to_rotmat(angle * draws)
+    turns = from_rotvec(angle * draws)
     tilt = torch.eye(4, dtype=turns.dtype, device=turns.device).repeat(B, 1, P, 1, 1)
-    tilt[..., :3, :3] = roma.rotvec_to_rotmat(angle / 3 * draws[..., 0, :])
+    tilt[..., :3, :3] = from_rotvec(angle / 3 * draws[..., 0, :])
     present = scene.present[:, None, :, None, None]
     return scene.replace(
         body_rot=torch.where(present[..., None], scene.body_rot @ turns[..., 1:, :, :], scene.body_rot),

@@ -20,9 +20,9 @@ from magnet.packing import Kept, Linear, linear_of, norm_of, packs
 from magnet.precision import dtype_of
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.carried import Carried, Span, SpanLayer
+from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.features import features, fold, unfold
 from magnet.tokenizer.losses import orthonormalize
-from magnet.tokenizer.module import Tokenizer
 from magnet.tokenizer.vqvae import Conv, Decoder, Encoder, ResidualBlock, Upsample
 
 
@@ -160,7 +160,7 @@ LEAN: Kept[LeanNetwork] = Kept(LeanNetwork)  # type: ignore[arg-type]
 
 def usable(tokenizer: PoseTokenizer) -> bool:
     """Whether there is a lean form of a tokenizer's networks."""
-    if not isinstance(tokenizer, Tokenizer) or not packs():
+    if not isinstance(tokenizer, TokenizerCore) or not packs():
         return False
     return tokenizer.device.type == "cpu" and dtype_of(tokenizer.vqvae.decoder) == torch.float32
 
@@ -192,7 +192,7 @@ def decoded(
     """Some frames of `PoseTokenizer.decode`. -> (B, stop - start, P, 135)"""
     if not usable(tokenizer):
         return tokenizer.decode(latent, betas, deltas)[:, frames]
-    assert isinstance(tokenizer, Tokenizer)
+    assert isinstance(tokenizer, TokenizerCore)
     vqvae = tokenizer.vqvae
     inputs = vqvae.decoder_inputs(fold(latent), betas.flatten(0, 1), fold(deltas))
     network, span = LEAN.of(vqvae.decoder), (frames.start, frames.stop)
@@ -220,7 +220,7 @@ def encoded(
     """
     if not usable(tokenizer) or scene.valid is not None or not scene.scenes:
         return encoded_plainly(tokenizer, scene, quantize, tokens)
-    assert isinstance(tokenizer, Tokenizer)
+    assert isinstance(tokenizer, TokenizerCore)
     seen, vqvae = features(scene), tokenizer.vqvae
     known = torch.ones(1, 1, 2, dtype=torch.bool)
     inputs = vqvae.encoder_inputs(fold(seen.pose), seen.betas.flatten(0, 1), fold(seen.deltas), known)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from magnet.body.base import Body
 from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs, turn_to
 from magnet.export.page.palette import Colours, for_batches
 from magnet.export.page.rig import Array, Rig, Style, capsule, rigs
+from magnet.motion.rotations import to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MANY = 8
@@ -176,5 +176,5 @@ class LimbPeople:
 def stand(start: Array, end: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Turn and place that take a capsule along +z to each limb. (P, M, 3) x 2 -> (P, M, 4) wxyz, (P, M, 3)"""
     R = torch.from_numpy(turn_to(np.asarray(end - start, dtype=np.float64)))
-    turns = roma.rotmat_to_unitquat(R)[..., [3, 0, 1, 2]].float().numpy()
+    turns = to_quat(R)[..., [3, 0, 1, 2]].float().numpy()
     return np.ascontiguousarray(turns), np.ascontiguousarray(start, dtype=np.float32)

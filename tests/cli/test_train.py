@@ -15,8 +15,9 @@ import torch
 import yaml
 from lightning.pytorch.trainer.connectors import checkpoint_connector
 
-from magnet import checkpoints, cli
+from magnet import cli
 from magnet.cli import train
+from magnet.training.checkpoint_io import CheckpointIO
 from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel, play
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
@@ -287,7 +288,7 @@ def test_a_job_that_slurm_starts_again_goes_on(
     """With the checkpoint that Lightning leaves where time is up; another job may not overwrite it."""
     begun = []
     kept = torch.load(trained / "checkpoints/last.ckpt", weights_only=True)
-    checkpoints.CheckpointIO().save_checkpoint(kept, trained / "hpc_ckpt_1.ckpt")
+    CheckpointIO().save_checkpoint(kept, trained / "hpc_ckpt_1.ckpt")
     assert [path.name for path in trained.glob("hpc_ckpt_*")] == ["hpc_ckpt_1.ckpt"]  # Lightning counts such files
     monkeypatch.setattr(ToyModel, "on_train_start", lambda self: begun.append(self.trainer.global_step), raising=False)
     said = {"NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0", "JOB_ID": "7", "JOB_NAME": "big"}

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from magnet import checkpoints
+from magnet.training.checkpoint_io import CheckpointIO
 from tests.scripts import module_at
 
 
@@ -98,7 +99,7 @@ def test_foreign_code_in_a_checkpoint_is_not_run(tmp_path, capsys):
         checkpoints.read(path)
     torch.save({"state_dict": Evil()}, path)
     with pytest.raises(ValueError, match="not a checkpoint that can be read safely"):
-        checkpoints.CheckpointIO().load_checkpoint(path)
+        CheckpointIO().load_checkpoint(path)
     assert "code has run" not in capsys.readouterr().out
 
 

@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -22,6 +21,7 @@ from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
+from magnet.motion.rotations import from_quat, quat_from_rotvec, to_quat
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import BODY_JOINTS, FPS, Scene, cat_agents
 
@@ -123,7 +123,7 @@ def canonicalize(
     for p, gender in enumerate(recording.genders):  # of a body that nobody gave
         notes.append(f"{names[p] if names else f'person {p}'}: {gender}; the shape is used with the body model given")
     motion, flags, flagged = _moved(recording, body, options)
-    quat = roma.rotmat_to_unitquat(motion.rotations).numpy()
+    quat = to_quat(motion.rotations).numpy()
     flags += check_people.jumps(quat, motion.joints.numpy(), motion.valid, but=flags)
     flagged += check_people.described(flags, names, FPS)
     notes += [*flagged, *motion.notes]
@@ -198,9 +198,9 @@ def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[
     place = check_motion.filled(np.asarray(place, dtype=np.float64), valid)
     check_motion.check_apart(place, valid)
     betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
-    quat = roma.rotvec_to_unitquat(torch.from_numpy(poses))
+    quat = quat_from_rotvec(torch.from_numpy(poses))
     quat = resample_rotations(quat, recording.fps)
-    rotations = roma.unitquat_to_rotmat(quat).float()
+    rotations = from_quat(quat).float()
     rest = body.rest_joints(betas)
     check_people.check_stature(rest.numpy(), recording.persons)
     # SMPL's root turns about the rest pelvis and is moved by transl after that

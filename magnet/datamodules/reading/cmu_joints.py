@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from magnet.body.apart import widened
 from magnet.body.fit import swing
 from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
 from magnet.datamodules.reading.recording import DataError, Recording
-from magnet.motion.rotations import geodesic
+from magnet.motion.rotations import from_rotvec, geodesic, to_quat
 from magnet.motion.scene import BODY_JOINTS, FPS
 
 from magnet.body.joints import (  # isort: skip
@@ -197,14 +196,14 @@ def _half_roll(hand: Tensor) -> tuple[Tensor, Tensor]:
 
     (T, 3, 3) -> (T, 3, 3), the identity where it is wrong; (T,) bool
     """
-    x, y, z, w = roma.rotmat_to_unitquat(hand).unbind(-1)
+    x, y, z, w = to_quat(hand).unbind(-1)
     roll = 2 * torch.atan2(x, w)
     roll = torch.atan2(roll.sin(), roll.cos())
     bend = 2 * torch.atan2((y * y + z * z).sqrt(), (x * x + w * w).sqrt())
     wrong = (roll.abs() > np.radians(ROLL_LIMIT)) | (bend > np.radians(WRIST_LIMIT))
     axis = torch.zeros(len(hand), 3, dtype=hand.dtype)
     axis[:, 0] = torch.where(wrong, 0.0, roll / 2)
-    return roma.rotvec_to_rotmat(axis), wrong
+    return from_rotvec(axis), wrong
 
 
 @dataclass(frozen=True)

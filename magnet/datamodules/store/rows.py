@@ -8,12 +8,12 @@ of the 820 that matrices take in memory.
 from __future__ import annotations
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SCALE = 32767
@@ -26,7 +26,7 @@ CACHED = 8192
 def encode(scene: Scene) -> NDArray[np.void]:
     """A scene (B = 1) as rows, person after person. -> (P * T,) of `ROW`"""
     rotations = torch.cat([scene.T_world_root[0, :, :, None, :3, :3], scene.body_rot[0]], dim=2)
-    quat = roma.rotmat_to_unitquat(rotations.double())
+    quat = to_quat(rotations.double())
     quat = torch.where(quat[..., 3:] < 0, -quat, quat)
     rows = np.zeros((scene.agents, scene.frames), dtype=ROW)
     rows["rotations"] = (SCALE * quat).round().to(torch.int16).transpose(0, 1).numpy()

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -32,6 +31,7 @@ from magnet.export.limbs import (
     turn_to,
 )
 from magnet.export.page.light import light
+from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 Array = NDArray[np.floating]
@@ -117,13 +117,13 @@ def bone_poses(body: Body, scene: Scene) -> tuple[Array, Array]:
         places = body.joints(scene)[0]
         rest = body.rest_joints(scene.betas[:, None])
         turns = body.bone_chain(scene.body_rot, scene.T_world_root, rest)[0][0]
-        turns = roma.rotmat_to_unitquat(turns)[..., [3, 0, 1, 2]]
+        turns = to_quat(turns)[..., [3, 0, 1, 2]]
     return turns.float().cpu().numpy(), places.float().cpu().numpy()
 
 
 def bend(rig: Rig, turns: Array, places: Array) -> Array:
     """The mesh as a browser draws it. turns (22, 4), places (22, 3) -> (V, 3)"""
-    R = roma.unitquat_to_rotmat(torch.from_numpy(turns[:, [1, 2, 3, 0]]).double()).numpy()
+    R = from_quat(torch.from_numpy(turns[:, [1, 2, 3, 0]]).double()).numpy()
     shift = places - np.einsum("jab,jb->ja", R, rig.rest)
     bones, weights = rig.skin.bones, rig.skin.weights[..., None]
     return (weights * (np.einsum("vkab,vb->vka", R[bones], rig.skin.vertices) + shift[bones])).sum(axis=1)
