@@ -23,13 +23,13 @@ from typing import NamedTuple
 import torch
 
 import magnet.api
+from magnet.body.contact import DEEP, deepest
 from magnet.generation.crowd import CrowdRollout
 from magnet.generation.crowd_settling import settled_moments
 from magnet.generation.crowd_start import START
 from magnet.generation.rollout import CHUNK
 from magnet.generation.stats import SamplingStats
 from magnet.metrics import Floating, FootSkating
-from magnet.metrics.body_depth import DEEP, deepest
 from magnet.motion.scene import FPS, Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.joint import JointFuture

@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 
 from magnet.body import load_body
+from magnet.body.contact import deepest
 from magnet.body.repair import repaired
 from magnet.datamodules.cmu import CMU
 from magnet.metrics import hand_distance, lowest_foot, toe_steps
-from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene, concatenate
 
 BODY = load_body()

@@ -28,6 +28,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from magnet.body import Body, load_body
+from magnet.body.contact import deepest
 from magnet.cli import run_folder
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
@@ -36,7 +37,6 @@ from magnet.evaluation.results import machine
 from magnet.export.picture import contact_sheet
 from magnet.generation.rollout import generate
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance
-from magnet.metrics.body_depth import deepest
 from magnet.metrics.frechet import Features, moments
 from magnet.metrics.own_frame import joint_canonical_frame, seen_from
 from magnet.motion.scene import Scene, concatenate

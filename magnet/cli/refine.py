@@ -143,8 +143,8 @@ def told(scene: Scene, body: Body) -> str:
     """One line on how deep bodies overlap, how fast low toes slide, and how many feet are off the floor."""
     import torch
 
+    from magnet.body.contact import deepest
     from magnet.body.joints import FEET, TOES
-    from magnet.metrics.body_depth import deepest
 
     joints = body.joints(scene)
     worst = joints.new_zeros(joints.shape[:2])
@@ -180,10 +180,8 @@ def by_frame(scene: Scene, body: Body) -> dict[str, Tensor]:
     """What is marked on bodies, in each frame of the first scene: by title, (T,)."""
     import torch
 
+    from magnet.body.contact import deepest, hand_distance, toe_steps
     from magnet.body.joints import FEET
-    from magnet.metrics import hand_distance
-    from magnet.metrics.body_depth import deepest
-    from magnet.metrics.skating import toe_steps
 
     one = scene.select([0])
     joints = body.joints(one)[0][:, one.present[0]]  # (T, P, 22, 3)

@@ -7,6 +7,8 @@ from typing import Any
 from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
+from magnet.body.contact import hand_distance, penetration_depth, segment_distance, toe_steps
+from magnet.body.energy import hand_points
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.body_depth import BodyDepth
 from magnet.metrics.columns import Better, Column, column, columns_of
@@ -14,16 +16,16 @@ from magnet.metrics.diversity import Diversity, diversity
 from magnet.metrics.floor import Floating, GroundPenetration, lowest_foot
 from magnet.metrics.frechet import FrechetBySecond, FrechetDistance, frechet_distance
 from magnet.metrics.futures import Futures
-from magnet.metrics.hand_contact import HandContact, hand_distance, hand_points
+from magnet.metrics.hand_contact import HandContact
 from magnet.metrics.interaction import MotionInteraction, pearson
 from magnet.metrics.interval import bootstrap_interval, independent_units
 from magnet.metrics.jitter import Jitter, jitter
 from magnet.metrics.memorisation import NearestTraining
 from magnet.metrics.partners import PartnerBearing, PartnerDistance, TurnRate, bearing, partner_distance, turn_rate
-from magnet.metrics.penetration import Interpenetration, penetration_depth, segment_distance
+from magnet.metrics.penetration import Interpenetration
 from magnet.metrics.position_error import PositionError, VelocityError, joint_error, velocity_error
 from magnet.metrics.registry import other_metrics
-from magnet.metrics.skating import FootSkating, StandingToes, toe_steps
+from magnet.metrics.skating import FootSkating, StandingToes
 from magnet.metrics.token_borders import TokenBorders
 from magnet.motion.scene import FPS
 

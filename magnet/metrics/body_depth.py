@@ -8,33 +8,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from magnet.body.contact import CHUNK, DEEP, TOUCH, deepest
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import histogram_of, quantile
-from magnet.metrics.penetration import CHUNK, FOREARMS, TOUCH, penetration_depth
-
-ARMS = slice(5, 9)
-"""Capsules of upper arms and forearms, next to each other in `CAPSULES`."""
-
-DEEP = 0.10
-"""Metres of depth that no touch of two people explains."""
 
 KINDS = ("depth", "depth_body", "depth_arms")
-
-
-def deepest(joints: Tensor, partner: Tensor) -> Tensor:
-    """How deep two bodies are in each other at most. (N, 22, 3) x 2 -> (N, 3) metres
-
-    Over all capsules but forearm on forearm, as IP has it; over all but arm on arm; over arm on arm, forearm on forearm
-    included.
-    """
-    depth = penetration_depth(joints, partner, touch=0.0, forearms=True)
-    arms = depth[:, ARMS, ARMS].amax(dim=(1, 2))
-    depth[:, FOREARMS[0] : FOREARMS[1] + 1, FOREARMS[0] : FOREARMS[1] + 1] = 0.0
-    every = depth.amax(dim=(1, 2))
-    depth[:, ARMS, ARMS] = 0.0
-    return torch.stack([every, depth.amax(dim=(1, 2)), arms], dim=-1)
 
 
 class BodyDepth(ClipMeans):

@@ -8,19 +8,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.body.energy import BEYOND, hand_points
+from magnet.body.contact import WITHIN, hand_distance
+from magnet.body.energy import BEYOND
 from magnet.metrics.base import ClipMeans, Of, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
-
-WITHIN = 0.20
-"""Metres between the middles of two hands under which they are in contact."""
-
-
-def hand_distance(joints: Tensor, partner: Tensor, beyond: float = BEYOND) -> Tensor:
-    """Between the nearest of the four pairs of two people's hands. (..., 22, 3) x 2 -> (...) metres"""
-    between = hand_points(joints, beyond)[..., :, None, :] - hand_points(partner, beyond)[..., None, :, :]
-    return between.norm(dim=-1).amin(dim=(-1, -2))
 
 
 def holds(contact: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,30 +8,17 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from magnet.body.joints import TOES
+from magnet.body.contact import STANDING, toe_steps
 from magnet.checks import require_choice
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import histogram_of, quantile
-from magnet.motion.scene import FPS
 
 Preset = Literal["default", "reference"]
 
-PRESETS: dict[Preset, tuple[float, float]] = {"default": (0.05, 0.05), "reference": (-0.01, 0.05)}
+PRESETS: dict[Preset, tuple[float, float]] = {"default": STANDING, "reference": (-0.01, 0.05)}
 """Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""
-
-
-def toe_steps(joints: Tensor, fps: float = FPS, height: float = 0.05) -> tuple[Tensor, Tensor]:
-    """Horizontal speed of each toe and whether it stands, being under `height` metres in both frames.
-
-    The floor is y = 0 and is not estimated again, which would hide floating.
-    (..., T, P, 22, 3) -> (..., T - 1, P, 2) m/s, same bool
-    """
-    toes = joints[..., TOES, :]
-    speed = toes[..., [0, 2]].diff(dim=-4).norm(dim=-1) * fps
-    low = toes[..., 1] < height
-    return speed, low[..., 1:, :, :] & low[..., :-1, :, :]
 
 
 class FootSkating(ClipMeans):

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from magnet.body import load_body
 from magnet.body.apart import APART, Apart, direction, eased, excess_depth, kept_apart, lifted, nearest_points
+from magnet.body.contact import deepest, penetration_depth, segment_distance
 from magnet.datamodules.synthetic import Synthetic
-from magnet.metrics.body_depth import deepest
-from magnet.metrics.penetration import penetration_depth, segment_distance
 
 EVERYBODY = torch.ones(1, 2, dtype=torch.bool)
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import load_body
+from magnet.body.contact import deepest
 from magnet.body.drift import drift, undrifted
 from magnet.body.energy import hand_points
 from magnet.body.fit import clearance
@@ -19,7 +20,6 @@ from magnet.body.settle import DOFS, Settle, corrected, correction, jacobian
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
 from magnet.metrics import hand_distance
-from magnet.metrics.body_depth import deepest
 from magnet.motion.frames import rigid
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.synthesis import synthesize

@@ -3,9 +3,9 @@
 import torch
 
 from magnet.bench.speed import standing
+from magnet.body.contact import deepest
 from magnet.generation.crowd_settling import bonded_groups, deep_moments, settled_groups, settled_moments
 from magnet.generation.settling import settled_chunk
-from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene, cat_time
 
 FRAMES = 90

@@ -12,6 +12,7 @@ import magnet
 from magnet.bench.speed import standing
 from magnet.body import load_body
 from magnet.body.apart import Apart
+from magnet.body.contact import deepest
 from magnet.body.energy import CONTACT
 from magnet.body.joints import TOES
 from magnet.body.settle import DOFS
@@ -33,7 +34,6 @@ from magnet.generation.settling import (
     settled_on,
 )
 from magnet.metrics import hand_distance
-from magnet.metrics.body_depth import deepest
 from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions, Separation, Settling

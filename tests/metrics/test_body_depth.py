@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from magnet.body.capsules import CAPSULES
+from magnet.body.contact import ARMS, deepest
 from magnet.metrics import BodyDepth
-from magnet.metrics.body_depth import ARMS, deepest
 
 from .batches import WHO_SLOWLY, Choose, crowd, gridded, pair_places, result
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from magnet.body.capsules import CAPSULES
+from magnet.body.contact import FOREARMS
 from magnet.metrics import Interpenetration, penetration_depth, segment_distance
-from magnet.metrics.penetration import FOREARMS
 from tests.cases import few
 
 from .batches import WHO_SLOWLY, Choose, crowd, gridded, scored

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from magnet.body.contact import deepest
 from magnet.export.page.html import save_html
 from magnet.export.page.light import light
-from magnet.metrics.body_depth import deepest
 from magnet.testing import random_scene
 from tests.viewer.browser import blue, orange, pale_orange, shot, upright
 

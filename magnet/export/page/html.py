@@ -16,13 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body.base import Body
+from magnet.body.contact import DEEP, TOUCH
 from magnet.body.joints import PARENTS
 from magnet.export.page.marks import marked
 from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes
-from magnet.metrics.body_depth import DEEP
-from magnet.metrics.penetration import TOUCH
 from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}

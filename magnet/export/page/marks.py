@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 
 from magnet.body.base import Body
 from magnet.body.capsules import capsule_segments, nearest_points
+from magnet.body.contact import DEEP, STANDING, TOUCH, WITHIN, penetration_depth, toe_steps
 from magnet.body.energy import hand_points
 from magnet.body.joints import TOES
 from magnet.export.page.palette import COLLIDES, SLIDES
 from magnet.export.page.rig import CROWD, Array, Index
-from magnet.metrics.body_depth import DEEP
-from magnet.metrics.hand_contact import WITHIN
-from magnet.metrics.penetration import TOUCH, penetration_depth
-from magnet.metrics.skating import PRESETS, toe_steps
 from magnet.motion.scene import Scene
 
 Mask = NDArray[np.bool_]
@@ -40,7 +37,7 @@ def standing(joints: Array, fps: float) -> tuple[Mask, Mask]:
 
     (T, P, 22, 3) -> (T - 1, P, 2) bool x 2, of frames 1 to T - 1
     """
-    height, fast = PRESETS["default"]
+    height, fast = STANDING
     speed, low = toe_steps(torch.from_numpy(joints), fps, height)
     return low.numpy(), (low & (speed > fast)).numpy()
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from magnet.body import Body
+from magnet.body.contact import WITHIN, deepest, hand_distance, penetration_depth, toe_steps
 from magnet.body.energy import hand_points
 from magnet.export.page.marks import (
     AT_ONCE,
@@ -21,10 +22,6 @@ from magnet.export.page.marks import (
     touching,
 )
 from magnet.export.page.palette import COLLIDES, SLIDES
-from magnet.metrics.body_depth import deepest
-from magnet.metrics.hand_contact import WITHIN, hand_distance
-from magnet.metrics.penetration import penetration_depth
-from magnet.metrics.skating import toe_steps
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
