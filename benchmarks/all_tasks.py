@@ -21,6 +21,7 @@ from torch import Tensor
 
 from magnet.baselines.predictor import Generators
 from magnet.cli import run_folder
+from magnet.cli.provenance import provenance
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
@@ -154,7 +155,7 @@ def main() -> None:
         truth = f"{PARTNER if PARTNER in name else ''}{TRUTH}"
         found.rows.setdefault(truth, results.rows[TRUTH])
         found.meta[name] = results.meta
-        found.meta.update(run_folder.provenance() | {"machine": machine()})
+        found.meta.update(provenance() | {"machine": machine()})
         found.save_json(file)
     shown = [metric for metric in METRICS if metric in found.metrics]
     (given.out / "table.md").write_text(found.to_markdown(shown))

@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 
 from magnet.body import Body, load_body
 from magnet.body.contact import deepest
-from magnet.cli import run_folder
+from magnet.cli.provenance import provenance
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import aligned
@@ -242,7 +242,7 @@ def main() -> None:
         "options": {key: str(value) for key, value in vars(given).items()},
     }
     given.out.mkdir(parents=True, exist_ok=True)
-    content = {"facts": facts, "curve": curve, "meta": run_folder.provenance() | {"machine": machine()}}
+    content = {"facts": facts, "curve": curve, "meta": provenance() | {"machine": machine()}}
     (given.out / "results.json").write_text(json.dumps(content, indent=1, default=str))
     draw(curve, floor, given.out / "curve.png")
     for b in range(min(2, long.scenes)):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import lightning as L
 
-from magnet.cli import run_folder
+from magnet.cli.provenance import provenance
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
@@ -61,7 +61,7 @@ def main() -> None:
             found.rows[name] = evaluator.results.rows["magnet"]
             found.rows.setdefault(f"{task}, {TRUTH}", evaluator.results.rows[TRUTH])
             found.meta[name] = evaluator.results.meta
-            found.meta.update(run_folder.provenance() | {"machine": machine()})
+            found.meta.update(provenance() | {"machine": machine()})
             found.save_json(file)
             print(
                 name, {metric: round(found.rows[name].get(metric, float("nan")), 4) for metric in METRICS}, flush=True

@@ -14,7 +14,7 @@ from lightning.pytorch import Trainer
 from rich.console import Console
 from rich.table import Table
 
-from magnet.cli import run_folder
+from magnet.cli.provenance import provenance
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results, machine, print_table
 from magnet.motion.scene import Scene
@@ -36,7 +36,7 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
         facts: more of how it came about.
         full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
     """
-    results.meta.update(run_folder.provenance() | {"machine": machine()} | facts)
+    results.meta.update(provenance() | {"machine": machine()} | facts)
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     shown = (
@@ -95,7 +95,7 @@ def write_scenes(
                 print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
-    facts = evaluator.facts() | run_folder.provenance() | {"machine": machine()}
+    facts = evaluator.facts() | provenance() | {"machine": machine()}
     (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
     print(cost(facts["sampling"]))
     print(f"written: {number} scenes of {evaluator.samples} samples to {folder / 'scenes'}")

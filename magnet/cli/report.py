@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code: 1 where a cell could not be done."""
     given = parser().parse_args(list(arguments))
-    from magnet.cli import run_folder
+    from magnet.cli.provenance import provenance
     from magnet.cli.train import quiet, run_trainer
     from magnet.evaluation.results import machine
     from magnet.report.cells import BUDGETS, Store
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         given.configs,
         given.ckpt_path,
         plan.budget.speed_rounds,
-        told(run_folder.provenance()["git"]),
+        told(provenance()["git"]),
         own_data,
     )
     wanted = [cell for cell in cells if held(cell.name, given.only) and not held(cell.name, given.skip)]
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if not given.page_only:
         runner.run(wanted)
     facts = {"tables": ", ".join(names), "budget": f"{given.budget}: {plan.budget.told}", "data": given.data}
-    facts |= {"checkpoint": given.ckpt_path, **run_folder.provenance(), "machine": machine()}
+    facts |= {"checkpoint": given.ckpt_path, **provenance(), "machine": machine()}
     written = page(blocks, store, runner.failed, facts)
     store.pack()
     print(f"written: {written}, report.json and cells.json")

@@ -1,4 +1,4 @@
-"""The folder of a run: configuration, provenance, logs and checkpoints."""
+"""The folder of a run: configuration, logs and checkpoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import csv
 import json
 import os
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -24,11 +23,10 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from magnet.cli.checkpoint_config import CONFIG_KEY
-from magnet.cli.doctor import version_of
 from magnet.cli.errors import CommandError
+from magnet.cli.provenance import provenance
 from magnet.version import __version__
 
-PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma")
 MONITOR = "val/loss"
 LATEST = "latest"
 
@@ -333,32 +331,3 @@ def point(link: Path, folder: Path) -> None:
         part.replace(link)
     except OSError as error:
         print(f"magnet: no link {link}: {error}", file=sys.stderr)
-
-
-def provenance() -> dict[str, Any]:
-    """When, by what command, from which commit and with which packages."""
-    return {
-        "command": shlex.join(["magnet", *sys.argv[1:]]),
-        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "magnet": __version__,
-        "python": sys.version.split()[0],
-        "packages": {name: version_of(name) for name in PACKAGES},
-        "git": git_state(Path(__file__).parents[1]),
-    }
-
-
-def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit of the source tree and whether it has changes; None where magnet is installed without one."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10)
-        if done.returncode:
-            raise OSError(done.stderr)
-        return done.stdout.strip()
-
-    try:
-        if not git("ls-files", "--", "__init__.py"):
-            return None  # a repository that merely lies around an installed package
-        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain"))}
-    except (OSError, subprocess.TimeoutExpired):
-        return None

@@ -1,0 +1,44 @@
+"""Where results come from: when, by what command, from which commit and with which packages."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from magnet.cli.doctor import version_of
+from magnet.version import __version__
+
+PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma")
+
+
+def provenance() -> dict[str, Any]:
+    """When, by what command, from which commit and with which packages."""
+    return {
+        "command": shlex.join(["magnet", *sys.argv[1:]]),
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "magnet": __version__,
+        "python": sys.version.split()[0],
+        "packages": {name: version_of(name) for name in PACKAGES},
+        "git": git_state(Path(__file__).parents[1]),
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit of the source tree and whether it has changes; None where magnet is installed without one."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10)
+        if done.returncode:
+            raise OSError(done.stderr)
+        return done.stdout.strip()
+
+    try:
+        if not git("ls-files", "--", "__init__.py"):
+            return None  # a repository that merely lies around an installed package
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain"))}
+    except (OSError, subprocess.TimeoutExpired):
+        return None
