@@ -23,9 +23,9 @@ import torch
 from magnet.agents.agent import Agent, motion_of
 from magnet.agents.message import TOKEN, pack, unpack
 from magnet.body import load_body
+from magnet.cli.provenance import machine
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.results import machine
 from magnet.metrics import FrechetDistance, HandContact, Interpenetration
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.sampling.options import SamplerOptions

@@ -23,7 +23,7 @@ from typing import Any
 import magnet
 from magnet.agents.message import RefusedMessage, unpack
 from magnet.agents.zeromq import Link
-from magnet.evaluation.results import machine
+from magnet.cli.provenance import machine
 
 COLUMNS = (
     *("tokens", "late", "gaps", "filled", "jumps", "resets", "passed_over"),

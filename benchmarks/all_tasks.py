@@ -21,13 +21,13 @@ from torch import Tensor
 
 from magnet.baselines.predictor import Generators
 from magnet.cli import run_folder
-from magnet.cli.provenance import provenance
+from magnet.cli.provenance import machine, provenance
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import TRUTH, Evaluator
-from magnet.evaluation.results import Results, machine
+from magnet.evaluation.results import Results
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.sampling.guidance import Guidance

@@ -18,8 +18,8 @@ import torch
 from pairwise_error import windows
 from torch import Tensor
 
+from magnet.cli.provenance import machine
 from magnet.denoiser.module import Denoiser
-from magnet.evaluation.results import machine
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import add_noise
 

@@ -29,11 +29,10 @@ import matplotlib.pyplot as plt
 
 from magnet.body import Body, load_body
 from magnet.body.contact import deepest
-from magnet.cli.provenance import provenance
+from magnet.cli.provenance import machine, provenance
 from magnet.datamodules.cmu import CMU
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import aligned
-from magnet.evaluation.results import machine
 from magnet.export.picture import contact_sheet
 from magnet.generation.rollout import generate
 from magnet.metrics import FrechetDistance, frechet_distance, partner_distance

@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from magnet.cli.provenance import machine
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
-from magnet.evaluation.results import machine
 from magnet.motion.frames import from_9d, to_planar
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES

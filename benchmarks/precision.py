@@ -20,11 +20,11 @@ import torch
 from pairwise_error import windows
 from torch import Tensor
 
+from magnet.cli.provenance import machine
 from magnet.denoiser.lean import lean
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
-from magnet.evaluation.results import machine
 from magnet.motion.frames import from_9d, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout

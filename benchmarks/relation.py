@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from magnet.evaluation.results import machine
+from magnet.cli.provenance import machine
 
 Rows = dict[str, dict[str, float]]
 """Rows of a table of results, by name: magnet, NN, ridge, training set, ground truth, ..."""

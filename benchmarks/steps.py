@@ -13,13 +13,13 @@ from pathlib import Path
 
 import lightning as L
 
-from magnet.cli.provenance import provenance
+from magnet.cli.provenance import machine, provenance
 from magnet.cli.train import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser
 from magnet.evaluation.evaluator import TRUTH, Evaluator
-from magnet.evaluation.results import Results, machine
+from magnet.evaluation.results import Results
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 

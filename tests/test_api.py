@@ -45,12 +45,13 @@ def test_importing_the_package_loads_neither_torch_nor_the_api():
 def test_sampling_needs_nothing_that_only_training_needs(tmp_path: Path) -> None:
     """Lightning takes longer to import than the model to load, and with what it imports 180 MiB."""
     code = f"""
-import sys, magnet
+import sys, magnet, magnet.bench.speed, magnet.cli.provenance, magnet.cli.refine, magnet.viewer.live_app
 from magnet.cli import main
 model = magnet.load("duet", steps=1)
 made = model.generate(people=2, frames=8, seed=0)
 made.save({str(tmp_path / "given.npz")!r})
 made.save({str(tmp_path / "given.glb")!r})
+made.save({str(tmp_path / "given.html")!r})
 model.partner(made).answer(made.slice(4, 8))
 magnet.load("duet", steps=1, sampler="plain").continue_(made, frames=8)
 assert main(["predict", {str(tmp_path / "given.npz")!r}, "--frames", "4", "--out", {str(tmp_path / "out.npz")!r}]) == 0

@@ -151,8 +151,7 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     import torch
 
     from magnet.bench.speed import cases, live_latency, measure
-    from magnet.cli.provenance import provenance
-    from magnet.evaluation.results import machine
+    from magnet.cli.provenance import machine, provenance
     from magnet.precision import device_of
     from magnet.sampling.options import SamplerOptions
     from magnet.tasks import registry

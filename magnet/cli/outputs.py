@@ -14,9 +14,9 @@ from lightning.pytorch import Trainer
 from rich.console import Console
 from rich.table import Table
 
-from magnet.cli.provenance import provenance
+from magnet.cli.provenance import machine, provenance
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
-from magnet.evaluation.results import Results, machine, print_table
+from magnet.evaluation.results import Results, print_table
 from magnet.motion.scene import Scene
 
 PANELS = 4

@@ -5,15 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import torch
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -263,30 +260,6 @@ def three(value: float) -> str:
     if digits > 6:
         return f"{value:.2e}"
     return f"{round(value, digits):.{max(digits, 0)}f}"
-
-
-def machine() -> dict[str, Any]:
-    """What this machine is: processor, cores at hand, accelerator, versions."""
-    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "cpu": _processor(),
-        "cores": cores,
-        "gpu": ", ".join(gpus) or None,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def _write(path: str | Path, text: str) -> Path:

@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 from torchmetrics import Metric, MetricCollection
 
-from magnet.evaluation.results import Results, machine, print_table, three
+from magnet.evaluation.results import Results, print_table, three
 from magnet.metrics import Column, NearestTraining, all_metrics, columns_of
 
 
@@ -174,9 +174,3 @@ def test_results_from_before_metrics_described_themselves_are_read(results: Resu
     del content["columns"]
     path.write_text(json.dumps(content))
     assert Results.load_json(path).to_markdown() == results.to_markdown()
-
-
-def test_machine_facts_are_json_ready() -> None:
-    facts = machine()
-    assert facts["cores"] >= 1 and facts["torch"] == torch.__version__
-    json.dumps(facts)
