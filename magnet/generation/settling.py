@@ -36,7 +36,7 @@ LOOSELY = (
 what is rounded otherwise in another batch moves people by a centimetre."""
 
 SHOWN = Settle(
-    iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, root=30.0, lift=1.0, stand=16.0, hold=10.0, hard=5.0
+    iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, root=30.0, lift=10.0, stand=16.0, hold=10.0, hard=5.0
 )
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once.
 
